@@ -13,6 +13,7 @@ BDT = GPST - 14 s. `Ephemeris` keeps the system's own time, `RawGnssEpoch` is in
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from drivers.immutable import immutable
@@ -46,7 +47,9 @@ CARRIER_HZ: dict[tuple[System, str], float] = {
 class RawSignal:
     """One signal of one satellite. Range rate is positive while the distance grows.
 
-    `sd_*` are what the receiver states, None where it does not; `cno_db_hz` likewise.
+    `sd_*` are what the receiver states, None where it does not; `cno_db_hz` likewise. A carrier
+    with half a cycle open is None. It has been followed for `lock_s` (s) at least, as the receiver
+    says: infinite where it says nothing, or no more than that its count is full.
     """
 
     system: System
@@ -58,6 +61,7 @@ class RawSignal:
     cno_db_hz: float | None = None
     sd_pseudorange_m: float | None = None
     sd_range_rate_m_s: float | None = None
+    lock_s: float = math.inf
 
     @property
     def satellite(self) -> str:

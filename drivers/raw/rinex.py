@@ -34,6 +34,8 @@ SYSTEMS: dict[str, System] = {"G": "G", "E": "E", "C": "C"}
 OTHERS = {"R": "glonass", "S": "sbas", "J": "qzss", "I": "navic"}
 _GPS_ORDINAL = date(1980, 1, 6).toordinal()
 _WIDTH = 16
+_LOCK_LOST, _HALF_CYCLE = 1, 2
+"""Bits of the loss-of-lock indicator: since the epoch before; half a cycle may be missing."""
 LABEL = slice(60, 80)
 FIRST_LABEL = "RINEX VERSION / TYPE"
 COMPRESSED_LABEL = "CRINEX VERS   / TYPE"
@@ -109,7 +111,8 @@ class _Columns:
 
 class ObservationReader:
     """One file. Counts `epochs_raw`, `lines_unreadable`, `events_passed`, `measured_G` and so on,
-    `signal_unknown`, `prn_unknown`, `pseudorange_implausible`, `rate_implausible`."""
+    `signal_unknown`, `prn_unknown`, `pseudorange_implausible`, `rate_implausible`,
+    `half_cycle_open`."""
 
     def __init__(self, source: str, text: str, counters: Counter[str]) -> None:
         version, kind = version_and_type(text)
@@ -198,12 +201,12 @@ class ObservationReader:
             except ValueError:
                 self._counters["lines_unreadable"] += 1
                 continue
-            signal = self._signal(system, prn, name, values)
+            signal = self._signal(system, prn, name, values, _flags(line, at[1]))
             if signal is not None:
                 yield signal
 
     def _signal(
-        self, system: System, prn: int, name: str, values: list[float | None]
+        self, system: System, prn: int, name: str, values: list[float | None], flags: int
     ) -> RawSignal | None:
         pseudorange, carrier, doppler, cno = values
         if pseudorange is None:
@@ -218,7 +221,13 @@ class ObservationReader:
             if abs(rate) > MAX_RATE_M_S:
                 self._counters["rate_implausible"] += 1
                 return None
-        return RawSignal(system, prn, name, pseudorange, rate, carrier, cno)
+        if carrier is not None and flags & _HALF_CYCLE:
+            self._counters["half_cycle_open"] += 1
+            carrier = None
+        lock_s = 0.0 if flags & _LOCK_LOST else math.inf
+        return RawSignal(
+            system, prn, name, pseudorange, rate, carrier, cno, None, None, lock_s
+        )
 
     def _make_columns(self, system: System) -> _Columns:
         names = self._header.observables.get(system, [])
@@ -237,6 +246,14 @@ class ObservationReader:
         columns = _Columns(list(found.items()), factors)
         self._columns[system] = columns
         return columns
+
+
+def _flags(line: str, k: int | None) -> int:
+    """The loss-of-lock indicator of a carrier; 0 where there is none."""
+    if k is None:
+        return 0
+    text = line[3 + _WIDTH * k + 14 : 3 + _WIDTH * k + 15]
+    return int(text) if text.isdigit() else 0
 
 
 def _value(line: str, column: int | None, factors: list[float]) -> float | None:

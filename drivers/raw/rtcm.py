@@ -330,6 +330,7 @@ def _signals(system: System, message: Any, counters: Counter[str]) -> list[RawSi
     fine = "DF405" if hasattr(message, "DF405_01") else "DF400"
     phase = "DF406" if fine == "DF405" else "DF401"
     strength = "DF408" if fine == "DF405" else "DF403"
+    lock = "DF407" if fine == "DF405" else "DF402"
     found: list[RawSignal] = []
     for i in range(1, message.NCell + 1):
         counters[f"measured_{system}"] += 1
@@ -354,10 +355,27 @@ def _signals(system: System, message: Any, counters: Counter[str]) -> list[RawSi
         carrier = None
         if turn > _NO_FINE_CARRIER_MS[phase]:
             carrier = (whole + part + turn) * carrier_hz * 1e-3
+        if carrier is not None and getattr(message, f"DF420_{i:02d}"):
+            counters["half_cycle_open"] += 1
+            carrier = None
         fine_rate = getattr(message, f"DF404_{i:02d}", _NO_FINE_RATE_M_S)
         rate = None
         if rough_rate != _NO_RATE_M_S and fine_rate > _NO_FINE_RATE_M_S + 1e-9:
             rate = rough_rate + fine_rate
         cno = getattr(message, f"{strength}_{i:02d}") or None
-        found.append(RawSignal(system, int(name), code, pseudorange_m, rate, carrier, cno))
+        lock_s = _lock_s(getattr(message, f"{lock}_{i:02d}"), lock)
+        found.append(
+            RawSignal(
+                system, int(name), code, pseudorange_m, rate, carrier, cno, None, None, lock_s
+            )
+        )
     return found
+
+
+def _lock_s(indicator: int, name: str) -> float:
+    """The least time (s) that a lock time indicator stands for: DF402, 0 or 2^(i + 4) ms; DF407,
+    2^k (i - 32 k) ms with k = i / 32 - 1, not below 0 (RTCM 10403.3, tables 3.5-74 and 3.5-75)."""
+    if name == "DF402":
+        return float(1 << (indicator + 4)) * 1e-3 if indicator else 0.0
+    k = max(indicator // 32 - 1, 0)
+    return float((indicator - 32 * k) << k) * 1e-3

@@ -61,10 +61,12 @@ SIGNALS: dict[tuple[int, int], str] = {
 
 _HEADER = struct.Struct("<dHbBB3x")
 _MEASUREMENT = struct.Struct("<ddfBBBxHBBxBBx")
+_LOCK_FULL_MS = 64_500
+"""The count of locktime goes no further."""
 _SUBFRAME = struct.Struct("<BBBxBxBx")
 
 _LEAP_KNOWN, _CLOCK_RESET = 1, 2
-_RANGE_VALID, _CARRIER_VALID = 1, 2
+_RANGE_VALID, _CARRIER_VALID, _HALF_KNOWN = 1, 2, 4
 
 # Per signal what one measurement needs: system, RINEX code, metres per second and hertz.
 _BY_SIGNAL = {
@@ -102,7 +104,7 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
     Every measurement is counted as `measured_G`, `measured_E`, `measured_C`, or with the name of
     another system, and again where one of the three is refused: `signal_unknown`, `prn_unknown`,
     `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `rate_implausible`,
-    `signal_repeated`. A leap second count that cannot be is counted as `leap_seconds_implausible`
+    `signal_repeated`. A carrier with half a cycle open is left out: `half_cycle_open`. A leap second count that cannot be is counted as `leap_seconds_implausible`
     and not known.
     """
     if len(payload) < _HEADER.size:
@@ -137,7 +139,9 @@ def _signal(
     measurement: tuple[float, float, float, int, int, int, int, int, int, int, int],
     counters: Counter[str],
 ) -> RawSignal | None:
-    pseudorange, carrier, doppler, gnss, prn, sig, _, cno, sd_range, sd_doppler, track = measurement
+    pseudorange, carrier, doppler, gnss, prn, sig, lock_ms, cno, sd_range, sd_doppler, track = (
+        measurement
+    )
     system = SYSTEM_BY_ID.get(gnss)
     if system is None:
         counters[f"measured_{OTHER_SYSTEMS.get(gnss, 'unknown_system')}"] += 1
@@ -163,16 +167,21 @@ def _signal(
     if abs(doppler * wavelength) > MAX_RATE_M_S:
         counters["rate_implausible"] += 1
         return None
+    followed = track & _CARRIER_VALID
+    if followed and not track & _HALF_KNOWN:
+        counters["half_cycle_open"] += 1
+        followed = 0
     return RawSignal(
         system,
         prn,
         code,
         pseudorange,
         -doppler * wavelength,
-        carrier if track & _CARRIER_VALID else None,
+        carrier if followed else None,
         float(cno) if cno else None,
         0.01 * (1 << (sd_range & 0xF)),
         0.002 * (1 << (sd_doppler & 0xF)) * wavelength,
+        lock_ms * 1e-3 if lock_ms < _LOCK_FULL_MS else math.inf,
     )
 
 

@@ -56,7 +56,7 @@ class Innovation(NamedTuple):
 
 class State(NamedTuple):
     """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
-    (28,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
+    (35,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
     point, the truth). `lent` is what a filter lends aids to write their innovations to, by the
     number of rows: it holds until the next innovation is asked for."""
 

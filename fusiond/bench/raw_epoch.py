@@ -1,9 +1,10 @@
-"""Cost of an epoch of raw GNSS data: 40 satellites, a range and a rate of each.
+"""Cost of an epoch of raw GNSS data: 40 satellites with two frequencies each.
 
-From the decoded epoch to the filter that has used it: signals chosen, satellites and corrections
-computed, 80 rows linearised, gated one by one, folded in and tested by their residuals, the
-solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again,
-so the choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
+From the decoded epoch to the filter that has used it: signals chosen, carriers followed from the
+epoch before, satellites and corrections computed, 80 rows (ranges, rates by carriers) linearised,
+gated one by one, folded in and tested by their residuals, the solution corrected; then what
+`health` and the verdicts keep. The same epoch comes again and again after the same one, so the
+choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
 """
 
 from __future__ import annotations
@@ -22,23 +23,25 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
 from fusiond.gnss.orbit import is_beidou_geo
 from fusiond.models.catalogue import make_model
+from fusiond.navigation.strapdown import STEP_SECONDS
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.raw_gnss import RawGnss
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
 from fusiond.simulation.scenarios import SCENARIOS
 
 SATELLITES = 40
+SIGNALS: tuple[tuple[System, str], ...] = (("C", "2I"), ("C", "6I"), ("G", "1C"), ("G", "2L"))
 EPOCHS = 100
 
 
 def raw_epoch(_: int) -> Callable[[], int]:
     """Work of `EPOCHS` epochs, each with all that the daemon does with one."""
     truth = SCENARIOS["drive"].truth(10.0)
-    receiver = GnssRaw(truth, GnssRawOptions(), np.random.default_rng(1))
+    receiver = GnssRaw(truth, GnssRawOptions(signals=SIGNALS), np.random.default_rng(1))
     section = RawAiding(systems=("G", "C"))
     intake = Intake({"gnss": section})
     raw = intake.receivers["gnss"]
-    epoch = _crowded(receiver, raw)
+    before, epoch = _crowded(receiver, raw)
     start = truth.at(np.array([epoch.tow_s - receiver.start[1]]))
     imu = Imu()
     model = make_model("ins21", imu_noise(imu), *intake.extra_blocks())
@@ -49,10 +52,15 @@ def raw_epoch(_: int) -> Callable[[], int]:
     sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [3.0] * 3
     estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
 
-    instants = count()
+    instants = count(1)
+    estimator.step[STEP_SECONDS] = 1.0
+    first = raw.aid(before, 0)
+    first.at(nav).innovation(estimator.state)
+    estimator.step[STEP_SECONDS] += epoch.tow_s - before.tow_s
 
     def work() -> int:
         for _ in range(EPOCHS):
+            raw.recent[:] = [first]
             aid = raw.aid(epoch, next(instants))
             outcome = estimator.update(aid.at(nav))
             assert outcome.name == "fused"
@@ -65,19 +73,21 @@ def raw_epoch(_: int) -> Callable[[], int]:
     return work
 
 
-def _crowded(receiver: GnssRaw, raw: RawGnss) -> RawGnssEpoch:
-    """An epoch of 40 satellites; `raw` knows their ephemerides.
+def _crowded(receiver: GnssRaw, raw: RawGnss) -> tuple[RawGnssEpoch, RawGnssEpoch]:
+    """Two successive epochs of 40 satellites; `raw` knows their ephemerides.
 
     Half of them are doubles under numbers that the simulated constellations leave free, BeiDou's of
     the same kind of orbit.
     """
     for model in receiver.ionosphere:
         raw.learn(model)
-    epoch = receiver.epoch(10)
+    epochs = receiver.epoch(10), receiver.epoch(11)
     geostationary, others = iter(range(1, 6)), iter(range(6, 23))
     gps = iter(range(33, 64))
     doubles: dict[tuple[System, int], int] = {}
-    for s in epoch.signals:
+    for s in epochs[0].signals:
+        if (s.system, s.prn) in doubles:
+            continue
         free = gps if s.system == "G" else others
         if is_beidou_geo(s.system, s.prn):
             free = geostationary
@@ -85,5 +95,14 @@ def _crowded(receiver: GnssRaw, raw: RawGnss) -> RawGnssEpoch:
     for e in receiver.broadcast(float(receiver.t_s[10]), set(doubles)):
         raw.learn(e)
         raw.learn(replace(e, prn=doubles[e.system, e.prn]))
-    copied = [replace(s, prn=doubles[s.system, s.prn]) for s in epoch.signals]
-    return replace(epoch, signals=(*epoch.signals, *copied)[:SATELLITES])
+    few = list(doubles)[: SATELLITES - len(doubles)]
+
+    def crowded(epoch: RawGnssEpoch) -> RawGnssEpoch:
+        copied = [
+            replace(s, prn=doubles[s.system, s.prn])
+            for s in epoch.signals
+            if (s.system, s.prn) in few
+        ]
+        return replace(epoch, signals=(*epoch.signals, *copied))
+
+    return crowded(epochs[0]), crowded(epochs[1])

@@ -104,11 +104,12 @@ class RawAiding(Aiding):
     """Weaker signals are left out."""
     best_four: bool = False
     """Use the four satellites of smallest GDOP alone (paper 002), not all in view."""
-    bias_sd_m: NonNegativeFloat = 1.5
+    bias_sd_m: NonNegativeFloat = 0.5
     """Displacement that the ranges share for minutes (orbits, multipath), one sigma north and
-    east; 0: none is estimated, and sigma shrinks as if errors were white."""
-    bias_down_sd_m: PositiveFloat = 5.0
-    """The same downwards, where what the ionosphere's model leaves goes."""
+    east with eight satellites, less with more; 0: none is estimated, and sigma shrinks as if
+    errors were white."""
+    bias_down_sd_m: PositiveFloat = 1.0
+    """The same downwards. What models of ionosphere and troposphere leave is beside it."""
     bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that displacement."""
     clock_phase_m_sqrt_s: PositiveFloat = 0.1

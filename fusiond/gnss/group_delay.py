@@ -3,7 +3,8 @@ r"""Group delay of a signal in the satellite, against the clock of the ephemeris
     pseudorange + c (dt - d) = range + ...        d in s, in terms of the broadcast group delays
 
 GPS (clock refers to L1/L2 P, ionosphere-free):
-    L1: d = TGD,  L2: d = (f1/f2)^2 TGD,  L5: d = TGD, and 3 m more of sigma
+    L1 P: d = TGD,  L2 P: d = (f1/f2)^2 TGD;  L1 C/A, L2C: the same, and 0.3 m more of sigma
+    L5: d = TGD, and 3 m more of sigma
 Galileo (clock of I/NAV refers to E1/E5b, of F/NAV to E1/E5a, each ionosphere-free):
     E1:  I/NAV d = BGDb,  F/NAV d = BGDa
     E5b: I/NAV d = (f1/f5b)^2 BGDb
@@ -19,7 +20,8 @@ Without a broadcast delay, so refused by name: BeiDou B1C and B2a until B-CNAV h
 until D1 or D2 has, Galileo E5 as a whole and E6.
 
 E5a with an I/NAV clock: both clocks serve E1, so dt_F - BGDa = dt_I - BGDb there, and dt_F follows.
-L5: the inter-signal correction is in CNAV only. IS-GPS-705J 20.3.3.3.1.2.1 has it within
+L1 C/A and L2C: the inter-signal corrections, in CNAV only as well, are the differential code biases
+C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5: the inter-signal correction is in CNAV only. IS-GPS-705J 20.3.3.3.1.2.1 has it within
 +-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
 
 Source: IS-GPS-200N 20.3.3.3.3.2; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0 5.2.4
@@ -34,6 +36,9 @@ from typing import NamedTuple
 from drivers.raw.messages import CARRIER_HZ, Ephemeris
 
 GPS_L5_SIGMA_M = 3.0
+GPS_CIVIL_SIGMA_M = 0.3
+_P_CODES = "WPYMD"
+"""Signals that the clock refers to."""
 
 
 class GroupDelay(NamedTuple):
@@ -55,7 +60,7 @@ def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
     """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris; None if unknown."""
     band, delays = signal[0], ephemeris.group_delay_s
     if ephemeris.system == "G":
-        return _gps(band, delays)
+        return _gps(signal, delays)
     if ephemeris.system == "E":
         return _galileo(band, delays, ephemeris.message)
     if ephemeris.message in _DATA_BAND:
@@ -63,10 +68,11 @@ def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
     return _beidou(band, signal, delays)
 
 
-def _gps(band: str, delays: tuple[float, ...]) -> GroupDelay | None:
+def _gps(signal: str, delays: tuple[float, ...]) -> GroupDelay | None:
     if not delays:
         return None
-    scale = {"1": (1.0, 0.0), "2": (_L1_L2, 0.0), "5": (1.0, GPS_L5_SIGMA_M)}.get(band)
+    civil = 0.0 if signal[1:2] in _P_CODES else GPS_CIVIL_SIGMA_M
+    scale = {"1": (1.0, civil), "2": (_L1_L2, civil), "5": (1.0, GPS_L5_SIGMA_M)}.get(signal[0])
     return None if scale is None else GroupDelay(scale[0] * delays[0], scale[1])
 
 

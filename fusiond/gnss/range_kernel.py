@@ -4,11 +4,33 @@ r"""Range and range rate equations of one epoch, for all satellites at once.
     P + c (dt - d) - T - I = rho + b_system + noise
     D (1 + l . v_i / c) + c ddt = l . (v - v_r) + d + noise,    v_i = v + we x s
 
+Of a satellite with two carriers I is what they measure (fusiond.gnss.carriers), of variance V, up
+to an offset that its system's signals share (what the receiver delays one band more than the
+other). With I0 the model's delay, p the part of it that is not known, of satellite k, over
+those of its group
+
+    B   = sum w_k (I_k - I0_k) / sum w_k,       w_k = 1 / (V_k + p^2 I0_k^2)
+    M   = sum w_k I0_k / sum w_k
+    I   = I0 + B + a (I_k - I0 - B),            a = s^2 / (s^2 + V),  a = 0 with one carrier
+    s^2 = p^2 (I0 - M)^2 + (0.3 p I0)^2
+    var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) p (I0 - M)
+
+for with B known a model that is too strong or too weak errs by p (I0 - M), and by 0.3 p I0 from
+place to place in the sky. A group are the signals of one carrier of GPS, Galileo, BeiDou-3 or BeiDou-2; one without pairs has
+B = 0. So a satellite with one carrier, or a fresh one, has its delay of
+the model, at the level that the others measure.
+
 s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
 of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive while the
 distance grows); dt, ddt the satellite's clock offset and drift, d the signal's group delay; T, I
 troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
 D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
+
+A carrier's rate is the mean over dt before the epoch: that of the middle, D at the epoch less dt / 2
+times the range's acceleration l . a + (|w|^2 - (l . w)^2) / rho (to 1e-5 m/s in 2 s), w = v - v_r,
+of which `PULL` has l . a, the satellite's; in the turning axes
+
+    a = -GM s / |s|^3 - 2 we x v - we x (we x s)
 
 r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
 
@@ -32,6 +54,26 @@ from fusiond.gnss.atmosphere import (
     zenith_delays,
 )
 from fusiond.gnss.bdgim import bdgim
+from fusiond.gnss.carriers import (
+    CNO as CNO_A,
+)
+from fusiond.gnss.carriers import (
+    FIRST_COLUMNS,
+    MOVED,
+    MOVED_VARIANCE,
+    P_A,
+    SD_A,
+    SLANT,
+    SLANT_VARIANCE,
+    SPAN,
+    WITH_CODE,
+)
+from fusiond.gnss.carriers import (
+    RATE as DOPPLER,
+)
+from fusiond.gnss.carriers import (
+    SD_RATE as SD_DOPPLER,
+)
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
 from fusiond.navigation.compiled import compiled
@@ -42,22 +84,32 @@ EARTH_RATE_RAD_S = 7.2921151467e-5
 LOWEST_RADIUS_M = 6.3e6
 """A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
 
+GM_M3_S2 = 3.986004418e14
+"""For a satellite's acceleration, to 1e-3 of it: over half of two seconds 1e-3 m/s."""
+ATMOSPHERE_RATE_M_S = 0.002
+"""How fast ionosphere and troposphere change a range at the zenith beside their models."""
+BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
+"""One sigma of what a receiver delays BeiDou-2 more than BeiDou-3: of B1I (a Septentrio's has
+0.5 m), and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13
+(2021), 15, find metres on two makes of receivers."""
+
 _NEPERS = 0.1 * math.log(10.0)
 """A decibel of power as an exponent of e."""
 
 # What the plan says of each row.
-SIGNAL_COLUMNS = 4
-GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE = range(SIGNAL_COLUMNS)
+SIGNAL_COLUMNS = 6
+GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(SIGNAL_COLUMNS)
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # What the receiver says of each row; NaN where it does not.
-MEASURED_COLUMNS = 5
-PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = range(MEASURED_COLUMNS)
-# Results; the first ten are what an aid takes (fusiond.aiding.pseudorange).
-ROW_COLUMNS = 21
-AID_ROWS = 10
+MEASURED_COLUMNS = FIRST_COLUMNS
+PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
+# Results; the first seventeen are what an aid takes (fusiond.aiding.pseudorange).
+ROW_COLUMNS = 27
+AID_ROWS = 17
 (
-    X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, TOTAL_VARIANCE, RATE_VARIANCE,
-    LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON,
+    X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
+    COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL,
+    LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, TROPOSPHERE, IONOSPHERE, TOTAL_VARIANCE,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -67,15 +119,60 @@ NOISE_VALUES = 8
 ) = range(NOISE_VALUES)  # fmt: skip
 
 
+@compiled("void(f8[:, ::1], f8[:, ::1], f8, b1, f8[:, ::1])", allocates=True)
+def _take_off_ionosphere(
+    signals: Array, carriers: Array, local: float, on_earth: bool, out: Array
+) -> None:
+    """Settle each satellite's delay by model and carriers, and what is left of it."""
+    n = signals.shape[0]
+    weights, offsets, middles = np.zeros(n), np.zeros(n), np.zeros(n)
+    for k in range(n):
+        if math.isnan(carriers[k, SLANT]):
+            continue
+        w = 1.0 / (carriers[k, SLANT_VARIANCE] + out[COMMON, k] * out[COMMON, k])
+        group = int(signals[k, GROUP])
+        weights[group] += w
+        offsets[group] += w * (carriers[k, SLANT] - out[IONOSPHERE, k])
+        middles[group] += w * out[IONOSPHERE, k]
+    for k in range(n):
+        group, sigma, delay = int(signals[k, GROUP]), out[COMMON, k], out[IONOSPHERE, k]
+        share, variance, own = 0.0, 0.0, local * sigma
+        if weights[group] > 0.0:
+            level = offsets[group] / weights[group]
+            if on_earth and delay > 0.0:
+                sigma *= (delay - middles[group] / weights[group]) / delay
+            if not math.isnan(carriers[k, SLANT]):
+                v = carriers[k, SLANT_VARIANCE]
+                s = sigma * sigma + own * own
+                share = s / (s + v) if on_earth else 1.0
+                level += share * (carriers[k, SLANT] - delay - level)
+                variance = share * (share * v + carriers[k, WITH_CODE])
+            out[IONOSPHERE, k] += level
+        out[CORRECTED, k] -= out[IONOSPHERE, k]
+        left = (1.0 - share) * sigma
+        out[COMMON, k] = left
+        out[VARIANCE, k] += variance + ((1.0 - share) * own) ** 2
+        out[BEIDOU_2_SIGMA, k] = 0.0
+        if signals[k, BEIDOU_2] > 0.0:
+            out[BEIDOU_2_SIGMA, k] = BEIDOU_2_CODE_M + BEIDOU_2_PAIR_M * share
+        out[TOTAL_VARIANCE, k] = (
+            out[VARIANCE, k]
+            + left * left
+            + out[TROPOSPHERE_SIGMA, k] ** 2
+            + out[BEIDOU_2_SIGMA, k] ** 2
+        )
+
+
 @compiled(
-    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8, f8,"
-    "f8[:, ::1])",
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8,"
+    "f8, f8[:, ::1])",
     allocates=True,
 )
 def range_rows(
     elements: Array,
     signals: Array,
     measured: Array,
+    carriers: Array,
     ionosphere: Array,
     week: float,
     tow: float,
@@ -85,11 +182,12 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (21, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
+    """Write (27, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 33), `signals` (n, 4), `measured` (n, 5), `ionosphere` (3, 49): GPS's and
-    BeiDou's eight coefficients, and the terms of BDGIM; `noise` (8,).
+    `elements` (n, 33), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
+    fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
+    terms of BDGIM; `noise` (8,).
     """
     n = elements.shape[0]
     refused = 0
@@ -160,13 +258,34 @@ def range_rows(
         out[ELEVATION, k], out[NORTH, k], out[EAST, k] = elevation, north, east
         out[TROPOSPHERE, k], out[IONOSPHERE, k], out[COMMON, k] = tropo, iono, iono_sigma
         clock = SPEED_OF_LIGHT_M_S * states[k, 6] - signals[k, GROUP_DELAY_M]
-        out[CORRECTED, k] = measured[k, PSEUDORANGE] + clock - tropo - iono
+        out[CORRECTED, k] = measured[k, PSEUDORANGE] + clock - tropo
         inertial = (
             lx * (vx - EARTH_RATE_RAD_S * y) + ly * (vy + EARTH_RATE_RAD_S * x) + lz * vz
         ) / SPEED_OF_LIGHT_M_S
         drift = SPEED_OF_LIGHT_M_S * states[k, 7]
-        out[CORRECTED_RATE, k] = measured[k, RATE] * (1.0 + inertial) + drift
         thin = slant(up)
+        out[CORRECTED_RATE, k] = measured[k, RATE] * (1.0 + inertial) + drift
+        stated = measured[k, SD_RATE]
+        if math.isnan(stated):
+            stated = 0.0
+        out[RATE_VARIANCE, k] = (
+            noise[RATE_ZENITH] * noise[RATE_ZENITH] * thin * thin + stated * stated
+        )
+        span = carriers[k, SPAN]
+        out[CARRIER_SPAN, k] = span
+        out[CARRIER_RATE, k], out[CARRIER_VARIANCE, k], out[PULL, k] = math.nan, math.nan, 0.0
+        if span > 0.0:
+            out[CARRIER_RATE, k] = carriers[k, MOVED] * (1.0 + inertial) + drift
+            change = ATMOSPHERE_RATE_M_S * thin
+            out[CARRIER_VARIANCE, k] = carriers[k, MOVED_VARIANCE] * thin * thin + change * change
+            radius2 = x * x + y * y + z * z
+            fall = GM_M3_S2 / (radius2 * math.sqrt(radius2))
+            turn = EARTH_RATE_RAD_S * EARTH_RATE_RAD_S - fall
+            out[PULL, k] = (
+                lx * (turn * x + 2.0 * EARTH_RATE_RAD_S * vy)
+                + ly * (turn * y - 2.0 * EARTH_RATE_RAD_S * vx)
+                - lz * fall * z
+            )
         code = noise[CODE_ZENITH] * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno
@@ -178,15 +297,8 @@ def range_rows(
             code * code
             + noise[CODE_CNO] * noise[CODE_CNO] * weak
             + stated * stated
-            + (noise[TROPO_ZENITH] * thin) ** 2
-            + (noise[IONO_LOCAL] * iono_sigma) ** 2
             + signals[k, FIXED_VARIANCE]
         )
-        out[TOTAL_VARIANCE, k] = out[VARIANCE, k] + iono_sigma * iono_sigma
-        stated = measured[k, SD_RATE]
-        if math.isnan(stated):
-            stated = 0.0
-        out[RATE_VARIANCE, k] = (
-            noise[RATE_ZENITH] * noise[RATE_ZENITH] * thin * thin + stated * stated
-        )
+        out[TROPOSPHERE_SIGMA, k] = noise[TROPO_ZENITH] * thin if on_earth else 0.0
+    _take_off_ionosphere(signals, carriers, noise[IONO_LOCAL], on_earth, out)
     return refused

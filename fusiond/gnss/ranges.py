@@ -1,32 +1,41 @@
 r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how good each row is.
 
-    sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2
-                     + (0.12 m)^2 + (0.2 s_I)^2 + s_sis^2 + s_d^2
-    sigma^2(rate)  = (r m)^2 + s_rx^2
-    common to all ranges: s_I n,  n ~ N(0, 1),  s_I half the modelled delay, or 5 m m without model
+    sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2 + s_sis^2 + s_d^2
+                     + what carriers leave of the ionosphere + (0.3 s_I)^2
+    sigma^2(rate)  = (r m)^2 + s_rx^2,  or of the carrier from epoch to epoch
+    common to all ranges: s_I n_1 + 0.12 m n_2 + s_2 n_3,   n ~ N(0, 1)
 
 m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zenith and b thermal
-noise at 45 dB-Hz (m), s_rx what the receiver states, 0.12 m the troposphere left, s_sis orbit and
-clock, s_d the group delay left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
+noise at 45 dB-Hz (m), s_rx what the receiver states, s_sis orbit and clock, s_d the group delay
+left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
 
-The ionosphere that is left is not noise: the model is too strong or too weak for the whole sky and
-for hours. So it has a column of its own, `ionosphere_sigma_m`, to be used as one more unknown with
-unit variance (as `fusiond.gnss.single_point` does), or as a state of a filter; a fifth of it stands
-for what differs from satellite to satellite.
+s_I is what is not known of the ionosphere: half the modelled delay, or 5 m m without a model, of a
+satellite with one carrier; of one with two what `fusiond.gnss.range_kernel` leaves of it. 0.12 m is
+the troposphere left, s_2 what a receiver delays BeiDou-2 more than BeiDou-3. These are not noise:
+a model is too strong or too weak for the whole sky and for hours. So each has a column of its own,
+to be used as one more unknown with unit variance (as `fusiond.gnss.single_point` does), or as a
+state of a filter; 0.3 of s_I stand for what differs from satellite to satellite.
 
-One signal of each satellite serves: the first of `PREFERRED` that is there. Nothing is combined:
-the ionosphere-free pair makes noise and multipath 2.6 to 3 times as large.
+a and b are those of `RangeNoise` until the codes of satellites with two carriers have shown what
+this receiver's are (`fusiond.gnss.carriers`).
+
+One signal of each satellite serves as range and carrier, a second one for its slant delay
+(`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
+is the least uncertain; without a pair the first of `PREFERRED` that is there.
 
 Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
-its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
+its signals, or of none that is preferred), `weak_signal`, `low_elevation`; of carriers, which then
+give no rate for the epoch, `lock_lost`, `cycle_slip`, and of all at once `clock_jump`.
 """
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
+from itertools import chain, compress
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -42,9 +51,10 @@ from drivers.raw.messages import (
     RawSignal,
     System,
 )
+from fusiond.gnss import carriers as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.bdgim import TERMS, bdgim_terms
-from fusiond.gnss.group_delay import group_delay
+from fusiond.gnss.group_delay import GroupDelay, group_delay
 from fusiond.gnss.orbit import WEEK_S, Orbits
 from fusiond.gnss.store import EphemerisStore
 
@@ -57,13 +67,21 @@ PREFERRED: dict[System, tuple[str, ...]] = {
 }
 """Signals that have a broadcast group delay, best known first."""
 
-SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.7, "E": 0.7, "C": 1.5}
-"""Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, GPS Solutions 19 (2015),
-321-333, for GPS and BeiDou. Galileo's 1.6 m there were its first four satellites: GPS's
-is taken."""
+SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.6, "E": 0.3, "C": 0.6}
+"""Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, Advances in Space Research 61
+(2018), 3020-3038: Galileo 0.2 m, GPS 0.6, BeiDou-2 1.0, all of 2017. Galileo's group delays are in
+the 0.3 m; BeiDou-3, not whole then, is taken for GPS."""
+BEIDOU_2_IN_SPACE_M = 1.0
+LAST_BEIDOU_2_PRN = 18
+"""BDS-SIS-ICD-B1I-3.0 table 4-1: BeiDou-3 begins with 19 but for its GEO, from 59."""
 
 GPS_IONO_HZ = CARRIER_HZ["G", "1"]
 BEIDOU_IONO_HZ = CARRIER_HZ["C", "2"]
+BAND_DELAY_M = 3.0
+"""10 ns: what receivers delay one carrier more than another."""
+LEAST_GAMMA = 1.3
+"""Of (f_a / f_b)^2: nearer carriers (B3I and B2a, 1.16; E1 and E6 have 1.52) make noise tenfold, and
+of what a receiver delays one more than the other metres."""
 PLAN_HOLDS_S = 10.0
 """Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
 
@@ -86,7 +104,7 @@ class RangeNoise:
     troposphere_m: float = 0.12
     ionosphere_share: float = 0.5
     ionosphere_unmodelled_m: float = 5.0
-    ionosphere_local: float = 0.2
+    ionosphere_local: float = 0.3
     rate_m_s: float = 0.05
 
     def array(self) -> Array:
@@ -117,6 +135,19 @@ class RangeOptions:
     signal_in_space_m: dict[System, float] = field(default_factory=lambda: SIGNAL_IN_SPACE_M)
 
 
+_FIRST = attrgetter(
+    "pseudorange_m",
+    "range_rate_m_s",
+    "cno_db_hz",
+    "sd_pseudorange_m",
+    "sd_range_rate_m_s",
+    "carrier_cycles",
+    "lock_s",
+)
+_SECOND = attrgetter("pseudorange_m", "cno_db_hz", "sd_pseudorange_m", "carrier_cycles", "lock_s")
+_KEY = attrgetter("system", "prn", "signal")
+
+
 class _Of:
     """A view (n,) or (n, 3) of the values of rows."""
 
@@ -137,9 +168,11 @@ class Rows:
     satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
     that was assumed; `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use;
     `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
-    independent, `ionosphere_sigma_m` (n,) of what is common, `total_variance` (n,) of both;
-    `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
-    `values` (21, n) has all of them, as `range_kernel.range_rows` writes it.
+    independent, `common` (n, 3) what a common error of one sigma adds (ionosphere, troposphere,
+    BeiDou-2), `total_variance` (n,) of both; `carrier_rate_m_s` (n,) the mean rate over the last
+    `span_s` (n,) by the carrier, NaN and 0 where there is none; `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs
+    of satellite and reason.
+    `values` (27, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -162,6 +195,9 @@ class Rows:
     troposphere_m = _Of(rk.TROPOSPHERE)
     ionosphere_m = _Of(rk.IONOSPHERE)
     ionosphere_sigma_m = _Of(rk.COMMON)
+    common = _Of(slice(rk.COMMON, rk.BEIDOU_2_SIGMA + 1))
+    span_s = _Of(rk.CARRIER_SPAN)
+    carrier_rate_m_s = _Of(rk.CARRIER_RATE)
     total_variance = _Of(rk.TOTAL_VARIANCE)
 
     @property
@@ -195,6 +231,10 @@ class _Plan(NamedTuple):
     gps_s: float
     serving: list[int]
     doubles: struct.Struct
+    seconds: list[int]
+    second_doubles: struct.Struct
+    second_rows: npt.NDArray[np.intp]
+    followed: Array
     measured_at: npt.NDArray[np.intp]
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
@@ -206,13 +246,43 @@ class _Plan(NamedTuple):
     refused: tuple[tuple[str, str], ...]
 
 
+class _Served(NamedTuple):
+    """Of a satellite: which signal is its range, which one measures the ionosphere beside it, its
+    group (system, BeiDou-2, carrier), and its rows of the plan but for the group's."""
+
+    index: int
+    second: int | None
+    ephemeris: Ephemeris
+    group: tuple[System, bool, str]
+    fixed: tuple[float, float, float, float]
+    followed: tuple[float, float, float, float, float, float, float, float]
+
+
 class Picked(NamedTuple):
-    """An epoch's signals that serve, (n, 5) as measured: all that does not need the receiver."""
+    """An epoch's signals that serve, (n, 7) as measured, and the second ones (n, 5), NaN where there
+    is none."""
 
     plan: _Plan
     week: int
     tow_s: float
     measured: Array
+    second: Array
+
+
+class Followed(NamedTuple):
+    """Picked signals with what their carriers tell (n, 6) after the epochs before, what the model's
+    sigmas of codes are multiplied by, and whose carriers tell nothing and why: all that does not
+    need the receiver."""
+
+    picked: Picked
+    carriers: Array
+    code_scale: float
+    slips: tuple[tuple[str, str], ...]
+
+
+def nothing_kept() -> Array:
+    """What is kept of carriers before the first epoch."""
+    return np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
 
 class RangeModel:
@@ -223,18 +293,23 @@ class RangeModel:
         self.options = options or RangeOptions()
         self._noise = self.options.noise.array()
         self._plan: _Plan | None = None
+        self._kept = nothing_kept()
 
     def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
         """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
 
         A receiver nearer to the earth's centre than its surface is a first guess: elevations are
-        then 90 deg and the atmosphere is left out.
+        then 90 deg and the atmosphere is left out. Epochs are to come in the order of time.
         """
-        return self.evaluate(self.pick(epoch), receiver)
+        return self.evaluate(self.followed(epoch), receiver)
+
+    def followed(self, epoch: RawGnssEpoch) -> Followed:
+        """An epoch after those that were asked for before."""
+        return self.follow(self.pick(epoch), self._kept)
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
         """Choose the signals that serve."""
-        keys = [(s.system, s.prn, s.signal) for s in epoch.signals]
+        keys = list(map(_KEY, epoch.signals))
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan
         if (
@@ -244,36 +319,52 @@ class RangeModel:
             or plan.keys != keys
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
-        values: list[float | None] = []
-        for k in plan.serving:
-            s = epoch.signals[k]
-            values += (
-                s.pseudorange_m,
-                s.range_rate_m_s,
-                s.cno_db_hz,
-                s.sd_pseudorange_m,
-                s.sd_range_rate_m_s,
-            )
-        measured = np.empty((len(plan.serving), rk.MEASURED_COLUMNS))
-        try:
-            plan.doubles.pack_into(measured.data, 0, *values)  # half of what numpy takes
-        except struct.error:  # what a receiver does not say is None
-            measured[:] = np.array(values, float).reshape(measured.shape)
-        return Picked(plan, epoch.week, epoch.tow_s, measured)
+        signals = epoch.signals
+        measured = _packed(
+            plan.doubles, map(_FIRST, [signals[k] for k in plan.serving]), ca.FIRST_COLUMNS
+        )
+        second = np.full((len(plan.serving), ca.SECOND_COLUMNS), np.nan)
+        second[plan.second_rows] = _packed(
+            plan.second_doubles, map(_SECOND, [signals[k] for k in plan.seconds]), ca.SECOND_COLUMNS
+        )
+        return Picked(plan, epoch.week, epoch.tow_s, measured, second)
 
-    def evaluate(self, picked: Picked, receiver: Array) -> Rows:
+    def follow(self, picked: Picked, kept: Array) -> Followed:
+        """Take an epoch in to what is `kept` of the ones before, which is changed."""
+        plan = picked.plan
+        carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
+        refused = np.empty(len(plan.serving), np.int64)
+        now = picked.week * WEEK_S + picked.tow_s
+        args = plan.followed, picked.measured, picked.second, now, carriers, refused
+        jumped = ca.follow(kept, *args)
+        scale = math.sqrt(ca.scale_squared(kept))
+        slips: tuple[tuple[str, str], ...] = ()
+        if refused.any():
+            slips = tuple(
+                (plan.satellites[k], "lock_lost" if refused[k] == ca.LOCK_LOST else "cycle_slip")
+                for k in np.flatnonzero(refused)
+            )
+        if jumped:
+            slips += (("", "clock_jump"),)
+        return Followed(picked, carriers, scale, slips)
+
+    def evaluate(self, followed: Followed, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
-        plan, options = picked.plan, self.options
+        picked, options = followed.picked, self.options
+        plan = picked.plan
         out = np.empty((rk.ROW_COLUMNS, len(plan.satellites)))
+        noise = self._noise.copy()
+        noise[: rk.CODE_CNO + 1] *= followed.code_scale
         lost = rk.range_rows(
             plan.orbits.elements,
             plan.fixed,
             picked.measured,
+            followed.carriers,
             plan.ionosphere,
             float(picked.week),
             picked.tow_s,
             np.ascontiguousarray(receiver, float),
-            self._noise,
+            noise,
             options.elevation_mask_rad,
             options.cno_mask_db_hz,
             out,
@@ -297,55 +388,112 @@ class RangeModel:
         for k, s in enumerate(epoch.signals):
             if s.system in self.options.systems:
                 by_satellite.setdefault((s.system, s.prn), {})[s.signal] = k
-        chosen: list[tuple[int, RawSignal, Ephemeris]] = []
-        fixed: list[tuple[float, float, float, float]] = []
+        chosen: list[_Served] = []
         refused: list[tuple[str, str]] = []
         for found in by_satellite.values():
             served = self._serve(epoch, found)
             if isinstance(served, str):
                 refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
-                continue
-            index, ephemeris, row = served
-            chosen.append((index, epoch.signals[index], ephemeris))
-            fixed.append(row)
-        serving = [k for k, _, _ in chosen]
+            else:
+                chosen.append(served)
+        groups = _grouped(chosen)
+        serving = [s.index for s in chosen]
+        signals = [epoch.signals[k] for k in serving]
+        paired = [k for k, s in enumerate(chosen) if s.second is not None]
+        seconds = [s.second for s in chosen if s.second is not None]
         return _Plan(
             keys,
             self.store.version,
             now,
             serving,
-            struct.Struct(f"{len(serving) * rk.MEASURED_COLUMNS}d"),
+            struct.Struct(f"{len(serving) * ca.FIRST_COLUMNS}d"),
+            seconds,
+            struct.Struct(f"{len(seconds) * ca.SECOND_COLUMNS}d"),
+            np.array(paired, np.intp),
+            np.array([s.followed for s in chosen], float).reshape(-1, ca.PLAN_COLUMNS),
             np.array(serving, np.intp),
-            tuple(s.satellite for _, s, _ in chosen),
-            tuple(s.signal for _, s, _ in chosen),
-            np.array([SYSTEMS.index(s.system) for _, s, _ in chosen], np.intp),
-            np.array([self.options.systems.index(s.system) for _, s, _ in chosen], np.int64),
-            Orbits.of([e for _, _, e in chosen]),
-            np.array(fixed, float).reshape(len(fixed), rk.SIGNAL_COLUMNS),
+            tuple(s.satellite for s in signals),
+            tuple(s.signal for s in signals),
+            np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
+            np.array([self.options.systems.index(s.system) for s in signals], np.int64),
+            Orbits.of([s.ephemeris for s in chosen]),
+            np.array(groups, float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
             tuple(refused),
         )
 
-    def _serve(
-        self, epoch: RawGnssEpoch, found: dict[str, int]
-    ) -> tuple[int, Ephemeris, tuple[float, float, float, float]] | str:
-        """Of one satellite's signals the one that serves: index, ephemeris, row of the plan."""
+    def _serve(self, epoch: RawGnssEpoch, found: dict[str, int]) -> _Served | str:
+        """Of one satellite's signals those that serve."""
         first = epoch.signals[next(iter(found.values()))]
         wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
         outcome = "no_group_delay"
+        candidates: list[tuple[int, Ephemeris, GroupDelay]] = []
         for k in wanted or found.values():
             s = epoch.signals[k]
             e = self.store.select(s.system, s.prn, epoch.week, epoch.tow_s, s.signal[0])
             if isinstance(e, str):
                 outcome = e
-                continue
-            delay = group_delay(e, s.signal)
-            if delay is None:
-                continue
-            model, scale = self._ionosphere_model(s)
-            variance = self.options.signal_in_space_m[s.system] ** 2 + delay.sigma_m**2
-            return k, e, (SPEED_OF_LIGHT_M_S * delay.delay_s, model, scale, variance)
-        return outcome
+            elif (delay := group_delay(e, s.signal)) is not None:
+                candidates.append((k, e, delay))
+        if not candidates:
+            return outcome
+        best: tuple[float, int, int, Ephemeris, GroupDelay, GroupDelay] | None = None
+        for k, e, delay in candidates:
+            for j in found.values():
+                other = group_delay(e, epoch.signals[j].signal)
+                if other is None:
+                    continue
+                gamma = _gamma(epoch.signals[k], epoch.signals[j])
+                if gamma <= LEAST_GAMMA:
+                    continue
+                noise = ca.CODE_M**2
+                a, b = noise + delay.sigma_m**2, noise + other.sigma_m**2
+                variance = (gamma**2 * a + b) / (gamma - 1.0) ** 2
+                if best is None or variance < best[0]:
+                    best = variance, k, j, e, delay, other
+        if best is None:
+            k, e, delay = candidates[0]
+            return self._served(epoch, k, e, delay, None, None)
+        _, k, j, e, delay, other = best
+        return self._served(epoch, k, e, delay, j, other)
+
+    def _served(
+        self,
+        epoch: RawGnssEpoch,
+        index: int,
+        ephemeris: Ephemeris,
+        delay: GroupDelay,
+        second: int | None,
+        other: GroupDelay | None,
+    ) -> _Served:
+        s = epoch.signals[index]
+        model, scale = self._ionosphere_model(s)
+        in_space = self.options.signal_in_space_m[s.system]
+        beidou_2 = s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN
+        if beidou_2:
+            in_space = max(in_space, BEIDOU_2_IN_SPACE_M)
+        variance = in_space**2 + delay.sigma_m**2
+        delay_m = SPEED_OF_LIGHT_M_S * delay.delay_s
+        slot = float(64 * SYSTEMS.index(s.system) + s.prn)
+        length = SPEED_OF_LIGHT_M_S / CARRIER_HZ[s.system, s.signal[0]]
+        first = float(_number(s.signal, ""))
+        followed = (slot, length, 0.0, 0.0, 0.0, 0.0, 0.0, first)
+        if second is not None and other is not None:
+            b = epoch.signals[second]
+            gamma = _gamma(s, b)
+            followed = (
+                slot,
+                length,
+                SPEED_OF_LIGHT_M_S / CARRIER_HZ[b.system, b.signal[0]],
+                gamma,
+                SPEED_OF_LIGHT_M_S * (other.delay_s - delay.delay_s),
+                (delay.sigma_m**2 + other.sigma_m**2) / (gamma - 1.0) ** 2,
+                float(_number(s.signal, b.signal)),
+                first,
+            )
+        fixed = (delay_m, model, scale, variance)
+        group = s.system, beidou_2, s.signal[0]
+        return _Served(index, second, ephemeris, group, fixed, followed)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
         """Model and scale to the signal's frequency: the system's own, else whichever came. Of
@@ -369,3 +517,47 @@ class RangeModel:
         if self.store.bdgim is not None:
             out[2] = bdgim_terms(self.store.bdgim, epoch.week, epoch.tow_s)
         return out
+
+
+def _packed(
+    doubles: struct.Struct, rows: Iterable[tuple[float | None, ...]], columns: int
+) -> Array:
+    """Values as rows; NaN for None."""
+    values = list(chain.from_iterable(rows))
+    out = np.empty((len(values) // columns, columns))
+    try:
+        doubles.pack_into(out.data, 0, *values)  # half of what numpy takes
+    except struct.error:  # what a receiver does not say is None
+        out[:] = np.array(values, float).reshape(out.shape)
+    return out
+
+
+def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:
+    """Rows of the plan with the numbers of their groups. What a receiver delays one carrier more
+    than another is in the clock where satellites with two carriers settle it: a satellite with
+    one, on another carrier than theirs, does not know it."""
+    numbers: dict[tuple[System, bool, str], int] = {}
+    paired: dict[tuple[System, bool], set[str]] = {}
+    for s in chosen:
+        numbers.setdefault(s.group, len(numbers))
+        if s.second is not None:
+            paired.setdefault(s.group[:2], set()).add(s.group[2])
+    rows = []
+    for s in chosen:
+        delay, model, scale, variance = s.fixed
+        settled = paired.get(s.group[:2])
+        if settled and s.group[2] not in settled:
+            variance += BAND_DELAY_M**2
+        rows.append((delay, model, scale, variance, numbers[s.group], s.group[1]))
+    return rows
+
+
+def _gamma(a: RawSignal, b: RawSignal) -> float:
+    """(f_a / f_b)^2."""
+    hertz = (CARRIER_HZ[s.system, s.signal[0]] for s in (a, b))
+    return float(next(hertz) / next(hertz)) ** 2
+
+
+def _number(a: str, b: str) -> int:
+    """A number, not 0, of a pair of signals."""
+    return int.from_bytes((a + b).encode("ascii"))

@@ -1,12 +1,13 @@
 r"""Least-squares position, velocity and clocks from one epoch: no filter, no past.
 
-    y - rho(x) = H [dr, b, n] + noise,   H = [-l, clock columns, s_I],   n ~ N(0, 1)
-    dx = N^-1 H^T W (y - rho),   N = H^T W H + diag(0, .., 0, 1)
+    y - rho(x) = H [dr, b, n] + noise,   H = [-l, clock columns, S],   n ~ N(0, I)
+    dx = N^-1 H^T W (y - rho),   N = H^T W H + diag(0, .., 0, 1, 1, 1)
 
-l (n, 3) lines of sight, one clock offset per system that is there, W = 1 / sigma^2; s_I n is what
-the ionosphere's model leaves in the whole sky, known beforehand to its sigma. Iterated until the
+l (n, 3) lines of sight, one clock offset per system that is there, W = 1 / sigma^2; S n is what the
+models of ionosphere and troposphere leave in the whole sky, and BeiDou-2's offset, known beforehand
+to their sigmas (`fusiond.gnss.ranges.Rows.common`). Iterated until the
 step is under 1 mm, from the earth's centre if nothing better is known. Velocity and drift the same
-way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and n^2, against
+way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and |n|^2, against
 chi^2 with as many degrees of freedom as there are rows more than positions and clocks; while it
 fails, the row with the largest normalised residual
 
@@ -34,7 +35,7 @@ import numpy.typing as npt
 
 from drivers.raw.messages import SYSTEMS, RawGnssEpoch
 from fusiond.gnss.ecef import ned_axes, to_geodetic
-from fusiond.gnss.ranges import Picked, RangeModel, Rows
+from fusiond.gnss.ranges import Followed, RangeModel, Rows
 from fusiond.navigation.chi_square import quantile
 
 Array = npt.NDArray[np.float64]
@@ -106,7 +107,7 @@ def dops(line_of_sight: Array, system: npt.NDArray[np.intp], receiver: Array) ->
 class _Fit(NamedTuple):
     position: Array
     clocks: Array
-    ionosphere: float
+    common: Array
     rows: Rows
     h: Array
     systems: list[int]
@@ -115,22 +116,22 @@ class _Fit(NamedTuple):
 
 
 def single_point(
-    model: RangeModel, epoch: RawGnssEpoch, guess: Array | None = None
+    model: RangeModel, epoch: RawGnssEpoch | Followed, guess: Array | None = None
 ) -> SinglePoint | str:
     """Solve one epoch; `too_few`, `geometry` or `diverged` names why there is none.
 
     `guess` (3,) ECEF m: where the receiver is about.
     """
-    picked = model.pick(epoch)
+    followed = epoch if isinstance(epoch, Followed) else model.followed(epoch)
     position = np.zeros(3) if guess is None else np.array(guess, float)
     out: list[str] = []
     while True:
-        fit = _fit(model, picked, position, out)
+        fit = _fit(model, followed, position, out)
         if isinstance(fit, str):
             return fit
         position, rows = fit.position, fit.rows
-        n, m = len(fit.h), fit.h.shape[1] - 1
-        statistic = float(fit.residual**2 @ (1.0 / rows.variance)) + fit.ionosphere**2
+        n, m = len(fit.h), fit.h.shape[1] - len(fit.common)
+        statistic = float(fit.residual**2 @ (1.0 / rows.variance)) + float(fit.common @ fit.common)
         bound = quantile(n - m, FALSE_ALARM) if n > m else 0.0
         if n - m < 2 or statistic <= bound:
             break
@@ -157,10 +158,12 @@ def single_point(
     )
 
 
-def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> _Fit | str:
+def _fit(
+    model: RangeModel, followed: Followed, position: Array, out: list[str]
+) -> _Fit | str:
     """Gauss-Newton from `position`, without the satellites in `out`."""
     for _ in range(MAX_ITERATIONS):
-        rows = model.evaluate(picked, position)
+        rows = model.evaluate(followed, position)
         if out:
             rows = rows.without(out)
         h, systems = design(rows.line_of_sight, rows.system)
@@ -170,16 +173,16 @@ def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> 
         if np.linalg.cond(h) > MAX_CONDITION:
             return "geometry"
         weight = 1.0 / rows.variance
-        h = np.column_stack([h, rows.ionosphere_sigma_m])
+        h = np.column_stack([h, rows.common])
         normal: Array = h.T @ (h * weight[:, None])
-        normal[m, m] += 1.0
+        normal[range(m, h.shape[1]), range(m, h.shape[1])] += 1.0
         covariance = np.asarray(np.linalg.inv(normal), np.float64)
         y = rows.pseudorange_m - rows.range_m
         x = covariance @ (h.T @ (weight * y))
         position = position + x[:3]
         if np.abs(x[:3]).max() < STEP_M:
             residual: Array = y - h @ x
-            return _Fit(position, x[3:m], float(x[m]), rows, h, systems, covariance, residual)
+            return _Fit(position, x[3:m], x[m:], rows, h, systems, covariance, residual)
     return "diverged"
 
 

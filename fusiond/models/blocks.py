@@ -127,6 +127,12 @@ def position_bias(name: str, sd_m: float, tau_s: float, axes: str = "ne") -> Blo
     return Block(name, "m", tuple(axes), columns, initial=sd_m, steady=sd_m, tau_s=tau_s)
 
 
+def shared_error(name: str, unit: str, sd: float, tau_s: float) -> Block:
+    """One state that some measurements share, a first-order Gauss-Markov process or a constant."""
+    steady = 0.0 if math.isinf(tau_s) else sd
+    return Block(name, unit, (name,), (-1,), initial=sd, steady=steady, tau_s=tau_s)
+
+
 def clock_blocks(
     offsets: tuple[str, ...] = ("receiver",), noise: ClockNoise | None = None
 ) -> list[Block]:

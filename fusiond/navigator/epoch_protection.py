@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import NotApplicable, State
-from fusiond.aiding.pseudorange import RANGE_BIAS
+from fusiond.aiding.pseudorange import DISPLACED_BY, RANGE_BIAS, RANGE_SHARED
 from fusiond.estimators.base import Estimator
 from fusiond.gnss.ecef import ned_axes
 from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude
@@ -119,7 +119,7 @@ class EpochProtection:
         n = int(ranges.sum())
         axes = ned_axes(float(state.nav[LAT]), float(state.nav[LON]))
         _, clocks = np.unique(corrected.aid.clock[ranges], return_inverse=True)
-        sigma = np.sqrt(corrected.aid.range_variance[ranges])
+        sigma = np.sqrt(corrected.aid.total_variance[ranges])
         epoch = Epoch(
             rows.line_of_sight[ranges] @ axes,
             clocks.astype(np.int64),
@@ -130,9 +130,13 @@ class EpochProtection:
             np.full(int(clocks.max(initial=-1)) + 1, CONSTELLATION_FAULT),
         )
         slots = [slot for block in RANGE_BIAS for slot in state.model.slots_of(block)]
-        shared = state.xi[slots] if len(slots) == 3 else np.zeros(3)
+        several = math.sqrt(DISPLACED_BY / max(n, 1))
+        shared = several * state.xi[slots] if len(slots) == 3 else np.zeros(3)
+        # Of an epoch alone nothing is known of what its ranges share.
+        columns = state.model.slots_of_all(RANGE_SHARED)
+        z = innovation.z[:n] + innovation.h[:n, columns] @ state.xi[columns]
         names = tuple(s for s, here in zip(rows.satellites, ranges, strict=True) if here)
-        self._heard[aid.source] = _Heard(aid.t_ns, names, epoch, innovation.z[:n], shared.copy())
+        self._heard[aid.source] = _Heard(aid.t_ns, names, epoch, z, shared)
 
     def level(self, source: str, estimator: Estimator) -> EpochLevel:
         """Of the estimator's present state, by the last epoch of a receiver."""

@@ -8,6 +8,7 @@ filter, the solution of the epoch alone starts the alignment.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,18 +21,27 @@ from drivers.immutable import immutable
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
-from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
+from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
-from fusiond.gnss.range_kernel import AID_ROWS, RATE_VARIANCE, TOTAL_VARIANCE
-from fusiond.gnss.ranges import Picked, RangeModel, RangeOptions, Rows
+from fusiond.gnss.range_kernel import AID_ROWS, CARRIER_VARIANCE, RATE_VARIANCE, VARIANCE
+from fusiond.gnss.ranges import (
+    Followed,
+    Picked,
+    RangeModel,
+    RangeOptions,
+    Rows,
+    nothing_kept,
+)
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
 from fusiond.gnss.store import EphemerisStore
 
 Array = NDArray[np.float64]
 
+REMEMBERED_NS = 12_000_000_000
+"""Epochs older than that are too old for the timeline, which goes back by ten seconds."""
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """Names of screened rows in `health`; everything else is `gated`."""
 
@@ -61,6 +71,7 @@ class _Corrected(NamedTuple):
     """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
 
     place: tuple[float, float, float]
+    followed: Followed
     guess: Array
     rows: Rows
     aid: PseudorangeAid
@@ -68,10 +79,21 @@ class _Corrected(NamedTuple):
 
 @dataclass(slots=True)
 class _Memory:
-    """Result of the last epoch, and whether its refused satellites have been counted."""
+    """Result of an epoch, and whether its refused satellites have been counted. `left` is
+    what the filter's last run over it leaves to the next. `followed` is the epoch after the one
+    whose `kept` is `after`, and `kept` what is known of carriers then."""
 
     corrected: _Corrected | None = None
     counted: bool = False
+    left: Array = field(default_factory=nothing_left)
+    before: Array = field(default_factory=nothing_left)
+    followed: Followed | None = None
+    after: Array | None = None
+    kept: Array = field(default_factory=nothing_kept)
+
+    def is_after(self, before: _Memory) -> bool:
+        """Whether the epoch has been followed from that one."""
+        return self.followed is not None and self.after is before.kept
 
 
 @immutable(eq=False)
@@ -98,10 +120,11 @@ class RawEpochAid(Aid):
     def at(self, nav: Array) -> PseudorangeAid:
         """The epoch's ranges for a vehicle there; it may have no satellites left."""
         lat, lon, height = nav[:3].tolist()
+        followed = self.receiver.followed(self)
         found, key = self.memory.corrected, (lat, lon, height)
-        if found is None or found.place != key:
+        if found is None or found.place != key or found.followed is not followed:
             guess = np.array(to_ecef(lat, lon, height))
-            found = _Corrected(key, guess, *self.receiver.correct(self, guess))
+            found = _Corrected(key, followed, guess, *self.receiver.correct(self, followed, guess))
             self.memory.corrected = found
         return found.aid
 
@@ -122,7 +145,8 @@ class RawEpochAid(Aid):
 
 
 class RawGnss:
-    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`."""
+    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`; `recent` are its last
+    epochs in the order of time."""
 
     def __init__(self, source: str, section: RawAiding) -> None:
         self.source = source
@@ -137,6 +161,7 @@ class RawGnss:
         self._left_out: dict[str, str] = {}
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
+        self.recent: list[RawEpochAid] = []
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
@@ -146,11 +171,45 @@ class RawGnss:
     def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
         """The epoch as an aid, with the ephemerides that are known by now."""
         picked = self._model.pick(epoch)
-        return RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
+        aid = RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
+        insort(self.recent, aid, key=_instant)
+        oldest = self.recent[-1].t_ns - REMEMBERED_NS
+        del self.recent[: bisect_left(self.recent, oldest, key=_instant)]
+        return aid
+
+    def followed(self, aid: RawEpochAid) -> Followed:
+        """The epoch after all that are known by now to be before it, in whatever order they came:
+        one that came late changes those behind it."""
+        recent = self.recent
+        at = bisect_left(recent, aid.t_ns, key=_instant)
+        while at < len(recent) and recent[at] is not aid and recent[at].t_ns == aid.t_ns:
+            at += 1
+        if at == len(recent) or recent[at] is not aid:  # older than all that is remembered
+            return aid.memory.followed or self._follow(aid, None)
+        first = at
+        while first > 0 and not recent[first].memory.is_after(recent[first - 1].memory):
+            first -= 1
+        for k in range(first, at + 1):
+            memory, before = recent[k].memory, recent[k - 1].memory if k else None
+            if before is None and memory.followed is None:
+                self._follow(recent[k], None)
+            elif before is not None and not memory.is_after(before):
+                self._follow(recent[k], before)
+        found = aid.memory.followed
+        assert found is not None
+        return found
+
+    def _follow(self, aid: RawEpochAid, before: _Memory | None) -> Followed:
+        memory = aid.memory
+        memory.after = None if before is None else before.kept
+        memory.kept = nothing_kept() if before is None else before.kept.copy()
+        memory.before = nothing_left() if before is None else before.left
+        memory.followed = found = self._model.follow(aid.picked, memory.kept)
+        return found
 
     def alone(self, aid: RawEpochAid) -> list[Offer]:
         """Position and velocity of an epoch alone, for the alignment; none without a solution."""
-        found = single_point(self._model, aid.epoch, self._guess)
+        found = single_point(self._model, self.followed(aid), self._guess)
         offers: list[Offer] = []
         if isinstance(found, str) or not found.consistent:
             self.refused[found if isinstance(found, str) else "inconsistent"] += 1
@@ -159,21 +218,23 @@ class RawGnss:
             offers = self._fix(found, aid.t_ns)
         left_out = aid.picked.plan.refused
         if self._guess is not None:
-            left_out = self._model.evaluate(aid.picked, self._guess).refused
+            left_out = self._model.evaluate(self.followed(aid), self._guess).refused
         self._judged, self._left_out = None, dict(left_out)
         self._count(aid, left_out)
         return offers
 
-    def correct(self, aid: RawEpochAid, guess: Array) -> tuple[Rows, PseudorangeAid]:
+    def correct(
+        self, aid: RawEpochAid, followed: Followed, guess: Array
+    ) -> tuple[Rows, PseudorangeAid]:
         """An epoch's rows for a vehicle at about `guess` (ECEF, m), and what they are as an aid."""
-        rows = self._model.evaluate(aid.picked, guess)
+        rows = self._model.evaluate(followed, guess)
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
             values = values.copy()
-            values[[TOTAL_VARIANCE, RATE_VARIANCE]] *= scale
+            values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -183,6 +244,8 @@ class RawGnss:
             rows.clock,
             self._section.lever_arm_m,
             aid.epoch.clock_reset,
+            aid.memory.before,
+            aid.memory.left,
             robust=aid.robust,
         )
 
@@ -212,6 +275,8 @@ class RawGnss:
             aid.memory.counted = True
             for satellite, reason in refused:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
+            for satellite, reason in self.followed(aid).slips:
+                self.refused[f"{satellite[0]}_{reason}" if satellite else reason] += 1
 
     def sky(self) -> Sky:
         """Result of the last epoch."""
@@ -252,6 +317,10 @@ class RawGnss:
             sd = self._section.start_velocity_sd_m_s
             offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd), lever))
         return offers
+
+
+def _instant(aid: RawEpochAid) -> int:
+    return aid.t_ns
 
 
 def _seen(epoch: RawGnssEpoch, rows: Rows) -> dict[str, Seen]:

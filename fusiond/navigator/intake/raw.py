@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.settings import clock_noise
-from fusiond.models.blocks import Block, clock_blocks, position_bias
+from fusiond.models.blocks import Block, clock_blocks, position_bias, shared_error
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
@@ -18,9 +20,22 @@ def aids(m: RawGnssEpoch, sections: Sections, when: Instants) -> list[Aid] | str
     return [receiver.aid(m, when.t_ns)]
 
 
+CARRIER_CLOCK_M_S = 1.0
+"""One sigma of what a clock's phase adds to the mean drift between two epochs: 0.1 m by the root of
+a second are 0.45 m/s over 50 ms."""
+CARRIER_CLOCK_LASTS_S = 0.01
+"""It is another one at each epoch."""
+IONOSPHERE_LASTS_S, TROPOSPHERE_LASTS_S = 1800.0, 10_800.0
+"""The first as long as the displacement's default; fronts pass in hours."""
+
+
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     """A clock offset a system, drift, and errors that ranges share."""
-    from fusiond.aiding.pseudorange import RANGE_BIAS  # noqa: PLC0415 - as fusiond.navigator.raw_gnss
+    from fusiond.aiding.pseudorange import (  # noqa: PLC0415 - as fusiond.navigator.raw_gnss
+        CARRIER_CLOCK,
+        RANGE_BIAS,
+        RANGE_SHARED,
+    )
 
     found = clock_blocks(section.systems, clock_noise(section))
     if section.bias_sd_m > 0.0:
@@ -28,6 +43,10 @@ def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
         level, down = RANGE_BIAS
         found.append(position_bias(level, section.bias_sd_m, tau_s))
         found.append(position_bias(down, section.bias_down_sd_m, tau_s, "d"))
+    lasting = (IONOSPHERE_LASTS_S, TROPOSPHERE_LASTS_S, math.inf)
+    for name, lasts_s in zip(RANGE_SHARED, lasting, strict=True):
+        found.append(shared_error(name, "", 1.0, lasts_s))
+    found.append(shared_error(CARRIER_CLOCK, "m/s", CARRIER_CLOCK_M_S, CARRIER_CLOCK_LASTS_S))
     return found
 
 

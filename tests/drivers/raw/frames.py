@@ -13,7 +13,7 @@ from drivers.raw.messages import Ephemeris
 
 # One measurement of UBX-RXM-RAWX: range, carrier, Doppler, gnssId, svId, sigId, freqId, lock time,
 # C/N0, sigma codes of range, carrier and Doppler, tracking status.
-GOOD = (2.2e7, 1.1e8, -1000.0, 0, 5, 0, 0, 1000, 45, 5, 1, 6, 3)
+GOOD = (2.2e7, 1.1e8, -1000.0, 0, 5, 0, 0, 1000, 45, 5, 1, 6, 7)
 
 
 def ubx(class_id: bytes, payload: bytes) -> bytes:

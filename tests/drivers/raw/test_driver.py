@@ -172,15 +172,22 @@ def test_what_of_the_stream_to_use() -> None:
 
 
 def msm7(
-    number: int, epoch_ms: int, more: int, cells: list[tuple[int, int, int, int]], prn: int = 5
+    number: int,
+    epoch_ms: int,
+    more: int,
+    cells: list[tuple[int, int, int, int]],
+    prn: int = 5,
+    lock: int = 704,
+    half: int = 0,
 ) -> bytes:
-    """One satellite, one signal: (whole ms, 2^-10 ms, 2^-29 ms, rate code) of its only cell."""
+    """One satellite, one signal: (whole ms, 2^-10 ms, 2^-29 ms, rate code) of its only cell; its
+    lock time indicator, and whether half a cycle is open."""
     whole, part, fine, rate = cells[0]
     fields = [
         (number, 12), (0, 12), (epoch_ms, 30), (more, 1), (0, 3), (0, 7), (0, 2), (0, 2), (0, 1),
         (0, 3), (1 << (64 - prn), 64), (1 << 30, 32), (1, 1),
         (whole, 8), (0, 4), (part, 10), (100, 14),
-        (fine, 20), (8, 24), (0, 10), (0, 1), (45 * 16, 10), (rate, 15),
+        (fine, 20), (8, 24), (lock, 10), (half, 1), (45 * 16, 10), (rate, 15),
     ]  # fmt: skip
     value = total = 0
     for field, length in fields:
@@ -209,6 +216,25 @@ def test_msm7_units() -> None:
     assert signal.carrier_cycles == pytest.approx((73.5 + 8 * 2**-31) * 1_561_098.0, abs=1e-6)
     assert signal.range_rate_m_s == pytest.approx(100.25)
     assert signal.sd_pseudorange_m is None
+
+
+@pytest.mark.parametrize(
+    ("indicator", "lock_s"),
+    [(0, 0.0), (63, 0.063), (64, 0.064), (95, 0.126), (96, 0.128), (127, 0.252), (704, 67108.864)],
+)
+def test_msm_says_how_long_a_carrier_has_been_followed(indicator: int, lock_s: float) -> None:
+    """RTCM 10403.3, table 3.5-75: the ends of its first segments, and the last value."""
+    (found,) = dated().feed(msm7(1077, 180_867_000, 0, [GOOD], lock=indicator), 9)
+    assert isinstance(found, RawGnssEpoch)
+    assert found.signals[0].lock_s == pytest.approx(lock_s, abs=1e-9)
+
+
+def test_msm_with_half_a_cycle_open() -> None:
+    decoder = dated()
+    (found,) = decoder.feed(msm7(1077, 180_867_000, 0, [GOOD], half=1), 9)
+    assert isinstance(found, RawGnssEpoch)
+    assert found.signals[0].carrier_cycles is None
+    assert decoder.counters["half_cycle_open"] == 1
 
 
 def test_one_epoch_out_of_several_messages() -> None:

@@ -72,6 +72,7 @@ def test_walk_is_complete_and_every_frame_accounted_for() -> None:
         "measured_C": 14_399,
         "measured_G": 11_709,
         "measured_E": 10_163,
+        "half_cycle_open": 2395,
         "measured_sbas": 1579,
         "subframes_lnav": 80,
         "gps_cnav_not_used": 148,

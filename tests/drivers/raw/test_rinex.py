@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import Counter
 
@@ -44,6 +45,21 @@ def observed(*values: float | None) -> str:
 def epochs(text: str) -> tuple[list[RawGnssEpoch], Counter[str]]:
     counters = Counter[str]()
     return list(ObservationReader("gnss", text, counters).epochs()), +counters
+
+
+@pytest.mark.parametrize(
+    ("flag", "lock_s", "carrier"),
+    [(" ", math.inf, 1.5), ("0", math.inf, 1.5), ("1", 0.0, 1.5), ("2", math.inf, None), ("3", 0.0, None)],
+)  # fmt: skip
+def test_loss_of_lock_and_half_cycles(flag: str, lock_s: float, carrier: float | None) -> None:
+    """Bit 0: the lock was lost since the epoch before. Bit 1: half a cycle may be missing."""
+    line = f"G05{22_000_000.125:14.3f}  {1.5:14.3f}{flag}7{-1234.5:14.3f}  {45.0:14.3f}  \n"
+    (epoch,), counters = epochs(
+        header("3.05", "OBSERVATION DATA", TYPES) + NOW.format(flag=0, n=1) + line
+    )
+    assert epoch.signals[0].lock_s == lock_s
+    assert epoch.signals[0].carrier_cycles == carrier
+    assert counters["half_cycle_open"] == (carrier is None)
 
 
 def test_an_epoch() -> None:

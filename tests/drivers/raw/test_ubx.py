@@ -48,11 +48,28 @@ def test_units_of_one_measurement() -> None:
         44.0,
         0.01 * 32,
         pytest.approx(0.002 * 64 * C / 1_268_520_000.0),
+        1.0,
     )  # a negative Doppler: the distance grows
     assert found.signals[0].satellite == "C21"
     assert (found.source, found.t_seen_ns, found.week, found.tow_s) == ("gnss", 7, 2440, 345_600.25)
     assert not found.clock_reset
     assert counters["measured_C"] == counters["rawx"] == counters["ubx_frames"] == 1
+
+
+@pytest.mark.parametrize(("ms", "lock_s"), [(0, 0.0), (250, 0.25), (64_500, math.inf)])
+def test_how_long_a_carrier_has_been_followed(ms: int, lock_s: float) -> None:
+    """The count ends at 64.5 s."""
+    found, _ = epoch(measurement(lock=ms))
+    assert found.signals[0].lock_s == lock_s
+
+
+@pytest.mark.parametrize(("track", "carrier", "opened"), [(7, 1.1e8, 0), (3, None, 1), (1, None, 0)])
+def test_a_carrier_with_half_a_cycle_open_is_none(
+    track: int, carrier: float | None, opened: int
+) -> None:
+    found, counters = epoch(measurement(track=track))
+    assert found.signals[0].carrier_cycles == carrier
+    assert counters["half_cycle_open"] == opened
 
 
 def test_time_of_an_epoch() -> None:

@@ -1,0 +1,277 @@
+r"""What the carriers of a satellite tell from epoch to epoch: its slant delay, and how far it moved.
+
+Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
+gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
+
+    P_b - P_a = (gamma - 1) I + code noise            L_a - L_b = (gamma - 1) I + constant
+    I_code    = (P_b - P_a) / (gamma - 1),            A = (s_a^2 + s_b^2) / (gamma - 1)^2
+
+so the carriers say to millimetres how I changes, the codes what it is: a filter of one state,
+
+    I <- I + d(L_a - L_b) / (gamma - 1),     K = V / (V + R),  R = A max(1, 2 tau / dt)
+    I <- I + K (I_code - I),   V <- (1 - K) V
+
+with tau for how long multipath lasts: codes closer together are not worth more. The first epoch has
+V = A: the ionosphere-free pair. I errs with the code of the epoch, by which it is then subtracted
+from P_a: V / A of what it knows is of this epoch, so twice (V / A) s_a^2 / (gamma - 1) is added
+(exact for the pair: s_a^2 + 2 s_a^2 / (gamma - 1) + A = (gamma^2 s_a^2 + s_b^2) / (gamma - 1)^2).
+The codes also show the receiver's noise, as they part from the delay that the carriers keep: with
+nu = I_code - I, each worth w = min(dt / 2 tau, 1) of an independent one,
+
+    scale^2 = (20 + sum w nu^2 / (A + V)) / (20 + sum w)
+
+multiplies the model's variances of multipath and thermal noise, here and in the ranges.
+
+Neither depends on where the receiver is; what it delays between bands is left in I.
+
+The way from epoch to epoch, as a rate (m/s), and its variance:
+
+    (L_a(t) - L_a(t - dt)) / dt = mean range rate + clock,   2 s_L^2 / dt^2
+
+s_L by a model of C/N0 and a scale, learned in the same way from d(L_a - L_b) of variance
+2 (s_La^2 + s_Lb^2).
+
+Refused, of each satellite: `lock_lost` (the receiver says so), `cycle_slip` (the carriers part by
+more than the ionosphere can, or the rate is not that of the Dopplers); of all at once: `clock_jump`.
+
+Source: Hatch, Proc. 3rd Int. Geodetic Symposium on Satellite Doppler Positioning (1982); Groves,
+2nd edition, 9.2.7 and 9.3.3; van Graas and Soloviev, Navigation 51 (2004), 277-292.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+# What the plan says of each row: slot of the satellite; wavelengths (m); gamma, 0 without a second
+# signal; d_b - d_a (m); variance (m^2) of what stays unknown of it, as a delay; numbers of the pair
+# and of its first signal.
+PLAN_COLUMNS = 8
+SLOT, LENGTH_A, LENGTH_B, GAMMA, DELAY, DELAY_VARIANCE, PAIR, SIGNAL = range(PLAN_COLUMNS)
+# What the receiver says: of the first signal, of the second.
+FIRST_COLUMNS, SECOND_COLUMNS = 7, 5
+P_A, RATE, CNO, SD_A, SD_RATE, CARRIER_A, LOCK_A = range(FIRST_COLUMNS)
+P_B, CNO_B, SD_B, CARRIER_B, LOCK_B = range(SECOND_COLUMNS)
+# What is kept of a satellite: of its first signal, of its pair; times and numbers of 0: nothing.
+SLOTS, KEPT_COLUMNS = 3 * 64, 9
+_T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V = range(KEPT_COLUMNS)
+# Slot 0 is no satellite's: sum of w nu^2 / (A + V) and of w; the same of changes of two carriers.
+_SUM, _COUNT, _PHASES, _PHASE_COUNT = range(4)
+# What comes out; NaN: nothing known.
+OUT_COLUMNS = 6
+SLANT, SLANT_VARIANCE, WITH_CODE, MOVED, SPAN, MOVED_VARIANCE = range(OUT_COLUMNS)
+# Refusals of a satellite's carrier, by what `follow` writes.
+FOLLOWED, LOCK_LOST, CYCLE_SLIP = 0, 1, 2
+
+CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
+"""Those of `fusiond.gnss.ranges.RangeNoise`, the first over a uniform sky above 10 deg: the mean of
+1 / sin^2 E is there 1 / sin 10 deg."""
+PRIOR_COUNT, MOST_COUNT = 20.0, 400.0
+"""What that is worth as a number of independent codes, a sky; older than so many are forgotten by
+halves: satellites of an hour."""
+SCALE_SQUARED = (0.1, 10.0)
+"""Antennas from a choke ring to a hand in a street have code multipath of 0.15 to 3 m (Groves
+9.3.4), the model 0.5."""
+PHASE_M, PHASE_THERMAL_M = 0.003, 0.0015
+"""Multipath that changes from epoch to epoch, of 48 mm that a reflection can make at most; a loop
+of 15 Hz at 45 dB-Hz has 1.2 mm (Groves 9.3.3). That of a receiver is learned as its codes' noise
+is, from what two carriers part by."""
+PHASE_LENGTH_M = 0.19
+"""On L1; on other carriers it is so much of their length."""
+CLIPPED = 9.0
+"""No change of two carriers counts as more than three sigma: a slip is no noise."""
+MULTIPATH_S = 60.0
+"""For how long multipath of code lasts: minutes at rest, seconds on the move."""
+LONGEST_S = 2.0
+"""Beyond this the way between two epochs says little of the velocity at its end."""
+FORGOTTEN_S = 120.0
+"""After this the delay begins anew."""
+DELAY_RATE_M_S = 0.01
+"""How fast a slant delay changes at most by itself: ten times the quiet ionosphere's 1 mm/s
+(Klobuchar, in Parkinson and Spilker 1996, vol. 1, chapter 12)."""
+SLIP_SIGMAS = 4.0
+"""Carriers part by so many sigmas of their noise at most (one in 16,000), and by what the
+ionosphere may do. One cycle lost on both of L1 and L2 parts them by 54 mm, L1 and L5 by 65 mm: in
+noise of less than 14 mm it is found; smaller ones are left to the filter's innovation."""
+SLIP_RATE_M_S = 0.5
+"""Between the mean of two Dopplers and the carrier's rate, or a wavelength over dt where that is
+more. A hand that swings with 3 m/s^2 twice a second leaves 0.2 m/s over 0.25 s."""
+JUMP_M_S = 3.0
+"""What all satellites share beyond their Dopplers: three sigma of the filter's `carrier_clock`
+(fusiond.navigator.intake.raw). A clock set by a millisecond within 2 s gives 150,000."""
+
+
+@compiled("f8(f8[:, ::1])")
+def scale_squared(kept: Array) -> float:
+    """What the model's variances of codes are to be multiplied by."""
+    found = (PRIOR_COUNT + kept[0, _SUM]) / (PRIOR_COUNT + kept[0, _COUNT])
+    return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
+
+
+@compiled("f8(f8, f8)", forceinline=True)
+def _phase_variance(cno: float, length: float) -> float:
+    """Of a carrier of a wave length (m), m^2, by the model."""
+    weak = 1.0
+    if not math.isnan(cno):
+        weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
+    turn = length / PHASE_LENGTH_M
+    return turn * turn * (PHASE_M * PHASE_M + PHASE_THERMAL_M * PHASE_THERMAL_M * weak)
+
+
+@compiled("f8(f8, f8, f8)", forceinline=True)
+def _code_variance(cno: float, stated: float, scale: float) -> float:
+    """Of a pseudorange (m^2), wherever the satellite stands, with its model `scale` times."""
+    weak = 1.0
+    if not math.isnan(cno):
+        weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
+    found = scale * (CODE_M * CODE_M + THERMAL_M * THERMAL_M * weak)
+    if not math.isnan(stated):
+        found += stated * stated
+    return found
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8, f8[::1])")
+def _delay(
+    state: Array,
+    plan: Array,
+    first: Array,
+    second: Array,
+    span: float,
+    change: float,
+    scale: float,
+    seen: Array,
+) -> None:
+    """The slant delay with this epoch's codes and with the carriers' `change`; NaN: none. Adds to
+    the sums of what has been `seen` of the codes."""
+    more = plan[GAMMA] - 1.0
+    code = (second[P_B] - first[P_A] - plan[DELAY]) / more
+    noise = _code_variance(first[CNO], first[SD_A], scale)
+    noise = (noise + _code_variance(second[CNO_B], second[SD_B], scale)) / (more * more)
+    if state[_PAIR] != plan[PAIR] or span > FORGOTTEN_S:
+        state[_DELAY], state[_V] = code, noise
+        return
+    if math.isnan(change):
+        state[_V] += (DELAY_RATE_M_S * span) ** 2
+    else:
+        state[_DELAY] += change / more
+        model = _code_variance(first[CNO], first[SD_A], 1.0)
+        model = (model + _code_variance(second[CNO_B], second[SD_B], 1.0)) / (more * more)
+        w = min(0.5 * span / MULTIPATH_S, 1.0)
+        seen[_SUM] += w * (code - state[_DELAY]) ** 2 / (model + state[_V])
+        seen[_COUNT] += w
+    r = noise * max(1.0, 2.0 * MULTIPATH_S / span)
+    gain = state[_V] / (state[_V] + r)
+    state[_DELAY] += gain * (code - state[_DELAY])
+    state[_V] *= 1.0 - gain
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], f8, f8[::1])")
+def _tell(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
+    """The slant delay, its variance, and twice its covariance with the code."""
+    if plan[GAMMA] == 0.0 or state[_PAIR] != plan[PAIR] or state[_T] - state[_T_PAIR] > 0.0:
+        return
+    more = plan[GAMMA] - 1.0
+    own = _code_variance(first[CNO], first[SD_A], scale)
+    out[SLANT] = state[_DELAY]
+    out[SLANT_VARIANCE] = state[_V] + plan[DELAY_VARIANCE]
+    # As if both codes were of one noise: A = 2 own / more^2.
+    part = min(0.5 * state[_V] * more * more / own, 1.0)
+    out[WITH_CODE] = 2.0 * part * own / more
+
+
+@compiled(
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], i8[::1])", allocates=True
+)
+def follow(
+    kept: Array,
+    plan: Array,
+    first: Array,
+    second: Array,
+    now: float,
+    out: Array,
+    refused: npt.NDArray[np.int64],
+) -> int:
+    """Take in an epoch at `now` (s); whether the clock jumped. `kept` (SLOTS, 7) is changed; `plan`
+    (n, 7), `first` (n, 7), `second` (n, 5); writes `out` (n, 6) and `refused` (n,)."""
+    n = plan.shape[0]
+    scale = scale_squared(kept)
+    phases = (PRIOR_COUNT + kept[0, _PHASES]) / (PRIOR_COUNT + kept[0, _PHASE_COUNT])
+    phases = min(max(phases, SCALE_SQUARED[0]), SCALE_SQUARED[1])
+    for j in (_COUNT, _PHASE_COUNT):
+        if kept[0, j] > MOST_COUNT:
+            kept[0, j] *= 0.5
+            kept[0, j - 1] *= 0.5
+    apart = np.empty(n)
+    many = 0
+    for i in range(n):
+        state = kept[int(plan[i, SLOT])]
+        refused[i] = FOLLOWED
+        for j in range(OUT_COLUMNS):
+            out[i, j] = math.nan
+        out[i, SPAN] = 0.0
+        span = now - state[_T]
+        l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
+        if not (0.0 < span <= LONGEST_S) or state[_SIGNAL] != plan[i, SIGNAL]:
+            continue
+        if math.isnan(l_a) or math.isnan(state[_L_A]):
+            continue
+        if first[i, LOCK_A] < span:
+            refused[i] = LOCK_LOST
+            continue
+        moved = (l_a - state[_L_A]) / span
+        out[i, MOVED], out[i, SPAN] = moved, span
+        phase = phases * _phase_variance(first[i, CNO], plan[i, LENGTH_A])
+        out[i, MOVED_VARIANCE] = 2.0 * phase / (span * span)
+        d = moved - 0.5 * (first[i, RATE] + state[_RATE])
+        if not math.isnan(d):
+            apart[many] = d
+            many += 1
+    common = 0.0
+    if many > 0:
+        ordered = np.sort(apart[:many])
+        common = ordered[many // 2]
+    jumped = abs(common) > JUMP_M_S
+    for i in range(n):
+        state = kept[int(plan[i, SLOT])]
+        span = now - state[_T]
+        if span <= 0.0:  # seen already
+            _tell(state, plan[i], first[i], scale, out[i])
+            continue
+        l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
+        pair = plan[i, GAMMA] > 0.0 and not math.isnan(second[i, P_B])
+        l_ab = math.nan
+        if pair:
+            l_ab = l_a - second[i, CARRIER_B] * plan[i, LENGTH_B]
+        change = math.nan
+        locked = first[i, LOCK_A] >= span and second[i, LOCK_B] >= span
+        if pair and locked and state[_PAIR] == plan[i, PAIR] and state[_T_PAIR] == state[_T]:
+            change = l_ab - state[_L_AB]
+        noise = _phase_variance(first[i, CNO], plan[i, LENGTH_A])
+        noise = 2.0 * (noise + _phase_variance(second[i, CNO_B], plan[i, LENGTH_B]))
+        slipped = abs(change) > SLIP_SIGMAS * math.sqrt(phases * noise) + DELAY_RATE_M_S * span
+        if 0.0 < span <= LONGEST_S and not math.isnan(change):
+            w = min(span, 1.0)
+            kept[0, _PHASES] += w * min(change * change / noise, CLIPPED * phases)
+            kept[0, _PHASE_COUNT] += w
+        if out[i, SPAN] > 0.0:
+            d = out[i, MOVED] - 0.5 * (first[i, RATE] + state[_RATE]) - common
+            if slipped or abs(d) > max(SLIP_RATE_M_S, plan[i, LENGTH_A] / span):
+                refused[i] = CYCLE_SLIP
+        if jumped or refused[i] != FOLLOWED:
+            out[i, MOVED], out[i, SPAN] = math.nan, 0.0
+        if pair:
+            if slipped:
+                change = math.nan
+            since = now - state[_T_PAIR]
+            _delay(state, plan[i], first[i], second[i], since, change, scale, kept[0])
+            state[_T_PAIR], state[_PAIR], state[_L_AB] = now, plan[i, PAIR], l_ab
+        state[_T], state[_SIGNAL], state[_L_A] = now, plan[i, SIGNAL], l_a
+        state[_RATE] = first[i, RATE]
+        _tell(state, plan[i], first[i], scale, out[i])
+    return int(jumped)
