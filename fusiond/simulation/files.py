@@ -139,15 +139,19 @@ def _gnss_rows(receiver: GnssReceiver) -> Array:
 
 
 def _rdss_rows(truth: Truth, scenario: Scenario, rng: np.random.Generator) -> Array:
-    """Fixes asked for as a host may: one second more than the service frequency apart."""
+    """Fixes asked for as a host may: as soon as the card allows and the last one is there, with a
+    command and its answer in between."""
     o = scenario.rdss
     centre = RdssCentre(truth, o, rng)
-    spacing = o.service_frequency_s + 1.0
+    spacing = o.service_frequency_s + 2.0 * o.reply_s
     rows = []
-    for k in range(1, math.floor(truth.duration_s / spacing) + 1):
+    at_s = spacing
+    while at_s <= truth.duration_s:
+        asked_s, at_s = at_s, at_s + spacing
         if centre.dropped():
             continue
-        fix = centre.fix(k * spacing, None)
+        fix = centre.fix(asked_s, None)
+        at_s = max(at_s, fix.t_arrival_s + 2.0 * o.reply_s)
         if fix.t_arrival_s <= truth.duration_s:
             rows.append(
                 (
