@@ -43,8 +43,9 @@ _ATTRIBUTE = re.compile(rf"\s*BA_\w*\s+(?:(?:BO_|SG_)\s+)?\"({'|'.join(_ATTRIBUT
 _ATTRIBUTE_OWNER = re.compile(r'\s*BA_\s+"\w+"\s+(BO_|SG_)\s+(\d+)(?:\s+(\w+))?')
 UNSELECTED = "it shares its bits with other signals, and none (M) says which of them a frame holds"
 LAST_STANDARD, LAST_EXTENDED, EXTENDED = 0x7FF, 0x1FFFFFFF, 1 << 31
-_SIZES = re.compile(r"\bBO_\s+\d+\s+[^\s:]+\s*:\s*(\d+)|\bSG_\s[^:]{0,200}:\s*(\d+)\s*\|\s*(\d+)")
-"""Wherever they stand: a signal may be on its message's line."""
+_SIZES = re.compile(r"\bBO_\s+\d+\s+[^\s:]+\s*:\s*([-+]?\d+)|:\s*([-+]?\d+)\s*\|\s*([-+]?\d+)\s*@")
+"""Bytes of a message, first bit and bits of a signal, wherever they stand: a signal may be on its
+message's line, and its name of any length."""
 MOST_BITS = 2048 * 8
 """Of CAN XL, the longest frame there is. cantools makes room for as many as a file says."""
 _AT_LINE = re.compile(r"at line \d+, column \d+: ")
@@ -122,8 +123,9 @@ def read_whole(text: str) -> Database:
     """A DBC file in which cantools finds no flaw. Raises what its parser does, and ValueError where
     a message or signal is longer than any frame."""
     for size in _SIZES.finditer(text):
-        if max(int(number) for number in size.groups() if number) > MOST_BITS:
-            raise ValueError(f"no frame is so long: {size[0].strip()!r}")
+        numbers = [int(number) for number in size.groups() if number]
+        if not 0 <= min(numbers) <= max(numbers) <= MOST_BITS:
+            raise ValueError(f"no frame is so long: {size[0].strip(': @')!r}")
     found = cantools.database.load_string(text + _END, database_format="dbc", strict=False)
     assert isinstance(found, Database)
     return found

@@ -23,62 +23,33 @@ from collections import Counter
 from collections.abc import Callable
 
 from drivers.rdss.cycle import (
-    BEAM_ATTEMPTS,
-    BEAM_POLL_NS,
-    BEAMS_STALE_NS,
     DETAIL,
-    FEEDBACK_NS,
-    GIVE_UP_NS,
     IN_FLIGHT,
-    POLL_NS,
-    POLL_REPLY_NS,
-    PROBE_NS,
     READ_ONLY_DETAIL,
     SECOND,
-    TIMEOUTS_ALARM,
     Action,
     Notice,
-    Send,
     State,
     TerminalOptions,
 )
+from drivers.rdss.deadlines import Deadlines
 from drivers.rdss.height import HeightSource
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import MessageRefusedError
 from drivers.rdss.messages import (
     BeamPower,
-    BeamPowerRequest,
-    EncodeError,
     Family,
     Feedback,
     Fix,
-    HeightMode,
     Identity,
-    IdentityRequest,
     Message,
     Reply,
-    Request,
-    SelfTestRequest,
     Text,
-    TextRequest,
-    TimeRequest,
 )
-from drivers.rdss.outbox import Outbox, Outgoing
-from drivers.rdss.probe import ENCODE
+from drivers.rdss.outbox import Outbox
 from drivers.rdss.replies import Replies
 from drivers.rdss.report import PositionReport
 from drivers.rdss.session import Session
-
-_POLLS: tuple[Callable[[int], Request], ...] = (
-    SelfTestRequest,
-    BeamPowerRequest,
-    TimeRequest,
-    BeamPowerRequest,
-    IdentityRequest,
-    BeamPowerRequest,
-)
-_BLOCKED_POLLS: tuple[Callable[[int], Request], ...] = (SelfTestRequest, BeamPowerRequest)
-"""While nothing may be transmitted: the self test may tell when that ends."""
 
 
 class Terminal:
@@ -106,8 +77,7 @@ class Terminal:
         self._replies = Replies(self._session)
         self.height = HeightSource(options)
         self._t_ns = 0
-        self._polls = 0
-        self._quiet_until_ns = 0
+        self._deadlines = Deadlines(options, self._session, self.height, self.counters)
 
     # ------------------------------------------------------------------ inputs
 
@@ -128,7 +98,7 @@ class Terminal:
         """A message that the codec of `family` decoded."""
         self._t_ns = t_ns
         if isinstance(message, Reply) and not isinstance(message, Feedback | Fix | Text):
-            self._quiet_until_ns = min(self._quiet_until_ns, t_ns)
+            self._deadlines.quiet_until_ns = min(self._deadlines.quiet_until_ns, t_ns)
         return self._replies.take(message, t_ns, family)
 
     def tick(self, t_ns: int) -> list[Action]:
@@ -147,7 +117,7 @@ class Terminal:
                 )
                 session.abandon()
                 session.search(t_ns)
-            _DUE[session.state](self, t_ns, actions)
+            self._deadlines.due(t_ns, actions)
         return actions
 
     def request_now(self, t_ns: int) -> Notice:
@@ -207,7 +177,7 @@ class Terminal:
                 due = min(due, session.pace.due_ns)
                 if session.outbox.next_ns is not None:
                     due = min(due, max(session.pace.free_ns, session.outbox.next_ns))
-            due = max(due, self._quiet_until_ns)
+            due = max(due, self._deadlines.quiet_until_ns)
         if due is not None and session.answered:
             due = min(due, session.heard_ns + int(self._options.timeout_s * SECOND))
         return due
@@ -272,155 +242,3 @@ class Terminal:
     def _gone_quiet(self, t_ns: int) -> bool:
         quiet_ns = int(self._options.timeout_s * SECOND)
         return self._session.answered and t_ns - self._session.heard_ns >= quiet_ns
-
-    # ------------------------------------------------------------------ deadlines
-
-    def _read(self, kind: Callable[[int], Request], actions: list[Action]) -> None:
-        session = self._session
-        if session.family is not None:
-            user = session.identity.user if session.identity is not None else 0
-            actions.append(Send(ENCODE[session.family](kind(user)), "read"))
-
-    def _poll(self, t_ns: int, actions: list[Action]) -> None:
-        polls = _POLLS if self._session.permit.granted else _BLOCKED_POLLS
-        self._read(polls[self._polls % len(polls)], actions)
-        self._polls += 1
-        self._session.next_poll_ns = t_ns + POLL_NS
-        self._quiet_until_ns = t_ns + POLL_REPLY_NS
-
-    def _due_probing(self, t_ns: int, actions: list[Action]) -> None:
-        actions += self._session.probe.next()
-        self.counters["probes"] += 1
-        self._session.deadline_ns = t_ns + PROBE_NS
-
-    def _due_no_card(self, t_ns: int, actions: list[Action]) -> None:
-        self._read(IdentityRequest, actions)
-        self._session.deadline_ns = t_ns + POLL_NS
-
-    def _due_beams(self, t_ns: int, actions: list[Action]) -> None:
-        """CHECKING and NO_BEAM: read the beams until they allow a request."""
-        session = self._session
-        if session.beam_reads >= BEAM_ATTEMPTS:
-            self.counters["beams_unknown"] += 1
-            session.levels, session.levels_ns = (), t_ns
-            session.enter(State.READY, None)
-            return
-        session.beam_reads += 1
-        self._read(BeamPowerRequest, actions)
-        session.deadline_ns = t_ns + (PROBE_NS if session.state is State.CHECKING else BEAM_POLL_NS)
-
-    def _due_ready(self, t_ns: int, actions: list[Action]) -> None:
-        session = self._session
-        if t_ns >= session.next_poll_ns:
-            self._poll(t_ns, actions)
-        elif not self._options.transmit:
-            return
-        elif session.levels_ns is None or t_ns - session.levels_ns > BEAMS_STALE_NS:
-            session.proceed(t_ns)
-        else:
-            self._transmit(t_ns, actions)
-
-    def _due_feedback(self, t_ns: int, actions: list[Action]) -> None:
-        self.counters["timeout_feedback"] += 1
-        self._session.enter(State.AWAIT_FIX, (self._session.pace.requested_ns or t_ns) + GIVE_UP_NS)
-
-    def _due_fix(self, t_ns: int, actions: list[Action]) -> None:
-        session = self._session
-        self.counters["timeout_fix"] += 1
-        session.timeouts += 1
-        if session.timeouts == TIMEOUTS_ALARM:
-            actions.append(
-                Notice("rdss_no_fixes", f"{TIMEOUTS_ALARM} requests in a row brought no fix")
-            )
-        session.enter(State.READY, None)
-
-    def _due_message(self, t_ns: int, actions: list[Action]) -> None:
-        self._session.outbox.unanswered()
-        self._session.enter(State.READY, None)
-
-    def _due_blocked(self, t_ns: int, actions: list[Action]) -> None:
-        """HOLDING, SUPPRESSED and SILENT: reads only, until the hold is over if it has an end."""
-        session = self._session
-        until = session.blocked_until_ns
-        if until is not None and t_ns >= until:
-            if session.state is State.SUPPRESSED:
-                session.permit.grant()
-                actions.append(Notice("rdss_hold_over", "Hold time over: requesting fixes again"))
-            session.proceed(t_ns)
-            return
-        if t_ns >= session.next_poll_ns:
-            self._poll(t_ns, actions)
-        session.deadline_ns = (
-            session.next_poll_ns if until is None else min(session.next_poll_ns, until)
-        )
-
-    # ------------------------------------------------------------------ requests and messages
-
-    def _transmit(self, t_ns: int, actions: list[Action]) -> None:
-        session = self._session
-        if session.family is None or session.identity is None:
-            session.search(t_ns)
-            return
-        fix_due = t_ns >= session.pace.due_ns
-        message = session.outbox.next(t_ns) if t_ns >= session.pace.free_ns else None
-        user = session.identity.user
-        if message is not None and (session.turns.message_first or not fix_due):
-            if self._send(message, user, session.family, t_ns, actions):
-                session.turns.took(message=True, other_waits=fix_due)
-        elif fix_due:
-            self._request(user, session.family, t_ns, actions)
-            session.turns.took(message=False, other_waits=message is not None)
-
-    def _send(
-        self, message: Outgoing, user: int, family: Family, t_ns: int, actions: list[Action]
-    ) -> bool:
-        """Write a message; False if it cannot be sent from this card, which is its end."""
-        session = self._session
-        wording = session.outbox.wording(message)
-        if wording is None:
-            return False
-        text = TextRequest(
-            message.receiver, wording.payload, wording.encoding, user, odd=wording.odd
-        )
-        try:
-            data = ENCODE[family](text)
-        except EncodeError as error:
-            session.outbox.unsayable(message, str(error))
-            return False
-        actions.append(Send(data, "request"))
-        session.pace.written(t_ns, len(data), self.baud, fix=False)
-        session.outbox.written(message)
-        session.enter(State.AWAIT_MESSAGE, t_ns + FEEDBACK_NS)
-        return True
-
-    def _request(self, user: int, family: Family, t_ns: int, actions: list[Action]) -> None:
-        session = self._session
-        try:
-            request = self.height.request(user, t_ns)
-            data = ENCODE[family](request)
-        except EncodeError as error:
-            session.hold(t_ns, str(error))
-            return
-        actions.append(Send(data, "request"))
-        self.counters["requested"] += 1
-        session.pace.written(t_ns, len(data), self.baud, fix=True)
-        session.answerable = True
-        session.height_given = request.height_mode is not HeightMode.NONE
-        session.height_sd_m = self.height.given_sd_m
-        session.enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)
-
-
-_DUE: dict[State, Callable[[Terminal, int, list[Action]], None]] = {
-    State.PROBING: Terminal._due_probing,
-    State.NO_CARD: Terminal._due_no_card,
-    State.CHECKING: Terminal._due_beams,
-    State.READY: Terminal._due_ready,
-    State.AWAIT_FEEDBACK: Terminal._due_feedback,
-    State.AWAIT_FIX: Terminal._due_fix,
-    State.AWAIT_MESSAGE: Terminal._due_message,
-    State.NO_BEAM: Terminal._due_beams,
-    State.HOLDING: Terminal._due_blocked,
-    State.SUPPRESSED: Terminal._due_blocked,
-    State.SILENT: Terminal._due_blocked,
-}
-"""Action of each state at its deadline. CLOSED has none."""

@@ -21,7 +21,8 @@ BASE = "fusiond/truck"
 
 
 def options(broker: Broker | OldBroker, **more: Any) -> Mqtt:
-    return Mqtt(host="127.0.0.1", port=broker.port, **{"keepalive_s": 2, **more})
+    """By default a busy host has ten seconds for each confirmation (`keepalive_s` is 20)."""
+    return Mqtt(host="127.0.0.1", port=broker.port, **more)
 
 
 class Running:

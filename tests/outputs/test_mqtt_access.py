@@ -72,7 +72,7 @@ async def test_tls_verifies_the_broker_and_shows_our_certificate(tmp_path: Path)
         async with running(options(broker, tls=True)) as it:
             await it.until(lambda r: r.publisher.status.state == "absent")
             assert "certificate verify failed" in it.publisher.status.detail
-        async with running(options(broker)) as it:
+        async with running(options(broker, keepalive_s=2)) as it:
             await it.until(lambda r: r.publisher.status.state == "absent")
 
 

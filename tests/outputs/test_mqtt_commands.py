@@ -246,8 +246,7 @@ async def test_a_retained_command_is_carried_out_once_over_reconnections(tmp_pat
         async with listening(broker) as (listener, client), old_broker(broker) as old:
             enabled = options(old, commands=("reset_filter",))
             async with running(enabled, on_command=handler(taken)):
-                await listener.until(heard("online"))
-                await asyncio.sleep(0.2)  # to subscribe
+                await listener.until(heard("online"))  # it has subscribed before
                 command = f"{BASE}/cmd/reset_filter"
                 await client.publish(command, b'{"id":"kept"}', qos=1, retain=True)
                 await listener.until(lambda li: len(heard("reply")(li)) == 1)

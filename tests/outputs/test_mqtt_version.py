@@ -19,7 +19,7 @@ from fusiond.outputs.topics import EVENT
 from tests.broker import Broker, listening
 from tests.outputs.old_broker import HANGS_UP, REFUSES, SILENT, old_broker
 from tests.outputs.publisher import BASE, event, heard, options, running
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 
 
 def _options(port: int) -> Mqtt:
@@ -64,8 +64,11 @@ async def test_the_broker_of_the_demo_is_spoken_to_in_its_version() -> None:
             await it.until(lambda r: r.publisher.counters["mqtt_published"] >= 2)
 
 
-async def test_what_is_too_long_stays_with_a_broker_of_version_5(tmp_path: Path) -> None:
+async def test_what_is_too_long_stays_with_a_broker_of_version_5(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Longer than we answer to but short of the limit it comes, and its sender is told why."""
+    monkeypatch.setattr(mqtt_version, "ANSWER_S", PATIENCE_S)  # a busy broker is of version 5, too
     with Broker(tmp_path) as broker:
         async with (
             listening(broker) as (listener, client),
@@ -91,8 +94,11 @@ async def test_what_is_too_long_stays_with_a_broker_of_version_5(tmp_path: Path)
             assert it.publisher.counters["mqtt_reconnects"] == 0
 
 
-async def test_a_command_that_is_to_be_kept_is_refused_while_we_are_there(tmp_path: Path) -> None:
+async def test_a_command_that_is_to_be_kept_is_refused_while_we_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A broker of version 5 says so of it; one of 3.1.1 only to who comes later."""
+    monkeypatch.setattr(mqtt_version, "ANSWER_S", PATIENCE_S)
     with Broker(tmp_path) as broker:
         async with (
             listening(broker) as (listener, client),
@@ -114,16 +120,17 @@ async def test_a_frozen_broker_is_asked_both_ways_and_then_said_to_be_absent(
     monkeypatch.setattr(mqtt_version, "ANSWER_S", 0.2)
     with Broker(tmp_path) as broker:
         broker.freeze()
-        async with running(options(broker)) as it:
-            await it.until(lambda r: r.codes() == ["mqtt_absent"])
+        async with running(options(broker, keepalive_s=2)) as it:
+            await it.until(lambda r: r.codes()[:1] == ["mqtt_absent"])
             broker.thaw()
-            await it.until(lambda r: r.codes() == ["mqtt_absent", "mqtt_connected"])
+            await it.until(lambda r: "mqtt_connected" in r.codes())
 
 
 async def test_an_attempt_that_is_cancelled_ends_in_silence(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The daemon is told to stop while the broker has yet to answer."""
+    monkeypatch.setattr(mqtt_version, "ANSWER_S", PATIENCE_S)
     with Broker(tmp_path) as broker:
         async with old_broker(broker, SILENT) as old:
             async with running(_options(old.port)) as it:

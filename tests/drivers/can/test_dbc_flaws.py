@@ -232,6 +232,26 @@ def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:
     assert told(load_dbc(str(path))) == told(load_dbc("racelogic_imu04"))
 
 
+@pytest.mark.parametrize(
+    ("length", "bits"),
+    [
+        ("8", "0|4294967296"),
+        ("8", "-1|4294967296"),
+        ("8", "9999999999 | 8"),
+        ("4294967296", "0|8"),
+        ("-4294967296", "0|8"),
+    ],
+)
+@pytest.mark.parametrize("name", ["far", "x" * 400])
+def test_no_room_is_made_for_what_no_frame_can_hold(length: str, bits: str, name: str) -> None:
+    """cantools makes a list of as many bits as a file says: half a minute, and gigabytes."""
+    sound = 'BO_ 1 sound: 8 A\n SG_ s : 0|8@1+ (1,0) [0|4294967296] "" B\n\n'
+    flawed = f'BO_ 2 flawed: {length} A\n SG_ {name} : {bits}@0- (1,0) [0|0] "" B\n'
+    found = sound_part(sound + flawed)
+    assert [message.name for message in found.messages] == ["sound"]
+    assert all("no frame is so long" in why for why in found.left_out.values())
+
+
 @pytest.mark.parametrize("text", ["", "hello world", "BO_ 1 2: 8 X\n"])
 def test_what_is_no_dbc_file_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "none.dbc"
