@@ -25,6 +25,7 @@ class Advice(NamedTuple):
 _ORDER: dict[str, int] = {"error": 0, "warning": 1, "info": 2}
 
 WHY: tuple[tuple[str, Level, str], ...] = (
+    (r"^compiling", "info", "Wait: kernels are compiled, once."),
     (r"^waiting for IMU data", "error", "Check power and bus of the inertial unit."),
     (r"^IMU silent", "error", "The inertial unit has stopped: check its power and its bus."),
     (r"multiply the|another unit", "error", "Correct the unit of the inertial data, then restart."),
@@ -60,7 +61,8 @@ _VERDICTS: dict[str, str] = {
 
 
 def advice(status: Said, health: Said) -> list[Advice]:
-    """What to do, the most urgent first; nothing where all is well."""
+    """What to do, the most urgent first; nothing where all is well. Counters are those of the last
+    minute."""
     found = [*_of_status(status), *_of_sources(health), *_of_the_host(status, health)]
     found.sort(key=lambda each: _ORDER[each.level])
     return list(dict.fromkeys(found))

@@ -52,7 +52,7 @@ function banner(run, parent) {
   const worst = wrong.some((p) => p[0] === "error") ? "error" : wrong.length ? "warning" : "fine";
   const box = parent.appendChild(element("div", "banner " + worst));
   if (!wrong.length) {
-    box.textContent = timed ? "Nothing is wrong with this file." : "Every one has its figures.";
+    box.textContent = timed ? "The file is whole. How good the drive was stands below." : "Every one has its figures.";
     return;
   }
   box.appendChild(element("b", "", `What is wrong with ${run.name}`));
