@@ -112,10 +112,10 @@ format: $(STAMP) ## let ruff lay out the code
 picture: $(STAMP) ## docs/house.svg, from the imports
 	$(BIN)/python tools/house.py
 
-bench: $(RUNTIME) ## what the kernels cost; ARGS="--json F.json" keeps the figures
+bench: $(STAMP) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 	$(BIN)/fusiond bench $(ARGS)
 
-faults: $(RUNTIME) ## fault matrix as a table; ARGS="--only step_500m", "--service 3", "--sharpness 4"
+faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m", "--service 3", "--sharpness 4"
 	$(BIN)/python -m fusiond.studies.faults $(ARGS)
 
 wires: $(STAMP) test-packages ## faults of wires, clocks and the host; ARGS="--only gnss_late_3s"

@@ -339,7 +339,9 @@ def _by_clock(
         for kind in range(2):
             total, count = 0.0, 0
             for k in range(clock.shape[0]):
-                if math.isfinite(values[_RANGE + kind, k]) or (kind == 1 and values[_SPAN, k] > 0.0):
+                if math.isfinite(values[_RANGE + kind, k]) or (
+                    kind == 1 and values[_SPAN, k] > 0.0
+                ):
                     if kept[row] and clock[k] == clock[i]:
                         total += whitened[row]
                         count += 1

@@ -35,16 +35,25 @@ def compiling() -> Iterator[None]:
 def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> None:
     """Compile kernels in processes that end, and link them in this one. What cannot be kept on disk
     is compiled here."""
-    from fusiond.navigation.compiled import load_compiler  # noqa: PLC0415 - numba
+    from fusiond.navigation.compiled import (  # noqa: PLC0415 - numba
+        kernels_can_be_kept,
+        load_compiler,
+    )
 
-    progress(0, len(missing))
-    with Forked(missing, load_compiler) as compiling:
-        for done in compiling:
-            progress(done, compiling.total)
-    for load in missing:
+    total = len(missing)
+    progress(0, total)
+    if kernels_can_be_kept():
+        with Forked(missing, load_compiler) as compiling:
+            for done in compiling:
+                progress(done, total)
+        for load in missing:
+            load()
+        if compiling.done < total:
+            progress(total, total)
+        return
+    for done, load in enumerate(missing):
         load()
-    if compiling.done < compiling.total:
-        progress(compiling.total, compiling.total)
+        progress(done + 1, total)
 
 
 class Progress:

@@ -72,14 +72,8 @@ def study(
     if out is not None and not ABOUT[name].rows:
         raise typer.BadParameter(f"--out: {name} draws all its runs at once, none is a row")
     from importlib import import_module  # noqa: PLC0415
-    from importlib.util import find_spec  # noqa: PLC0415
 
-    missing = [name for name in ("scipy", "pywt", "matplotlib") if find_spec(name) is None]
-    if missing:
-        from fusiond.files.extras import install  # noqa: PLC0415
-
-        typer.echo(f"fusiond: studies need {', '.join(missing)}: {install('studies')}", err=True)
-        raise typer.Exit(EXIT_UNAVAILABLE)
+    _studies_installed()
     with compiling():
         module = import_module(STUDIES[name])
     with (
@@ -171,8 +165,21 @@ def model(
     write_json(report, json_path)
 
 
+def _studies_installed() -> None:
+    """Exit 69, and say what would do, where the extra `[studies]` is not there."""
+    from importlib.util import find_spec  # noqa: PLC0415
+
+    missing = [name for name in ("scipy", "pywt", "matplotlib") if find_spec(name) is None]
+    if missing:
+        from fusiond.files.extras import install  # noqa: PLC0415
+
+        typer.echo(f"fusiond: studies need {', '.join(missing)}: {install('studies')}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE)
+
+
 def bench(json_path: JsonPath = None) -> None:
     """Time the kernels against one numpy product."""
+    _studies_installed()  # a paper's filter is timed too
     with compiling():
         from fusiond.bench.bench import bench as run_bench  # noqa: PLC0415
     from fusiond.commands.bench_report import print_bench  # noqa: PLC0415

@@ -15,6 +15,7 @@ from typing import Any
 
 from fusiond.dashboard.advice import advice
 from fusiond.dashboard.history import Keyed, Ring
+from fusiond.dashboard.recent import Recent
 
 Said = Mapping[str, Any]
 
@@ -62,6 +63,8 @@ class Vehicle:
         self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
         self._next_row_s = float("-inf")
         self._received: dict[str, int] = {}
+        self._recent = {"health": Recent("ticks", "overruns"), "status": Recent("mqtt_taken_over")}
+        self._lately: dict[str, Said] = {}
 
     def take(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
         """A message of `topic`. `kept`: the broker had it, nobody knows here for how long."""
@@ -158,7 +161,8 @@ class Vehicle:
         if topic == "health":
             self._delays(said, None if kept else at_s)
         if topic in ("status", "health"):
-            said_now = advice(self.said("status"), self.said("health"))
+            self._lately[topic] = self._recent[topic].of(said, at_s)
+            said_now = advice(self._lately.get("status", {}), self._lately.get("health", {}))
             if said_now != self.said("advice"):
                 self._put("advice", said_now, at_s)
 

@@ -82,9 +82,6 @@ def demo(
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
         live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
-        if headless:
-            seen = f", page {page.address}" if page else ""
-            print(f"broker 127.0.0.1:{broker.port}, vehicle {VEHICLE}{seen}", file=sys.stderr)
         return asyncio.run(_Run(play, live, view, Path(folder), record).run())
 
 

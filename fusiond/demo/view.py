@@ -126,6 +126,7 @@ class HeadlessView:
         """Write until cancelled."""
         if live.page is not None:
             print(f"dashboard: {live.page}", file=self._out, flush=True)
+        print(f"broker: 127.0.0.1:{live.port}", file=self._out, flush=True)
         while True:
             await asyncio.sleep(LINE_EVERY_S)
             print(line(live), file=self._out, flush=True)

@@ -158,9 +158,7 @@ def single_point(
     )
 
 
-def _fit(
-    model: RangeModel, followed: Followed, position: Array, out: list[str]
-) -> _Fit | str:
+def _fit(model: RangeModel, followed: Followed, position: Array, out: list[str]) -> _Fit | str:
     """Gauss-Newton from `position`, without the satellites in `out`."""
     for _ in range(MAX_ITERATIONS):
         rows = model.evaluate(followed, position)

@@ -237,9 +237,18 @@ class ConsistencyMonitor:
             dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
             low, high = limits.nis_limits
             turns = _slide_over(
-                *(self._rows, self._figures, self._products, self._sums, first, o.window),
+                self._rows,
+                self._figures,
+                self._products,
+                self._sums,
+                first,
+                o.window,
                 *(rows[now], nis[now], energy[now], limits.weights, self._rho),
-                *(low, high, limits.portmanteau, dof, patience, self._held, turned),
+                *(low, high, limits.portmanteau),
+                dof,
+                patience,
+                self._held,
+                turned,
             )
             if k >= FEWEST:
                 self._average = float(self._sums[0]) / dof

@@ -33,7 +33,7 @@ from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
-from fusiond.navigation.compiled import load_compiler, load_kernels
+from fusiond.navigation.compiled import kernels_can_be_kept, load_compiler, load_kernels
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.timeline import Entry
 from fusiond.outputs.base import Output
@@ -58,6 +58,7 @@ log = logging.getLogger("fusiond")
 SWITCH_S = 0.0005
 """Time that a tick waits for a thread that computes, as the log's does ten times a second: 5 ms by
 CPython's default, by which one tick of a hundred began 7 ms late."""
+_NOT_KEPT = "NUMBA_CACHE_DIR, or XDG_CACHE_HOME, is no folder that may be written"
 
 
 class Daemon:
@@ -307,6 +308,11 @@ def run(
     try:
         if not config.sources:
             raise ConfigError("sources: there is none: add [sources.imu] with a driver")
+        if missing and not kernels_can_be_kept():
+            log.warning("compiling %d kernels, at each start: %s", len(missing), _NOT_KEPT)
+            for load in missing:
+                load()
+            missing = ()
         # The children are forked while nothing else runs in this process.
         with Forked(missing, load_compiler) if missing else nullcontext() as compiling:
             asyncio.run(main(compiling))

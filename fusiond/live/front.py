@@ -16,6 +16,7 @@ from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.service_manager import ServiceManager
 from fusiond.live.serving import Serving
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.reasons import reason
 from fusiond.outputs.base import Output
 from fusiond.outputs.catalogue import make_outputs
 from fusiond.outputs.commands import Command, CommandRefusedError
@@ -90,7 +91,7 @@ class Front:
         stopped = asyncio.create_task(stop.wait())
         line = Every(LINE_EVERY_NS)
         while not (over.done() or stop.is_set()):
-            text = f"compiling {compiling.done}/{compiling.total} kernels, once"
+            text = reason("compiling", done=compiling.done, total=compiling.total)
             t_ns = self.clock.now_ns()
             if line.due(t_ns):
                 log.info(text)

@@ -43,7 +43,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.types import Array
 from numba.np.numpy_support import FROM_DTYPE, map_layout
 
-from fusiond.navigation.kernel_cache import KernelCache, kept_in, shipped_in
+from fusiond.navigation.kernel_cache import KernelCache, can_keep, kept_in, shipped_in
 
 # numba's functions have no types.
 _array: Any = Array
@@ -142,6 +142,11 @@ def gathered() -> Iterator[list[Callable[[], None]]]:
         yield missing
     finally:
         _gathered = outer
+
+
+def kernels_can_be_kept() -> bool:
+    """Whether other processes can compile for this one, and for the next start."""
+    return can_keep(FOLDER)
 
 
 def load_compiler() -> None:

@@ -281,6 +281,15 @@ def _linked(
     return result
 
 
+def can_keep(folder: Path) -> bool:
+    """Whether what is compiled can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
 def kept_in(folder: Path) -> set[str]:
     """Names of the files in `folder`, less those that processes left there which died while they
     wrote: these are removed.

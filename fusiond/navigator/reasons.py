@@ -230,6 +230,12 @@ ALIGNING: Mapping[str, Reason] = {
     "allowed": Reason("info", "allowed: {sources}"),
 }
 
+STARTING: Mapping[str, Reason] = {
+    "compiling": Reason(
+        "info", "compiling {done}/{total} kernels, once", "Wait: it is done once for each version."
+    ),
+}
+
 SOLUTION: Mapping[str, Reason] = {
     "sigma": Reason(
         "error",
@@ -265,13 +271,18 @@ SOLUTION: Mapping[str, Reason] = {
         "No position fused for {seconds:.0f} s",
         "Get a receiver back; meanwhile sigma grows.",
     ),
+    "by_fixes_alone": Reason(
+        "info",
+        "No inertial unit: constant velocity, no attitude",
+        "Check power and bus of the IMU, if there is one.",
+    ),
     "heading_from": Reason("info", "Heading from {how}"),
     "calibration_wrong": Reason("warning", "The saved calibration is wrong: {what}"),
     "warm_start_wrong": Reason("warning", "{source} contradicts the state of the last run"),
     "before_history": Reason("info", "Before the stored history"),
 }
 
-REASONS: Mapping[str, Reason] = {**IMU, **ALIGNING, **SOLUTION}
+REASONS: Mapping[str, Reason] = {**STARTING, **IMU, **ALIGNING, **SOLUTION}
 
 
 def reason(code: str, **figures: object) -> str:

@@ -39,6 +39,7 @@ from fusiond.navigator.alignment.start import UNKNOWN_HEIGHT_SD_M
 from fusiond.navigator.filters import estimator_without_imu
 from fusiond.navigator.imu_door import BEARABLE_GAP_S
 from fusiond.navigator.readout import solution_of
+from fusiond.navigator.reasons import joined, reason
 from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
@@ -145,12 +146,13 @@ class WithoutImu:
         limits = self._config.estimator
         sigmas = e.sigmas()
         sd_m = math.hypot(float(sigmas[0]), float(sigmas[1]))
-        said = f"{why}; without an inertial unit: constant velocity, no attitude"
+        said = joined((why, reason("by_fixes_alone")))
         if not sd_m <= limits.invalid_sd_m:
-            return Mode.INVALID, f"horizontal sigma {sd_m:.0f} m; {said}"
+            lost = reason("sigma", sd=sd_m, limit=limits.invalid_sd_m)
+            return Mode.INVALID, joined((lost, said))
         unaided = (t_ns - self._located_ns) * 1e-9
         if unaided > limits.coast_after_s:
-            return Mode.COASTING, f"no position fused for {unaided:.0f} s; {said}"
+            return Mode.COASTING, joined((reason("no_fix", seconds=unaided), said))
         return Mode.NAVIGATING, said
 
     # ------------------------------------------------------------------ inside
@@ -208,7 +210,7 @@ class WithoutImu:
             self._imu.append(times, np.repeat(_felt(e.nav), count, axis=0))
         self._timeline.run()
         if not (np.isfinite(e.nav).all() and np.isfinite(e.covariance).all()):
-            self._event("filter_not_finite", "without an inertial unit: starting anew")
+            self._event("filter_not_finite", "Without an IMU: starting again")
             self.stop()
 
     def _outcome(self, entry: Entry) -> None:

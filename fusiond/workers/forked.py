@@ -74,8 +74,8 @@ class Forked:
         return self._read
 
     def read(self) -> bool:
-        """Wait for news, and take it; False when all is over."""
-        news = os.read(self._read, self.total)
+        """Wait until one more is done; False when all is over."""
+        news = os.read(self._read, 1)
         self.done += len(news)
         return bool(news)
 

@@ -214,9 +214,7 @@ SPAN_S = 0.5
 FORCE = (0.6, -0.4, -9.7)
 
 
-def _moved(
-    error: Array, rate_b: Array, force_b: Array
-) -> tuple[Array, Array, Array, Array]:
+def _moved(error: Array, rate_b: Array, force_b: Array) -> tuple[Array, Array, Array, Array]:
     """Navigation state and step at either end of `SPAN_S`, by an IMU of 100 Hz."""
     nav = runs.level_nav(RPY, VELOCITY)
     nav = runs.with_error(nav, error[:9])

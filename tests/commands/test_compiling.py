@@ -72,6 +72,25 @@ def test_a_pipe_and_systemd_hear_how_far_it_is(tmp_path: Path) -> None:
     assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 3
 
 
+def test_what_cannot_be_kept_is_compiled_here_and_told(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    (tmp_path / "cache").write_text("no folder")
+    done = subprocess.run(
+        [sys.executable, "-c", CODE],
+        env=os.environ
+        | {
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+            "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+        },
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
+    assert done.stdout == "0.25 2.0 16.0\n"
+    assert "compiled 3 kernels in" in done.stderr.splitlines()[-1]
+
+
 class _Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

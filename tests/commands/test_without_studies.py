@@ -108,9 +108,10 @@ print(fusiond.recording.about._versions().keys() >= {"numpy"})
 
 
 def test_what_needs_them_says_so_by_name(environment: dict[str, str], tmp_path: Path) -> None:
-    done = _fusiond(environment, "study", "rdss-static", status=69)
-    for words in ("scipy", "pywt", "matplotlib", "-m pip", "'scipy>=1.11' 'PyWavelets>=1.5'"):
-        assert words in done.stderr
+    for command in (("study", "rdss-static"), ("bench",)):
+        done = _fusiond(environment, *command, status=69)
+        for words in ("scipy", "pywt", "matplotlib", "-m pip", "'scipy>=1.11' 'PyWavelets>=1.5'"):
+            assert words in done.stderr
     config = tmp_path / "multiscale.toml"
     shipped = (REPOSITORY / "config" / "vehicle.toml").read_text()
     chosen = re.sub(r"(?m)^\[estimator\]$", '[estimator]\nfilter = "multiscale"', shipped)

@@ -176,3 +176,30 @@ def test_an_innovation_that_comes_again_takes_the_place_of_the_first() -> None:
     for t_ns in range(MOST_INNOVATIONS + 100):
         vehicle.take("innovation", innovation(t_ns, "fused", 1.0), float(t_ns))
     assert len(vehicle.since(0)["rows"]["innovation"]) == MOST_INNOVATIONS
+
+
+def _told_late(vehicle: Vehicle) -> bool:
+    return any("came too late" in step.text for step in vehicle.said("advice") or ())
+
+
+def test_an_alarm_ends_a_minute_after_what_it_tells_of() -> None:
+    """Ticks that came late when the daemon began are no reason to look at the computer now."""
+    vehicle, sound = Vehicle("truck"), {**said("health"), "utc_settled": True}
+    told = []
+    for second in range(200):
+        late = 5 * min(second, 20)  # of the first 20 s
+        vehicle.take("health", {**sound, "ticks": 100 * second, "overruns": late}, float(second))
+        told.append(_told_late(vehicle))
+    assert told[15]
+    assert told[60]
+    assert not any(told[81:])
+
+
+def test_a_daemon_that_begins_anew_begins_without_alarms() -> None:
+    vehicle = Vehicle("truck")
+    for second in range(30):
+        health = {**said("health"), "ticks": 100 * second, "overruns": 10 * second}
+        vehicle.take("health", health, float(second))
+    assert _told_late(vehicle)
+    vehicle.take("health", {**said("health"), "ticks": 50, "overruns": 0}, 31.0)
+    assert not _told_late(vehicle)

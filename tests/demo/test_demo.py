@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -73,6 +74,7 @@ def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
         said = list(takewhile(lambda text: "navigating" not in text, process.stderr))
         assert process.poll() is None, said
         assert any("aligning" in text for text in said)
+        assert re.fullmatch(r"broker: 127\.0\.0\.1:\d+", said[1].strip())
         page = said[0].removeprefix("dashboard: ").strip()
         with urlopen(page, timeout=PATIENCE_S) as answer:
             assert b"<title>fusiond</title>" in answer.read()
@@ -121,7 +123,7 @@ def test_ends_after_its_duration_and_what_never_navigated_is_null(command: list[
 
 def test_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo_broker.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(demo_broker.DemoError, match=r"pip install 'fusiond\[demo\]'"):
+    with pytest.raises(demo_broker.DemoError, match=r"install 'amqtt>=0.11'"):
         demo_broker.DemoBroker()
 
 

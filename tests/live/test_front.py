@@ -7,7 +7,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from fusiond.clock.clock import Clock
 from fusiond.commands.status import ask, chosen
+from fusiond.live import daemon
 from fusiond.live.daemon import Daemon
 from fusiond.live.front import Front
 from fusiond.navigation.compiled import FOLDER
@@ -63,13 +65,13 @@ async def test_it_answers_while_kernels_compile_and_goes_on_by_the_same_connecti
             await listener.until(lambda heard: _whys(heard, "compiling 1/2 kernels, once"))
             second.touch()
             await asyncio.wait_for(waiting, PATIENCE_S)
-            daemon = Daemon(config, front=front)
-            async with running(daemon):
+            made = Daemon(config, front=front)
+            async with running(made):
                 await listener.until(lambda heard: _whys(heard, "waiting for IMU data"))
                 await client.publish("fusiond/test/cmd/reset_filter", '{"id": "b"}', qos=1)
                 await listener.until(lambda heard: len(heard.payloads("fusiond/test/reply")) > 1)
                 assert listener.payloads("fusiond/test/online") == [b"online"]
-                assert daemon.outputs["mqtt"].counters["mqtt_reconnects"] == 0
+                assert made.outputs["mqtt"].counters["mqtt_reconnects"] == 0
     assert any("compiling 0/2" in record.getMessage() for record in caplog.records)
 
 
@@ -130,3 +132,23 @@ async def test_the_process_can_be_stopped_while_it_compiles(
         assert await process.terminate() == 0
         with pytest.raises(ProcessLookupError):
             os.kill(child, 0)
+
+
+def test_where_nothing_can_be_kept_it_compiles_before_anybody_waits_for_ticks(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Children would compile for nobody, and a watchdog would not wait for this process."""
+    compiled: list[int] = []
+
+    def served(main: Coroutine[None, None, None]) -> None:
+        main.close()
+        compiled.append(-1)
+
+    monkeypatch.setattr(daemon, "kernels_can_be_kept", lambda: False)
+    monkeypatch.setattr(daemon, "Forked", None)
+    monkeypatch.setattr(daemon.asyncio, "run", served)
+    config = bench.configuration("[mqtt]\nenabled = false\n")
+    jobs = [partial(compiled.append, k) for k in range(3)]
+    daemon.run(config, bench.folder / "test.toml", lambda: config, jobs)
+    assert compiled == [0, 1, 2, -1]
+    assert "compiling 3 kernels, at each start: NUMBA_CACHE_DIR" in caplog.text

@@ -12,7 +12,7 @@ from fusiond.navigator.reasons import JOIN, REASONS, joined, reason, recognised
 from tests.places import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-NAVIGATOR = REPOSITORY / "fusiond" / "navigator"
+GIVE = [REPOSITORY / "fusiond" / room for room in ("navigator", "live")]
 FIGURES = {"source": "gnss", "how": "GNSS course", "heading": "compass", "unit": "g"}
 FIGURES |= {"device": "gnss", "sources": "compass, saved", "sensor": "Gyro", "what": "yaw 3 deg"}
 IN_TWO_PARTS = {
@@ -61,7 +61,7 @@ def test_nothing_is_recognised_in_other_words() -> None:
 def test_every_reason_is_given_somewhere() -> None:
     """As the code in a call, or as one of two that a condition chooses from."""
     used = set()
-    for path in NAVIGATOR.rglob("*.py"):
+    for path in (path for room in GIVE for path in room.rglob("*.py")):
         if path.name != "reasons.py":
             tree = ast.parse(path.read_text(encoding="utf-8"))
             used |= {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}

@@ -85,7 +85,7 @@ def test_it_navigates_by_fixes_and_says_that_nothing_tells_the_attitude() -> Non
         s = d.at(t_s)
         assert s.mode is Mode.NAVIGATING
         assert s.reason == (
-            "waiting for IMU data; without an inertial unit: constant velocity, no attitude"
+            "Waiting for IMU data; no inertial unit: constant velocity, no attitude"
         )
         assert all(math.isnan(x) for x in (*s.rpy_rad, *s.sd_rpy_rad, *s.gyro_bias_rad_s))
         assert 0.1 < s.sd_ned_m[0] < 3.0
@@ -123,7 +123,7 @@ def test_it_takes_over_from_a_unit_that_has_fallen_silent_for_too_long() -> None
     assert d.at(21.5).reason.startswith("IMU silent for")
     s = d.at(25.0)
     assert s.mode is Mode.NAVIGATING
-    assert s.reason.startswith("IMU silent for 5.0 s; without an inertial unit")
+    assert s.reason.startswith("IMU silent for 5.0 s; no inertial unit")
     assert math.isnan(s.rpy_rad[2])
     assert np.abs(d.errors(24.0, 30.0)).max() < 4.5
     assert d.events.count("without_imu") == 1

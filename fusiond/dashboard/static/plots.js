@@ -172,12 +172,12 @@ export class Plots {
       this.sigma = new uPlot(
         this.options(
           this.sigmaHolder,
-          "m",
+          "m; heading: deg",
           [
             line("north", "s0"),
             line("east", "s1"),
             line("vertical", "s2"),
-            { ...line("heading, deg", "s3"), dash: [4, 3] },
+            { ...line("heading (deg)", "s3"), dash: [4, 3] },
           ],
           { range },
         ),

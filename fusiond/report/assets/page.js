@@ -52,7 +52,7 @@ function banner(run, parent) {
   const worst = wrong.some((p) => p[0] === "error") ? "error" : wrong.length ? "warning" : "fine";
   const box = parent.appendChild(element("div", "banner " + worst));
   if (!wrong.length) {
-    box.textContent = timed ? "Recording complete and undamaged." : "Every drive has its figures.";
+    box.textContent = timed ? "Recording complete and undamaged. How good the drive was stands below." : "Every drive has its figures.";
     return;
   }
   box.appendChild(element("b", "", `What is wrong with ${run.name}`));
