@@ -362,7 +362,7 @@ class ErrorStateFilter:
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
         if self.hypotheses is not None:
-            self.hypotheses.begin(self.t_ns, self.nav, self.step)
+            self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

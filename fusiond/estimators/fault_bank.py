@@ -85,9 +85,10 @@ KIND_NUMBERS = 7
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
-# aid lies, 1 if it is not the identity, and the probability of any fault as it was judged last.
+# aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, and by
+# how much the unit has been found to have turned on the vehicle in pitch and yaw (rad).
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
-ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, HEAD = 10, 11, 12, 13, 14, 15, 16
+ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, TURNED_BY, HEAD = 10, 11, 12, 13, 14, 15, 16, 24
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8

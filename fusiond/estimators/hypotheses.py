@@ -22,6 +22,7 @@ from fusiond.estimators.fault_bank import (
     ROLLS,
     SENSITIVITIES,
     SIZE,
+    TURNED_BY,
     UNEXPLAINED,
     WAITS,
     WEIGHT,
@@ -91,8 +92,13 @@ class Hypotheses:
         """Whether V is still that of the last aid, as it is after a look in passing."""
         return self.bank.item(WAITS) != 0.0
 
-    def begin(self, t_ns: int, nav: Array, step: Array) -> None:
-        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
+    def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
+        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step: one
+        that starts, or one of whose error state a fault's `mean` (n,) has been taken. Of the
+        mounting that is a turn."""
+        for k, slot in enumerate(self._mounting[:, 0].astype(int).tolist()):
+            turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
+            self.bank[TURNED_BY + k] = turned
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
@@ -114,21 +120,27 @@ class Hypotheses:
         return self.found
 
     def take(
-        self, t_ns: int, measured: bool, used: bool, xi: Array, step: Array, wider: Array
+        self,
+        t_ns: int,
+        measured: bool,
+        used: bool,
+        of: tuple[Array, Array, Array, int],
+        wider: Array,
     ) -> Array:
         """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
         unless one is identified, what the weighed hypotheses leave open of what is published,
-        `wider` (9,)."""
+        `wider` (9,), of a filter with that state, parameters, last step and slot of the clock."""
         table, n, found = self.table, self.n, self.found
         judge_and_widen(
-            *(self.bank, table.ints, table.numbers, table.lanes, n, t_ns, measured, used),
-            *(xi, step, self._mounting, self.work, wider, found),
+            *(self.bank, table.ints, table.numbers, table.lanes, n, t_ns, measured, used, *of),
+            *(self._mounting, self.work, wider, found),
         )
         return found
 
-    def widen(self, step: Array, wider: Array) -> None:
+    def widen(self, nav: Array, step: Array, time_slot: int, wider: Array) -> None:
         """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
-        widen_by_faults(self.bank, self.table.lanes, self.n, step, self.work, wider)
+        of = self.n, nav, step, time_slot
+        widen_by_faults(self.bank, self.table.lanes, *of, self.work, wider)
 
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
