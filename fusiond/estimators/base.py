@@ -222,7 +222,7 @@ class ErrorStateFilter:
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
-        own = m.bank, faults, model, m.xi, m.step, m.wider
+        own = m.bank, faults, model, (m.nav, m.xi, m.step, m.published), m.wider
         self.hypotheses = Hypotheses(*own) if faults.groups else None
         self._holding = False
         self._carrying = False
@@ -382,7 +382,7 @@ class ErrorStateFilter:
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
         if self.hypotheses is not None:
-            self.hypotheses.begin(self.t_ns, self.nav, self.step)
+            self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -194,6 +194,22 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
+@compiled("f8(f8[::1], f8[::1], i8, i8, b1, f8[::1])", forceinline=True)
+def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
+    """Log of the factor by which a likely fault is larger than it is expected to be; what no unit's
+    fault can be it does not explain."""
+    share = MOST_OF_UNIT**-2 if unit else _TINY
+    gained = solve(bank, at, size, numbers, share, m)
+    bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
+    bank[at + EXPLAINED], square = gained, 0.0
+    for c in range(size):
+        sigmas = m[9 + c] / numbers[PRIOR + c]
+        square += sigmas * sigmas
+        if unit and abs(sigmas) > MOST_OF_UNIT:
+            bank[at + UNEXPLAINED] = np.inf
+    return 0.5 * math.log(max(square / size, 1.0))
+
+
 @compiled(
     "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[:, ::1])", forceinline=True
 )
@@ -219,18 +235,15 @@ def _odds(
         for c in range(int(size)):
             by_rows -= numbers[kind, LOG_PRIOR + c]
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
+        if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
+            by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
+            gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
         off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
         if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
             bank[at + UNEXPLAINED] = np.inf  # it is of another size than this kind has
     bank[at + LOG_ODDS] = rate + gained
-    # A likely one of the unit: is it of a size that a unit can have?
-    if rate + gained > 0.0 and ints[kind, CLASS] == 0 and bank[at + UNEXPLAINED] <= 0.0:
-        solve(bank, at, int(size), numbers[kind], 1.0, m)
-        for c in range(int(size)):
-            if abs(m[9 + c]) > MOST_OF_UNIT * numbers[kind, PRIOR + c]:
-                bank[at + UNEXPLAINED] = np.inf
 
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")

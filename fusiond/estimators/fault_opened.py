@@ -5,9 +5,13 @@ the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
 
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 
-for eight groups side by side. The attitude is that of the axes that were configured, and the
-vehicle's as far as the unit sits on it so: pitch and yaw are open by what the mounting has beyond
-chance, too.
+for eight groups side by side. What is published is by the receiver's clock, whose offset tau a
+fault moves, too (fusiond.estimators.reading): v is V of p - v tau, of v - a tau, of phi + u tau.
+
+The attitude is that of the axes that were configured, and the vehicle's as far as the unit sits on
+it so: pitch and yaw are open by what the mounting has beyond chance, too, and by all that the unit
+has been found to have turned. In a bank or on a slope a turn d about the vertical axis is one of
+roll by d tan(pitch) and of pitch by d sin(roll).
 """
 
 from __future__ import annotations
@@ -38,12 +42,14 @@ from fusiond.estimators.fault_bank import (
     P_AT,
     SENSITIVITIES,
     THREES,
+    TURNED_BY,
     WEIGHT,
 )
 from fusiond.estimators.fault_odds import identified, judge
-from fusiond.estimators.reading import opened_variances
+from fusiond.estimators.reading import MOVING, moving, opened_variances
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE
+from fusiond.navigation.strapdown import STEP_DCM
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -54,10 +60,12 @@ RARE = 10.83
 """Chi-square of one that chance exceeds in one vehicle of a thousand."""
 
 # What the kernel needs to work: sums, lane by lane, of nine variances and three products; of eight
-# groups C below its diagonal (3), D^-1 (3), b (3) and weight; v C^-T (3) and v b of the attitude.
+# groups C below its diagonal (3), D^-1 (3), b (3) and weight; v C^-T (3) and v b of the attitude;
+# and v.
 _FACTORS = (CORE_SIZE + 3) * LANES
 _ROWS = _FACTORS + 10 * LANES
-OPENED_WORK = _ROWS + 3 * 4 * LANES
+_V = _ROWS + 3 * 4 * LANES
+OPENED_WORK = _V + CORE_SIZE * 3 * LANES
 
 
 @compiled("void(f8[::1], f8[::1], i8, i8, i8, f8[::1])")
@@ -106,17 +114,45 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
             factors[unsigned(6 * LANES) + lane] = mean + over * beyond
 
 
-@compiled("void(f8[::1], f8[::1], i8, f8[::1], f8[::1], f8[::1])", allocates=True)
+@compiled("void(f8[::1], i8, i8, i8, f8[::1], i8, f8[::1])")
+def _published_rows(
+    kept: Array, columns: int, first: int, count: int, motion: Array, time_slot: int, out: Array
+) -> None:
+    """Write v (9, count) of as many columns of V, of a vehicle that is `moving` (12,)."""
+    for i in range(CORE_SIZE):
+        row, to = kept[i * columns + first :], out[i * count : (i + 1) * count]
+        for j in range(to.shape[0]):
+            to[j] = row[j]
+        if time_slot >= 0:
+            c = motion[6 + i] if i < 3 else -motion[i] if i < 6 else -motion[i - 6]
+            of_time = kept[time_slot * columns + first :]
+            for j in range(to.shape[0]):
+                to[j] += c * of_time[j]
+
+
+@compiled(
+    "void(f8[::1], f8[::1], i8, f8[::1], f8[::1], i8, f8[::1], f8[::1])",
+    allocates=True,
+)
 def widen_by_faults(
-    bank: Array, lanes: Array, n: int, step: Array, work: Array, wider: Array
+    bank: Array,
+    lanes: Array,
+    n: int,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    work: Array,
+    wider: Array,
 ) -> None:
     """Write `wider` (9,): what the weighed hypotheses leave open of position, velocity, roll, pitch
-    and yaw, with the attitude that `step` (28,) holds; `work` (OPENED_WORK,)."""
-    v = bank[int(bank[SENSITIVITIES]) :]
-    columns, length = v.shape[0] // n, int(bank[LENGTH])
+    and yaw of nav (10,) with the attitude that `step` (28,) holds, published by the clock whose
+    offset is parameter `time_slot` (-1: none); `work` (OPENED_WORK,)."""
+    kept, motion = bank[int(bank[SENSITIVITIES]) :], np.empty(MOVING)
+    moving(nav, step, motion)
+    columns, length, v = kept.shape[0] // n, int(bank[LENGTH]), work[_V:OPENED_WORK]
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
-    sums, factors, rows = work[:_FACTORS], work[_FACTORS:_ROWS], work[_ROWS:OPENED_WORK]
+    sums, factors, rows = work[:_FACTORS], work[_FACTORS:_ROWS], work[_ROWS:_V]
     unsigned = np.uint64
     for j in range(sums.shape[0]):
         sums[j] = 0.0
@@ -129,9 +165,11 @@ def widen_by_faults(
             continue
         _factors(bank, lanes, row, threes, at, factors)
         first = LANES * (3 * row if row < threes else 2 * threes + row)
+        count = 3 * LANES if row < threes else LANES
+        _published_rows(kept, columns, first, count, motion, time_slot, v)
         if row < threes:
             for i in range(CORE_SIZE):
-                in_0 = unsigned(first + i * columns)
+                in_0 = unsigned(i * count)
                 in_1, in_2 = in_0 + unsigned(LANES), in_0 + unsigned(2 * LANES)
                 out, to = unsigned(i * LANES), unsigned(min(i, 2) * 4 * LANES)
                 for k in range(length):
@@ -155,7 +193,7 @@ def widen_by_faults(
                         rows[to + unsigned(3 * LANES) + lane] = along
         else:
             for i in range(CORE_SIZE):
-                in_0, out = unsigned(first + i * columns), unsigned(i * LANES)
+                in_0, out = unsigned(i * count), unsigned(i * LANES)
                 for k in range(length):
                     lane = unsigned(k)
                     v_0, b = v[in_0 + lane], factors[unsigned(6 * LANES) + lane]
@@ -177,8 +215,7 @@ def widen_by_faults(
                     open_ += u_2 * w_2 * factors[unsigned(5 * LANES) + lane]
                     sums[out + lane] += open_ * factors[unsigned(9 * LANES) + lane]
             else:
-                left = unsigned(first + one * columns)
-                right = unsigned(first + other * columns)
+                left, right = unsigned(one * count), unsigned(other * count)
                 for k in range(length):
                     lane = unsigned(k)
                     b = factors[unsigned(6 * LANES) + lane]
@@ -196,8 +233,8 @@ def widen_by_faults(
 
 
 @compiled(
-    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8, b1, b1, f8[::1], f8[::1], f8[:, ::1],"
-    " f8[::1], f8[::1], f8[::1])"
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8, b1, b1, f8[::1], f8[::1], f8[::1],"
+    " f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
 )
 def judge_and_widen(
     bank: Array,
@@ -208,8 +245,10 @@ def judge_and_widen(
     epoch_s: float,
     measured: bool,
     used: bool,
+    nav: Array,
     xi: Array,
     step: Array,
+    published: Array,
     mounting: Array,
     work: Array,
     wider: Array,
@@ -218,8 +257,8 @@ def judge_and_widen(
     """`judge`, if what has come was `measured` and is `used`, and `wider` (9,), unless a hypothesis
     is identified: at each measurement, and between two while a fault is likely enough to count.
 
-    `mounting` (2, 2): slots of the mounting's pitch and yaw in xi (n,), or -1, and what of their
-    squares is chance.
+    `published` (3,) as of fusiond.estimators.reading. `mounting` (2, 2): slots of the mounting's
+    pitch and yaw in xi (n,), or -1, and what of their squares is chance.
     """
     if measured and used:
         judge(bank, ints, numbers, lanes, epoch_s, found)
@@ -227,8 +266,16 @@ def judge_and_widen(
             return
     elif not measured and not bank[ANY_FAULT] > COUNTS:
         return
-    widen_by_faults(bank, lanes, n, step, work, wider)
+    widen_by_faults(bank, lanes, n, nav, step, int(published[0]), work, wider)
+    sp = step[STEP_DCM + 6]
     for k in range(2):
         slot = int(mounting[k, 0])
-        if slot >= 0:
-            wider[7 + k] += max(0.0, xi[slot] * xi[slot] - mounting[k, 1])
+        if slot < 0:
+            continue
+        turned = bank[TURNED_BY + k]
+        at_start = xi[slot] - turned
+        open_ = turned * turned + max(0.0, at_start * at_start - mounting[k, 1])
+        wider[7 + k] += open_
+        if k == 1:
+            wider[6] += open_ * sp * sp / max(1e-12, 1.0 - sp * sp)
+            wider[7] += open_ * step[STEP_DCM + 7] * step[STEP_DCM + 7]

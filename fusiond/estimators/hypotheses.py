@@ -24,6 +24,7 @@ from fusiond.estimators.fault_bank import (
     SENSITIVITIES,
     SIZE,
     SUSPECTS,
+    TURNED_BY,
     UNEXPLAINED,
     UNJUDGED,
     WAITS,
@@ -59,15 +60,21 @@ class Estimated(NamedTuple):
 
 
 class Hypotheses:
-    """A bank of `table` in `bank`, beside a filter of `model` with its parameters `xi` (n,), its
-    last `step` (28,) and the variances `wider` (9,) that what it publishes has beyond P's.
+    """A bank of `table` in `bank`, beside a filter of `model`: `of` are its state (10,), parameters
+    (n,), last step (35,) and axes and clock of publication (3,), and `wider` (9,) the variances
+    that what it publishes has beyond P's.
 
     Rows of one instant are judged once, together, unless something depends on it before the filter
     goes on: one fails its gate, or a hypothesis has been likely, and may be identified.
     """
 
     def __init__(
-        self, bank: Array, table: FaultTable, model: Model, xi: Array, step: Array, wider: Array
+        self,
+        bank: Array,
+        table: FaultTable,
+        model: Model,
+        of: tuple[Array, Array, Array, Array],
+        wider: Array,
     ) -> None:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
@@ -80,7 +87,7 @@ class Hypotheses:
         self.columns = columns_of(table)
         self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
         self._judged = bank, table.ints, table.numbers, table.lanes, self.n
-        self._widened = xi, step, self._mounting, self.work, wider, self.found
+        self._widened = *of, self._mounting, self.work, wider, self.found
         """What `judge_and_widen` takes before and behind an epoch."""
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
@@ -104,8 +111,13 @@ class Hypotheses:
         """True if V is still that of the last aid, as it is after a look in passing."""
         return self.bank.item(WAITS) != 0.0
 
-    def begin(self, t_ns: int, nav: Array, step: Array) -> None:
-        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
+    def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
+        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step: one
+        that starts, or one of whose error state a fault's `mean` (n,) has been taken. Of the
+        mounting that is a turn."""
+        for k, slot in enumerate(self._mounting[:, 0].astype(int).tolist()):
+            turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
+            self.bank[TURNED_BY + k] = turned
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
@@ -142,9 +154,10 @@ class Hypotheses:
         if epoch_s < math.inf:
             judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)
 
-    def widen(self, step: Array, wider: Array) -> None:
+    def widen(self, nav: Array, step: Array, time_slot: int, wider: Array) -> None:
         """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
-        widen_by_faults(self.bank, self.table.lanes, self.n, step, self.work, wider)
+        of = self.n, nav, step, time_slot
+        widen_by_faults(self.bank, self.table.lanes, *of, self.work, wider)
 
     def opened(self) -> Array:
         """Covariance that the weighed hypotheses add to attitude, velocity, position (9, 9);

@@ -179,7 +179,7 @@ def velocity_kinds(device: str) -> list[Kind]:
         ),
         of(
             *("velocity_drift", f"{device} velocity runs away", "m/s^2", VELOCITY_RAMP, MOTION),
-            *((0.2, 0.2, 0.2), RECEIVER_PER_H),
+            *((0.5, 0.5, 0.5), RECEIVER_PER_H),
         ),
     ]
 

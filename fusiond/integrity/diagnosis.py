@@ -209,7 +209,8 @@ class Diagnosis:
             known = self._lasting[one.source].judged(outcome.lasting)
             self._lasting = {**self._lasting, one.source: known}
         lasts = min(outcome.lasting, default=math.nan)
-        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis)
+        others = self._over_by_others(one)
+        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others)
         if self._goes_its_own_way(one):
             correction = _somewhere_else(aid, estimator)
             one.readmit(t_ns)
@@ -270,12 +271,25 @@ class Diagnosis:
                 lasting[name] = Lasting.of(of)
         self._lasting = lasting
 
+    def _over_by_others(self, one: Series) -> float:
+        """Log likelihood that a fault for which a series is out is over, by what else it has
+        spoiled: a fault is one story of all of it."""
+        known = set(self._lasting.get(one.source, Lasting()).findings)
+        others = [s for n, s in self._series.items() if s.out and n != one.source]
+        return sum(
+            s.over for s in others if known & set(self._lasting.get(s.source, Lasting()).findings)
+        )
+
     def _is_over(self, one: Series) -> None:
         """A series has returned: of the faults for which it was out none lasts, for others too."""
-        over = self._lasting.get(one.source)
-        if over is not None:
-            known = self._lasting.items()
-            self._lasting = {name: lasting.without(over) for name, lasting in known}
+        over, lasting = self._lasting.get(one.source), {}
+        if over is None:
+            return
+        for name, known in self._lasting.items():
+            left = lasting[name] = known.without(over)
+            if known.findings and not left.findings and self._series[name].out:
+                self._changed(name).reason = STILL
+        self._lasting = lasting
 
     def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
         """Terms of each fault in an innovation of a series that may be out (k, 3), if it lasts;
@@ -302,10 +316,14 @@ class Diagnosis:
     def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
         """Exclude the series that faults affect."""
         for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
-            if name in self._shared:
-                self._shared.discard(name)
-                self._series[name] = self._series[name].copied()
-            self._series[name].exclude(t_ns, reason)
+            self._changed(name).exclude(t_ns, reason)
+
+    def _changed(self, name: str) -> Series:
+        """A series that may be changed."""
+        if name in self._shared:
+            self._shared.discard(name)
+            self._series[name] = self._series[name].copied()
+        return self._series[name]
 
     def _goes_its_own_way(self, one: Series) -> bool:
         """True if a position whose fault is over has gone the way that the velocity of its device

@@ -17,7 +17,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
                                        itself to the bit while the vehicle moves
     out                   probation    `READMIT_COUNT` in a row pass against what is published, and
                                        the fault for which it is out is likelier over than not; one
-                                       that repeated itself says something new each time
+                                       that repeated itself says something new each time. Whether
+                                       a fault is over is asked of all that it has spoiled
     probation             nominal      it has been in service for as long as it was out
 
 Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
@@ -42,9 +43,10 @@ from fusiond.integrity.noise import forget_lately, learn, unlearned
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
-LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
+LASTS_S, RETURNS, MOST_TOLD, MOST_SURE = 60.0, 2.0, 12.0, 24.0
 """A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
-to one; and the most (chi-square) that one measurement tells of that."""
+to one; the most (chi-square) that one measurement tells of that; and the most (log likelihood) that
+one series does, four such measurements."""
 REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -140,10 +142,12 @@ class Series:
         if t_ns > self.proven_ns and self.state is not Service.NOMINAL:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
-    def looked_at(self, t_ns: int, passes: bool, lasting: float = math.nan) -> None:
+    def looked_at(
+        self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
+    ) -> None:
         """One that is out was compared with what is published. `lasting`: by how much more
         chi-square its innovation is if the fault for which it is out lasts; not a number where none
-        is known.
+        is known. `others`: log likelihood that it is over by what else it has spoiled.
 
         A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
         """
@@ -152,9 +156,9 @@ class Series:
         self.passed = self.passed + 1 if passes else 0
         if math.isfinite(lasting):
             self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
-            self.over = max(self.over, -MOST_TOLD)
+            self.over = max(-MOST_TOLD, min(self.over, MOST_SURE))
             prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
-            if self.over + prior < RETURNS:
+            if self.over + others + prior < RETURNS:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
                 self.reason = STILL

@@ -38,8 +38,12 @@ from fusiond.estimators.fault_odds import MOST_OF_UNIT
 from fusiond.estimators.fault_rows import _at_past, _past, walk_path
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.reading import opened_variances
-from tests.estimators.test_fault_bank import LAST_NS, MODEL, run
+from fusiond.estimators.reading import MOVING, moving, opened_variances
+from fusiond.integrity.catalogue import kinds_of, table_of
+from fusiond.models.catalogue import make_model
+from fusiond.models.vehicle import MOUNTING, mounting
+from fusiond.navigation.rotation import quaternion_from_rpy
+from tests.estimators.test_fault_bank import IMU, LAST_NS, MODEL, imu_noise, run
 
 Array = NDArray[np.float64]
 
@@ -83,6 +87,7 @@ def test_odds_are_those_of_the_theory() -> None:
         m = np.linalg.inv(information + np.linalg.inv(s))
         left = e - information @ mean
         share = np.linalg.inv(information + 1e-9 * np.linalg.inv(s))
+        unit = bool(bank.table.ints[row, CLASS] == 0)
         odds = numbers[LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
         odds += bank.each(COUNTS_BY)[row, restart]
         if numbers[BOUNDED]:
@@ -90,14 +95,23 @@ def test_odds_are_those_of_the_theory() -> None:
             odds -= 0.5 * np.linalg.slogdet(np.eye(size) + s @ information)[1]
         else:
             by_size = 0.5 * np.linalg.slogdet(np.eye(size) + s @ information)[1]
-            odds += 0.5 * e @ share @ e - max(0.5 * size * math.log(rows), by_size)
+            by_rows, prior = 0.5 * size * math.log(rows), np.linalg.inv(s)
+            gained = 0.5 * e @ share @ e - max(by_rows, by_size)
+            most = size + 4.0 * math.sqrt(2.0 * (rows - size)) + rows - 2.0 * size
+            fits = bank.each(J_AT)[row, restart] - e @ share @ e <= most
+            if odds + gained > 0.0 and fits:
+                share = np.linalg.inv(information + (1e-2 if unit else 1e-9) * prior)
+                b = share @ e
+                by_size += 0.5 * size * math.log(max(b @ prior @ b / size, 1.0))
+                gained = 0.5 * e @ share @ e - max(by_rows, by_size)
+            odds += gained
         assert found[row, restart] == pytest.approx(odds, abs=1e-6)
         degrees = max(rows - size, 1.0)
         most = degrees + 4.0 * math.sqrt(2.0 * degrees)
         unexplained = bank.each(J_AT)[row, restart] - e @ share @ e - most
-        off = np.abs(m @ left) / numbers[PRIOR : PRIOR + size]
+        off = np.abs((share @ e if unit else m @ left) / numbers[PRIOR : PRIOR + size])
         other = bool(numbers[BOUNDED]) and off[0] > 3.0
-        other |= bank.table.ints[row, CLASS] == 0 and odds > 0.0 and off.max() > MOST_OF_UNIT
+        other |= unit and odds > 0.0 and off.max() > MOST_OF_UNIT
         assert explains[row, restart] == (unexplained <= 0.0 and not other)
         compared += 1
     assert compared > 100
@@ -108,9 +122,51 @@ def test_what_is_published_is_wider_by_the_whole_mixture() -> None:
     made, bank = faulty()
     whole, wider = np.empty(9), np.empty(9)
     opened_variances(bank.opened(), made.step, whole)
-    bank.widen(made.step, wider)
+    bank.widen(made.nav, made.step, -1, wider)
     assert whole.max() > 1e-4
     assert wider == pytest.approx(whole, rel=1e-12)
+
+
+def test_what_is_published_by_the_receivers_clock_is_wider_by_what_a_fault_does_to_that() -> None:
+    """p - v tau, v - a tau, phi + u tau, of a parameter that faults have moved."""
+    made, bank = faulty()
+    slot, motion, by = 13, np.empty(MOVING), np.zeros((9, MODEL.size))
+    moving(made.nav, made.step, motion)
+    by[:, :9] = np.eye(9)
+    by[:, slot] = [*motion[6:9], *-motion[3:6], *-motion[:3]]
+    whole, wider, plain = np.empty(9), np.empty(9), np.empty(9)
+    opened_variances(by @ bank.opened_of_all() @ by.T, made.step, whole)
+    bank.widen(made.nav, made.step, slot, wider)
+    bank.widen(made.nav, made.step, -1, plain)
+    assert wider == pytest.approx(whole, rel=1e-9)
+    assert wider.max() > 1.01 * plain.max()
+
+
+def test_what_the_unit_has_been_found_to_have_turned_is_open() -> None:
+    """All of it, and no more than chance of what the mounting has from the start; on a slope a turn
+    about the vertical axis is one of roll, in a bank of pitch."""
+    model = make_model("ins15", imu_noise(IMU), mounting(math.radians(5.0)))
+    kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
+    made = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds))
+    tilted = quaternion_from_rpy(math.radians(10.0), math.radians(6.0), 0.3)
+    nav = np.array([0.5, 2.0, 0.0, 20.0, 0.0, 0.0, *tilted])
+    made.initialise(0, 0, nav, np.zeros(model.size), np.eye(model.size))
+    yaw, turn = model.slots_of(MOUNTING)[1], math.radians(-10.0)
+    mean, of = np.zeros(model.size), (made.nav, made.xi, made.step, -1)
+    mean[yaw] = turn
+    bank = made.hypotheses
+    assert bank is not None
+    made.xi[yaw] = turn
+    bank.take(1, True, False, of, made.wider)
+    assert made.wider.max() == 0.0  # two sigma of how it may sit
+    made.xi[yaw] = 0.0
+    made.adopt(mean, np.zeros((model.size, model.size)))
+    bank.take(2, True, False, of, made.wider)
+    roll, pitch = math.tan(math.radians(6.0)), math.sin(math.radians(10.0)) * math.cos(0.105)
+    assert np.sqrt(made.wider[6:]) == pytest.approx([-turn * roll, -turn * pitch, -turn], rel=1e-2)
+    made.initialise(3, 0, nav, np.zeros(model.size), np.eye(model.size))
+    bank.take(3, True, False, of, made.wider)
+    assert made.wider.max() == 0.0
 
 
 def test_what_lies_between_two_aids_is_multiplied_once() -> None:

@@ -10,8 +10,10 @@ from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.service import (
     DISAGREES,
     FORGET_NS,
+    MOST_SURE,
     READMIT_COUNT,
     REFUSED_IN_A_ROW,
+    STILL,
     Series,
     Service,
 )
@@ -94,6 +96,28 @@ def test_time_alone_readmits_nothing() -> None:
     one.exclude(0, "gnss position is off")
     one.hear(3600 * S)
     assert one.out
+
+
+def test_a_fault_is_over_where_what_else_it_has_spoiled_says_so() -> None:
+    """A position that stays where it was carried says nothing of that; the velocity does."""
+    place, other = series(), series()
+    for one in (place, other):
+        one.exclude(0, "gnss is carried off")
+    for k in range(READMIT_COUNT + 1):
+        place.looked_at((60 + k) * S, passes=False, lasting=-12.0)
+        other.looked_at((60 + k) * S, passes=False, lasting=-12.0, others=24.0)
+    assert place.reason != STILL
+    assert other.reason == STILL
+    assert place.out
+    assert other.out
+
+
+def test_nothing_says_endlessly_that_a_fault_is_over() -> None:
+    one = series()
+    one.exclude(0, "gnss is carried off")
+    for k in range(100):
+        one.looked_at((60 + k) * S, passes=False, lasting=12.0)
+    assert one.over == MOST_SURE
 
 
 def test_what_was_not_heard_of_for_long_is_judged_anew() -> None:
