@@ -337,8 +337,9 @@ class Diagnosis:
         )
 
     def _agrees(self, aid: Aid, one: Series) -> None:
-        """One of a device that is out, or was, has come: does the device fit itself?"""
-        if not (one.locates or one.moves) or aid.screened:
+        """One of a device that is out, or was, has come: does the device fit itself? What repeats
+        itself while the vehicle moves says nothing of that."""
+        if not (one.locates or one.moves) or aid.screened or one.repeats > 0:
             return
         known = self._agreement.get(aid.device, Agreement())
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}

@@ -7,6 +7,7 @@ import pytest
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.integrity.agreement import Agreement
+from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import (
     DISAGREES,
     FORGET_NS,
@@ -160,3 +161,16 @@ def test_one_that_stands_and_says_that_it_moves_does_not() -> None:
     for second in range(8):
         agreement = agreement.with_aid(position(second, 0.0)).with_aid(velocity(second, 10.0))
     assert agreement.lasted_ns == 0
+
+
+def test_what_repeats_itself_does_not_fit_itself() -> None:
+    """A receiver that hangs says for a minute that it stands where it stands."""
+    place, speed = Series.of(position(0, 0.0)), Series.of(velocity(0, 0.0))
+    for repeats in (0, 1):
+        diagnosis = Diagnosis()
+        place.repeats = speed.repeats = repeats
+        for second in range(8):
+            diagnosis._agrees(position(second, 0.0), place)
+            diagnosis._agrees(velocity(second, 0.0), speed)
+        lasted = [known.lasted_ns for known in diagnosis._agreement.values()]
+        assert lasted == ([] if repeats else [7 * S])
