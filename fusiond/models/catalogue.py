@@ -23,6 +23,7 @@ from fusiond.models.blocks import (
 )
 from fusiond.models.left_out import with_force_biases_as_noise
 from fusiond.models.model import Model
+from fusiond.navigation.error_model import FORCE_ERROR
 
 
 def make_model(name: str, noise: ImuNoise, *extra: Block) -> Model:
@@ -34,7 +35,10 @@ def make_model(name: str, noise: ImuNoise, *extra: Block) -> Model:
     blocks = MODELS[name](noise)
     given = {block.name: block for block in extra}
     own = [given.pop(block.name, block) for block in blocks]
-    return Model(name, (*own, *given.values()), hold_height=name.startswith("planar"))
+    states = {column for block in own for column in block.columns}
+    held = {FORCE_ERROR, FORCE_ERROR + 1} <= states  # a tilt's, north and east
+    bias = 0.0 if held else math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    return Model(name, (*own, *given.values()), name.startswith("planar"), bias)
 
 
 def _gyro_bias(noise: ImuNoise) -> Block:

@@ -39,6 +39,9 @@ class Model:
     name: str
     blocks: tuple[Block, ...]
     hold_height: bool = False
+    force_left_out: float = 0.0
+    """One sigma (m/s^2) of an accelerometer's bias that the model has no state for: a level that is
+    found by gravity is wrong by that."""
     size: int = field(init=False)
     width: int = field(init=False)
     active: NDArray[np.bool_] = field(init=False)

@@ -15,6 +15,7 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.models.catalogue import make_model
 from fusiond.models.left_out import density_of, tilt_memory_s, with_force_biases_as_noise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigator.alignment.start import Levelled, Place, build_start
 from fusiond.simulation.markov import gauss_markov
 
 CLASSES = [Imu(sensor_class=name) for name in ("consumer", "mems", "tactical")]
@@ -71,6 +72,38 @@ def test_steady_tilt_is_that_of_the_bias(imu: Imu) -> None:
 def test_without_a_bias_nothing_is_added() -> None:
     noise = replace(imu_noise(Imu()), force_bias_initial=0.0, force_bias_instability=0.0)
     assert with_force_biases_as_noise(noise) == noise
+
+
+@pytest.mark.parametrize(
+    ("name", "left_out_mg"),
+    [("planar10", 10.0), ("ins17", 10.0), ("planar15", 0.0), ("ins21", 0.0)],
+)
+def test_a_level_is_wrong_by_the_bias_that_no_state_holds(name: str, left_out_mg: float) -> None:
+    """10 mg are 0.57 deg. Where there is a state, the tilt of a start has it by correlation."""
+    model = make_model(name, imu_noise(Imu()))
+    bias = left_out_mg * 1e-3 * STANDARD_GRAVITY_M_S2
+    assert model.force_left_out == pytest.approx(bias, rel=1e-3)
+    place = Place(None, np.array([0.5, 2.0, 40.0]), 5.0, 5.0)
+    start = build_start(
+        *(model, 0, place, np.eye(3), 0.02, np.zeros(3), np.full(3, 0.1), "a test"),
+        levelled=Levelled(np.eye(3)),
+    )
+    tilt = np.degrees(np.sqrt(np.diag(start.covariance)[:2]))
+    assert tilt == pytest.approx([math.hypot(0.1, 0.573)] * 2, rel=0.01)
+    p = start.covariance[np.ix_(model.active, model.active)]
+    assert np.linalg.eigvalsh(p).min() > -1e-12
+
+
+def test_a_gyrocompass_is_wrong_by_it_as_well() -> None:
+    model = make_model("planar10", imu_noise(Imu()))
+    place = Place(None, np.array([0.8, 2.0, 40.0]), 5.0, 5.0)
+    start = build_start(
+        *(model, 0, place, np.eye(3), 0.0, np.zeros(3), np.full(3, 0.1), "a test"),
+        levelled=Levelled(np.eye(3)),
+        compassed=True,
+    )
+    p, tilt = start.covariance, model.force_left_out / STANDARD_GRAVITY_M_S2
+    assert p[0, 2] == pytest.approx(-math.tan(0.8) * tilt**2, rel=0.01)
 
 
 def test_only_the_model_without_the_states_has_the_noise() -> None:

@@ -309,7 +309,8 @@ def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> 
 def _correlate(
     model: Model, p: Array, dcm: Array, lat: float, height: float, compassed: bool
 ) -> None:
-    """Attitude errors that come of sensor errors: J Pss J^T on attitude, J Pss across."""
+    """Attitude errors that come of sensor errors: J Pss J^T on attitude, J Pss across. A bias that
+    the model has no state for makes a tilt all the same."""
     size = model.size
     jacobian = np.zeros((3, size))
     by_force = levelling_jacobian(dcm, lat, height)
@@ -326,3 +327,6 @@ def _correlate(
     p[:3, :3] += cross @ jacobian.T
     p[:3, 9:] += cross[:, 9:]
     p[9:, :3] = p[:3, 9:].T
+    tilt = model.force_left_out / gravity(lat, height)
+    for turned in ([1.0, 0.0, -math.tan(lat) if compassed else 0.0], [0.0, 1.0, 0.0]):
+        p[:3, :3] += tilt**2 * np.outer(turned, turned)
