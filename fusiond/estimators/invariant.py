@@ -139,7 +139,8 @@ class InvariantFilter(TiltAxesFilter):
     """The centralised filter, whose updates run in xi while it `turns`.
 
     One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
-    when a fault that was taken out has left it known no better than `LARGE_SD_RAD`.
+    when it was known and is no better than to `LARGE_SD_RAD`: a fault that was taken out has left
+    it so, or bends in which the inertial unit was silent.
     """
 
     def __init__(
@@ -150,6 +151,8 @@ class InvariantFilter(TiltAxesFilter):
         self.turns = False
         """Whether updates run in xi: the heading may be far off."""
         self._mounts = model.indices[MOUNTING]
+        self._known = False
+        """Whether the heading has been known since the start, to `PLAIN_SD_RAD`."""
         self._bent = False
         """Whether the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
@@ -219,7 +222,7 @@ class InvariantFilter(TiltAxesFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = self._bent = False
+        self.turns = self._known = self._bent = False
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -228,6 +231,10 @@ class InvariantFilter(TiltAxesFilter):
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
+        if self._settles and not self.turns:
+            variance = self.covariance[PHI + 2, PHI + 2]
+            self.turns = self._known and bool(variance > LARGE_SD_RAD**2)
+            self._known |= bool(variance < PLAIN_SD_RAD**2)
         if not self.turns or self._holding:
             return super().update(aid, noise)
         self.turned = 0.0
@@ -352,11 +359,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self.undoubted, self._bent
+        return self.turns, self.undoubted, self._known, self._bent
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self.undoubted, self._bent = extra
+        self.turns, self.undoubted, self._known, self._bent = extra
 
 
 def _way(a: Array, b: Array) -> Array:
