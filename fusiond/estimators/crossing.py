@@ -30,7 +30,7 @@ from fusiond.estimators.covariance import covariance_for
 from fusiond.estimators.turned_axes import rest_axes, turn_down, turn_tilt
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, coefficients
-from fusiond.navigation.strapdown import STEP_DCM, STEP_SMOOTH_N
+from fusiond.navigation.strapdown import STEP_DCM, STEP_SMOOTH_N, VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -68,22 +68,42 @@ def add_up(sums: Array, step: Array, h: float, densities: Array, row: int) -> No
         sums[DENSITIES + j] += share * (densities[6 * row + j] - sums[DENSITIES + j])
 
 
-@compiled("void(f8[::1], i8, b1[::1], f8, f8)", forceinline=True)
+@compiled("void(f8[::1], i8, b1[::1], f8[::1], f8, f8)", forceinline=True)
 def widen_for_gap(
-    cov: Array, width: int, active: NDArray[np.bool_], whole: float, h: float
+    cov: Array, width: int, active: NDArray[np.bool_], nav: Array, whole: float, h: float
 ) -> None:
     """Add to `cov`, flat and of `width` rows, what h seconds of an IMU silence of `whole` seconds
-    leave unknown."""
-    for r in range(CORE_SIZE):
-        if not active[r]:
-            continue
-        at = r * width + r
-        if r < 3:
-            cov[at] += GAP_RATE_RAD_S**2 * whole * h
-        elif r < 6:
-            cov[at] += GAP_FORCE_M_S2**2 * whole * h
-        else:
-            cov[at] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
+    leave unknown.
+
+    A vehicle that turns goes where it heads: its velocity turns with it, dv = v x dphi, and its
+    place by half of that a second. Told apart from each other, a constraint to go straight on would
+    take the velocity for a witness of the heading.
+    """
+    turned = GAP_RATE_RAD_S**2 * whole * h
+    n, e, d = nav[VN], nav[VN + 1], nav[VN + 2]
+    across = ((0.0, -d, e), (d, 0.0, -n), (-e, n, 0.0))
+    for i in range(3):
+        for j in range(3):
+            both = 0.0  # of (v x dphi) with itself
+            for k in range(3):
+                both += across[i][k] * across[j][k]
+            for r, c, q in (
+                (i, j, 1.0 if i == j else 0.0),
+                (3 + i, j, across[i][j]),
+                (i, 3 + j, across[j][i]),
+                (3 + i, 3 + j, both),
+                (6 + i, j, 0.5 * whole * across[i][j]),
+                (i, 6 + j, 0.5 * whole * across[j][i]),
+                (6 + i, 3 + j, 0.5 * whole * both),
+                (3 + i, 6 + j, 0.5 * whole * both),
+                (6 + i, 6 + j, 0.25 * whole * whole * both),
+            ):
+                if active[r] and active[c]:
+                    cov[r * width + c] += q * turned
+    for r in range(3, CORE_SIZE):
+        if active[r]:
+            q = GAP_FORCE_M_S2**2 * whole * h
+            cov[r * width + r] += q if r < 6 else 0.25 * q * whole * whole
 
 
 @compiled("void(f8[::1], i8, b1[::1], f8[::1], f8[::1], i8, f8)", forceinline=True)
@@ -170,7 +190,7 @@ def cross_for(width: int) -> Callable[..., None]:
             propagate_covariance(cov, mean, c, h, active, sensor_terms, rate_terms, noise, q, work)
             shake(cov, width, active, mean, shaken, 0, 0.5 * h * q)
             if silence > 0.0:
-                widen_for_gap(cov, width, active, silence, h * q)
+                widen_for_gap(cov, width, active, nav, silence, h * q)
             if rests:
                 rest_axes(cov, width, n, turn, sensor_slot, sensor_kind)
             elif turning:

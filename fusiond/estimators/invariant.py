@@ -139,7 +139,8 @@ class InvariantFilter(TiltAxesFilter):
     """The centralised filter, whose updates run in xi while it `turns`.
 
     One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
-    when a fault that was taken out has left it known no better than `LARGE_SD_RAD`.
+    when it was known and is no better than to `LARGE_SD_RAD`: a fault that was taken out has left
+    it so, or bends in which the inertial unit was silent.
     """
 
     def __init__(
@@ -148,6 +149,8 @@ class InvariantFilter(TiltAxesFilter):
         super().__init__(model, gap_s, faults)
         self._settles = settles
         self._mounts = model.indices[MOUNTING]
+        self._known = False
+        """True if the heading has been known since the start, to `PLAIN_SD_RAD`."""
         self._bent = False
         """True if the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
@@ -217,12 +220,20 @@ class InvariantFilter(TiltAxesFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = self._bent = False
+        self.turns = self._known = self._bent = False
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
         super().adopt(mean, spread)
         self.turns |= self._settles and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
+
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one aid in, or name why not."""
+        if self._settles and not self.turns:
+            variance = self.covariance[PHI + 2, PHI + 2]
+            self.turns = self._known and bool(variance > LARGE_SD_RAD**2)
+            self._known |= bool(variance < PLAIN_SD_RAD**2)
+        return super().update(aid, noise)
 
     def _turn_in(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not, by an update in xi."""
@@ -349,11 +360,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self.undoubted, self._bent
+        return self.turns, self.undoubted, self._known, self._bent
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self.undoubted, self._bent = extra
+        self.turns, self.undoubted, self._known, self._bent = extra
 
 
 def _way(a: Array, b: Array) -> Array:

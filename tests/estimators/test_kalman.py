@@ -249,8 +249,13 @@ def test_a_gap_widens_the_covariance_by_what_a_vehicle_may_do() -> None:
     estimator.propagate(buffer, int(times[-1]))
     sd = np.sqrt(np.diag(estimator.covariance))
     assert sd[2] == pytest.approx(GAP_RATE_RAD_S * gap, rel=0.05)
-    assert sd[8] == pytest.approx(0.5 * GAP_FORCE_M_S2 * gap**2, rel=0.05)
-    assert sd[5] == pytest.approx(GAP_FORCE_M_S2 * gap, rel=0.05)
+    # It goes where it heads: a pitch that is unknown is a speed downward.
+    turned = GAP_RATE_RAD_S * np.hypot(*estimator.nav[3:5])
+    assert sd[8] == pytest.approx(0.5 * gap**2 * np.hypot(GAP_FORCE_M_S2, turned), rel=0.05)
+    assert sd[5] == pytest.approx(gap * np.hypot(GAP_FORCE_M_S2, turned), rel=0.05)
+    p, v = estimator.covariance, estimator.nav[3:6]
+    assert p[3, 2] == pytest.approx(v[1] * (GAP_RATE_RAD_S * gap) ** 2, rel=0.05)
+    assert p[4, 2] == pytest.approx(-v[0] * (GAP_RATE_RAD_S * gap) ** 2, rel=0.05)
 
 
 def test_snapshot_and_restore_are_exact() -> None:

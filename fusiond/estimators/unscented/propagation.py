@@ -291,7 +291,7 @@ def propagate_points(
             shake(flat, width, active, step, flat_densities, i, h)
             if silent:
                 # The held sample is a guess: its error acts over the whole of the gap.
-                widen_for_gap(flat, width, active, (times[i] - times[i - 1]) * 1e-9, h)
+                widen_for_gap(flat, width, active, nav, (times[i] - times[i - 1]) * 1e-9, h)
         now = stop
         if now == times[i]:
             if record:
