@@ -157,7 +157,7 @@ class CanDriver(Generic[O]):
             self.status.state, self.status.detail = "running", ""
         if self._decoder.device_restarts != self._restarts:
             self._restarts = self._decoder.device_restarts
-            self._event("device_restarted", "the device's clock began anew: it was restarted")
+            self._event("device_restarted", "The device restarted: its clock began again")
         for measurement in measurements:
             self._emit(measurement)
 

@@ -1,4 +1,4 @@
-r"""How much of a receiver's error is each fix's own, lasts for seconds, and longer.
+r"""Shares of a receiver's error: each fix's own, lasting for seconds, and longer.
 
 A receiver states one sigma, s, of all that is wrong with a fix. One that errs anew with each fix is
 averaged out; one that fixes share for half a minute (multipath, satellites that come and go) or
@@ -64,8 +64,8 @@ repeats its error; how it follows a turn is in no share."""
 GAP_S = 2.5
 """Fixes farther apart than this leave too much of the way between them to two velocities."""
 SETTLES_NS = 10_000_000_000
-"""What is as old has come: the timeline's least buffer takes nothing that is later. So the order in
-which fixes come leaves no trace."""
+"""Age beyond which nothing more comes: the timeline's least buffer takes nothing that is later.
+So the order in which fixes come leaves no trace."""
 FORGETS_S = 600.0
 """Streets change."""
 LEAST_SCATTER = 1e-3
@@ -108,7 +108,7 @@ class Fix(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """What part of the stated variance is white, lasts for `LASTS_S`, and longer: one together."""
+    """Shares of the stated variance: white, lasting for `LASTS_S`, and longer; one together."""
 
     white: float
     wanders: float
@@ -219,7 +219,7 @@ def _take(
 
 @compiled("f8(f8, f8)")
 def share_of(x: float, sigma: float) -> float:
-    """What is to be expected of a share whose estimate is `x`, of scatter `sigma`."""
+    """Expectation of a share whose estimate is `x`, of scatter `sigma`."""
     x = min(max(x, -FAR_SIGMAS * sigma), 1.0 + FAR_SIGMAS * sigma)
     a, b, root = -x / sigma, (1.0 - x) / sigma, math.sqrt(0.5)
     at_a = math.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi)
@@ -235,7 +235,7 @@ def share_of(x: float, sigma: float) -> float:
 
 @compiled("f8(f8, f8, f8, f8)")
 def _by_speed(total: float, across: float, speeds: float, offset_variance: float) -> float:
-    """What a sum of d^2 has for the reason that fix and velocity are of two instants. `across` is
+    """Part of a sum of d^2 that fix and velocity of two instants make. `across` is
     that of d dv, `speeds` that of dv^2; `offset_variance` that of delta over that of one d."""
     if not (offset_variance > 0.0 and speeds > 0.0 and total > 0.0):
         return 0.0

@@ -115,7 +115,7 @@ def process(
     _print_summary(result, err="-" in (json_path, str(out)))
     write_json(result, json_path)
     if not result["solution_rows"]:
-        typer.echo(f"fusiond: nothing was navigated: {result['why']}", err=True)
+        typer.echo(f"fusiond: No solution: {result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
 
 
@@ -165,7 +165,7 @@ def calibrate(
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
     if not found.result["solution_rows"]:
-        typer.echo(f"fusiond: nothing was navigated: {found.result['why']}", err=True)
+        typer.echo(f"fusiond: No solution: {found.result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
     typer.echo(found.toml, nl=False, err=json_path == "-")
     if out is not None:

@@ -1,4 +1,4 @@
-"""What a demo plays: the daemon's configuration, the vehicle, and whose plug is pulled when."""
+"""Scenario of a demo: the daemon's configuration, the vehicle, and whose plug is pulled when."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Pulled(NamedTuple):
     every_s: float = 0.0
 
     def times(self, duration_s: float) -> Iterator[tuple[float, float]]:
-        """When it begins and ends, within `duration_s`."""
+        """Begin and end, within `duration_s`."""
         starts = count(self.start_s, self.every_s) if self.every_s else iter([self.start_s])
         for start_s in takewhile(lambda at: at < duration_s, starts):
             yield start_s, start_s + self.length_s

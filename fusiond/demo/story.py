@@ -19,7 +19,7 @@ def story(
     sigma (root of the sum of both variances). `outages` begin and end on the same clock.
     """
     if not len(t_s):
-        yield "nothing was navigated: the car had not driven off yet"
+        yield "No solution: the car had not driven off yet"
         return
     for begin_s, end_s in outages:
         inside = np.flatnonzero((t_s >= begin_s) & (t_s <= end_s))

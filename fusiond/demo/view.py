@@ -71,7 +71,7 @@ class Live:
         self.outage: tuple[str, float] | None = None
         """The device whose plug is pulled, and until when (monotonic, s)."""
         self.aligning = ""
-        """What is shown while there is no solution yet."""
+        """Display while there is no solution yet."""
         self.received = 0
         self._arrivals: deque[float] = deque(maxlen=4096)
 

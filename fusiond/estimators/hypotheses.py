@@ -88,7 +88,7 @@ class Hypotheses:
         self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
         self._judged = bank, table.ints, table.numbers, table.lanes, self.n
         self._widened = *of, self._mounting, self.work, wider, self.found
-        """What `judge_and_widen` takes before and behind an epoch."""
+        """Arguments of `judge_and_widen` before and behind an epoch."""
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)

@@ -279,7 +279,7 @@ class TiltAxesFilter(KalmanEstimator):
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
         self.turns = False
-        """Whether the heading may be far off, and updates are another kind's."""
+        """True if the heading may be far off, and updates are another kind's."""
         self.undoubted = True
         """True if what gyros are wrong by is what they were wrong by when the filter started."""
         if known:

@@ -1,4 +1,4 @@
-"""How the packages of an extra are installed into the Python that runs: no index has fusiond
+"""Installation of an extra into the running Python: no index has fusiond
 itself, so the packages are named."""
 
 from __future__ import annotations

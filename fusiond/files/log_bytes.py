@@ -35,7 +35,7 @@ class LogBytes(NamedTuple):
 
 
 def log_bytes(path: Path) -> LogBytes:
-    """What `path` holds. Raises `OSError`."""
+    """Bytes of the file at `path`. Raises `OSError`."""
     data = path.read_bytes()
     found = _unpacked(data) if data.startswith(_GZIP) else LogBytes(data)
     if found.data.startswith(_UTF_16):

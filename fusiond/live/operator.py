@@ -59,7 +59,7 @@ class Operator:
             case ResetFilter():
                 self._navigator.reset("reset by an operator")
                 self._navigator.without_imu.stop()
-                return "aligning anew"
+                return "aligning again"
             case SetGates():
                 self._navigator.set_gates(command.gates)
                 return ", ".join(f"{name} {gate:g}" for name, gate in command.gates.items())
@@ -86,7 +86,7 @@ class Operator:
         if outcome == "gated":
             raise CommandRefusedError(
                 f"position gated: it is {where}, whose sigma is"
-                f" {math.hypot(*before.sd_ned_m[:2]):.1f} m; nothing moved. To align anew from it,"
+                f" {math.hypot(*before.sd_ned_m[:2]):.1f} m; nothing moved. To align again from it,"
                 " send it with force = true"
             )
         raise CommandRefusedError(f"position refused: {outcome}")

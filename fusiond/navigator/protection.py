@@ -24,7 +24,7 @@ moves about its limit is one alarm. An alarm begins at once."""
 
 
 NO_BOUND = Bound(BoundState.OFF)
-"""Where no alert limit is configured."""
+"""Bound without a configured alert limit."""
 
 
 class ProtectionWatch:
@@ -44,7 +44,7 @@ class ProtectionWatch:
 
             self._levels = Levels(config, estimator)
         self.watches = self._levels is not None
-        """Whether there are levels."""
+        """True if there are levels."""
         self._event = on_event
         self._limits = options.horizontal_alert_limit_m, options.vertical_alert_limit_m
         self._beyond = False

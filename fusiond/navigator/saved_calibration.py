@@ -159,7 +159,7 @@ def load_calibration(path: Path, model: Model, digest: str) -> SavedCalibration 
     if saved is None:
         return None
     if saved.configuration != digest:
-        raise RefusedStateError("axes, mounting, lever arms or delays are configured anew since")
+        raise RefusedStateError("axes, mounting, lever arms or delays have changed since")
     for s in calibration_slots(model):
         value, _ = saved.values.get(s.name, (0.0, 1.0))
         if abs(value) > MOST_SIGMAS * s.prior_sd:

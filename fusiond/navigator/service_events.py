@@ -37,9 +37,9 @@ class ServiceEvents:
             now = self._timeline.estimator.isolated | now
         for source, reason in now.items():
             if source not in self._out:
-                self._event("isolated", f"{source} is left out of the solution: {reason}")
+                self._event("isolated", f"{source} is excluded from the solution: {reason}")
         for source in self._out:
             if source not in now:
-                self._event("readmitted", f"{source} is believed again")
+                self._event("readmitted", f"{source} is used again")
         self._out = now
         return found

@@ -179,7 +179,7 @@ def warm_state(
 def same_run(state: WarmState, config: str, boot_id: str, asleep_ns: int) -> None:
     """Raises `RefusedStateError` for a state whose clock or whose states are not of this run."""
     if state.boot_id != boot_id:
-        raise RefusedStateError("the computer has been started anew since")
+        raise RefusedStateError("the computer was restarted since")
     if abs(state.asleep_ns - asleep_ns) > SUSPENDED_NS:
         raise RefusedStateError("the computer has slept since")
     if state.config != config:

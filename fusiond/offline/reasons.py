@@ -89,11 +89,11 @@ def nothing_navigated(
             return _refused_rows(name, file)
     imu_name, imu, aids = _aids(files)
     if not aids:
-        return f"no aid was given: {reason}"
+        return f"No measurements: give --aid KIND=FILE ({reason})"
     others = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
     if len(others) == len(aids):
         ranges = " and ".join(others)
-        return f"no time in common: {imu_name} from {_span(imu)}, {ranges}"
+        return f"No time in common: {imu_name} from {_span(imu)}, {ranges}"
     kept = [f"{n} of {source} {name}" for source, o in refused.items() for name, n in o.items()]
     return f"{reason} ({', '.join(kept)})" if kept else reason
 

@@ -1,4 +1,4 @@
-"""How a connection to a broker ends where aiomqtt has no answer: a cancellation that is swallowed,
+"""End of a connection to a broker where aiomqtt has no answer: a cancellation that is swallowed,
 a broker that is frozen, an attempt that is given up."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which version of MQTT to speak with a broker: 5, or 3.1.1 where it does not know that.
+"""Version of MQTT for a broker: 5, or 3.1.1 where it does not know that.
 
 A client of version 5 says how long a packet it takes at most (Maximum Packet Size, MQTT 5,
 3.1.2.11.4): what is longer stays with the broker. It also hears of a command whether it was meant

@@ -51,7 +51,7 @@ def bus_here() -> tuple[Interface, str]:
 
 
 def configuration(folder: Path, interface: Interface, channel: str) -> str:
-    """What reads the devices, as a file for `fusiond run`."""
+    """Configuration for `fusiond run` that reads the devices."""
     imu = SIM_IMU.model_copy(update={"interface": interface, "channel": channel})
     options = imu.model_dump(mode="json", exclude_unset=True)
     sources = (

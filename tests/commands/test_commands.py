@@ -218,7 +218,7 @@ def test_process_names_what_it_rejected(tmp_path: Path) -> None:
     aid, out = f"gnss={gnss}", tmp_path / "solution.csv"
     done = in_this_process("process", VEHICLE, "--imu", imu, "--aid", aid, "--out", out)
     assert done.returncode == 65
-    assert done.stderr.startswith("fusiond: nothing was navigated: No heading")
+    assert done.stderr.startswith("fusiond: No solution: No heading")
     assert f"imu: {len(lines) - 1} rows, 2 rejected" in done.stdout.splitlines()
     assert "  line 11: time_repeated: " in done.stdout
     assert "  line 501: not_finite: accel_z_m_s2 = nan" in done.stdout

@@ -55,7 +55,7 @@ def refused(imu: Path, *aids: str, out: Path) -> str:
     code, _, text, report = process(imu, *aids, out=out)
     assert code == 65
     assert report["solution_rows"] == 0
-    assert text.strip() == f"fusiond: nothing was navigated: {report['why']}"
+    assert text.strip() == f"fusiond: No solution: {report['why']}"
     return str(report["why"])
 
 
@@ -149,13 +149,13 @@ def test_times_on_another_base(drive: Path, tmp_path: Path) -> None:
 
     gnss = changed(drive, "gnss.csv", of_week, tmp_path)
     why = refused(drive / "imu.csv", f"gnss={gnss}", out=tmp_path)
-    assert why.startswith("no time in common: imu from 0.")
+    assert why.startswith("No time in common: imu from 0.")
     assert "gnss from 24300" in why
 
 
 def test_no_aid_at_all(drive: Path, tmp_path: Path) -> None:
     why = refused(drive / "imu.csv", out=tmp_path)
-    assert why == "no aid was given: Waiting for a first position fix"
+    assert why == "No measurements: give --aid KIND=FILE (Waiting for a first position fix)"
 
 
 def test_aids_that_are_all_refused_are_named(drive: Path, tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_story_tells_the_outages_that_were_lived_through() -> None:
     ]
     none = np.zeros(0)
     assert list(story(none, none, none, [(1.0, 2.0)])) == [
-        "nothing was navigated: the car had not driven off yet"
+        "No solution: the car had not driven off yet"
     ]
 
 

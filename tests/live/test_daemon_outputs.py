@@ -54,7 +54,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["ok"], reply
                 assert reply["text"]
                 reply = await ask("reset_filter", {})
-                assert (reply["ok"], reply["text"]) == (True, "aligning anew")
+                assert (reply["ok"], reply["text"]) == (True, "aligning again")
                 await bench.mode(Mode.ALIGNING)
                 reply = await ask("set_position", here)
                 await bench.mode(PARKED)

@@ -109,8 +109,8 @@ def test_its_report_says_what_how_much_and_since_when() -> None:
 def test_each_turn_is_one_event() -> None:
     events = [(c, t) for c, t in velocity_off().events if c != "aligned"]
     assert [code for code, _ in events] == ["isolated", "readmitted"]
-    assert events[0][1].startswith("gnss_velocity is left out of the solution: gnss velocity is")
-    assert events[1][1] == "gnss_velocity is believed again"
+    assert events[0][1].startswith("gnss_velocity is excluded from the solution: gnss velocity is")
+    assert events[1][1] == "gnss_velocity is used again"
 
 
 def test_a_step_of_the_gyro_is_told_for_a_minute_after_it_was_corrected() -> None:

@@ -51,6 +51,6 @@ export function showMessages(store) {
     messages,
     lines.length
       ? lines
-      : [[{ text: "None since this dashboard listens.", className: "none", span: 4 }]],
+      : [[{ text: "No messages.", className: "none", span: 4 }]],
   );
 }

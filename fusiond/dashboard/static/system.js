@@ -27,7 +27,7 @@ export function showEvents(store) {
     events,
     lines.length
       ? lines
-      : [[{ text: "None since this dashboard listens.", className: "none", span: 3 }]],
+      : [[{ text: "No events.", className: "none", span: 3 }]],
   );
 }
 
@@ -132,7 +132,7 @@ const WORDS = {
   request_fix: "request a fix",
   start_recording: "start recording",
   stop_recording: "stop recording",
-  reset_filter: "align anew",
+  reset_filter: "align again",
 };
 const holder = byId("commands"),
   answer = element("span", "notes");
@@ -149,7 +149,7 @@ export function bindCommands(store, socket) {
       ...offered.map((name) => {
         const button = element("button", "", WORDS[name] || name);
         button.onclick = () => {
-          if (name === "reset_filter" && !confirm("Forget position and heading, and align anew?"))
+          if (name === "reset_filter" && !confirm("Forget position and heading, and align again?"))
             return;
           put(answer, "");
           socket.ask({ command: name, token: key });

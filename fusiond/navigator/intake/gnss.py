@@ -245,7 +245,7 @@ def _shares(
     sections: Sections,
     sd: Vector3,
 ) -> Shares | None:
-    """How a fix's variance is divided, as this receiver's fixes and velocities have shown, those by
+    """Division of a fix's variance, as this receiver's fixes and velocities have shown, those by
     code and those by phase each; None of one that states no velocity with it."""
     known = sections.fix_errors.get((m.source, by_phase))
     if known is None:
@@ -260,7 +260,7 @@ def _shares(
 
 
 def _lasting(sd: Vector3, shares: Shares, o: GnssAiding) -> Vector3:
-    """How much of the error that fixes share there is in one of that sigma; what is seen of the
+    """Share of the common error of fixes in one of that sigma; what is seen of the
     horizontal is taken to be so of the height. Its own error counts as stated all the same: how a
     receiver that smooths its fixes follows a turn is in no share."""
     north, east, down = sd

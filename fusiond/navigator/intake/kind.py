@@ -51,7 +51,7 @@ class Sections:
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
-        """Whether one wants large residuals to weigh less: by default none does."""
+        """True if large residuals weigh less: by default none does."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
         self.made: dict[tuple[str, object], Any] = {}
