@@ -16,7 +16,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from io import DEFAULT_BUFFER_SIZE, BytesIO, TextIOWrapper
+from io import BytesIO, TextIOWrapper
 from math import inf, isfinite, nan
 from pathlib import Path
 from typing import Any, TextIO
@@ -137,7 +137,7 @@ def read_table(
     try:
         data = plain_csv(path)
         start = len(first_line(data)) + 1
-        header = _header(data[: start + DEFAULT_BUFFER_SIZE])
+        header = _header(data)
         _check_header(path, header, columns)
         rows = newlines(data) - 1 + (data[-1:].tobytes() != b"\n")
         parsed = None
@@ -189,13 +189,20 @@ def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> N
 
 
 def _as_text(data: Text) -> TextIO:
-    return TextIOWrapper(BytesIO(data.data), encoding="utf-8-sig")
+    """A byte that is none of UTF-8 costs the cell that it stands in."""
+    return TextIOWrapper(BytesIO(data.data), encoding="utf-8-sig", errors="replace")
 
 
 def _header(data: Text) -> list[str]:
-    """The cells of the first line, of `data` that goes on by as much as is decoded at once."""
-    with _as_text(data) as stream:
-        return [cell.strip() for cell in stream.readline().split(",")]
+    """The cells of the first line. Raises `UnicodeDecodeError` where it is none of text."""
+    line = first_line(data).partition(b"\r")[0]
+    try:
+        text = line.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if any(byte < ord(" ") for byte in line if byte != ord("\t")):
+            raise
+        text = line.decode("cp1252", "replace")  # a column more, named by a Windows in German
+    return [cell.strip() for cell in text.split(",")]
 
 
 def _read_plain(data: Text, start: int, rows: int, header: list[str]) -> _Parsed | None:

@@ -39,7 +39,7 @@ def plain_csv(path: Path) -> Text:
         data = _text(_unzipped(data.tobytes()))
     if data[:2].tobytes() in _UTF_16:
         raise DialectError("UTF-16 text: save it as CSV in UTF-8")
-    return _with_commas(data)
+    return _with_commas(_without_quotes(data))
 
 
 def first_line(data: Text) -> bytes:
@@ -71,8 +71,20 @@ def _unzipped(data: bytes) -> bytes:
         raise DialectError(f"damaged .gz: {error}") from error
 
 
+def _without_quotes(data: Text) -> Text:
+    """Cells in quotes, as R writes names and spreadsheets what they are told to: no number and no
+    name of a column needs them."""
+    if b'"' in first_line(data) or b'"' in first_line(data[len(first_line(data)) + 1 :]):
+        return np.where(data == ord('"'), np.uint8(ord(" ")), data)
+    return data
+
+
 def _with_commas(data: Text) -> Text:
     header = first_line(data).strip()
+    if data.size and not header:
+        raise DialectError("line 1 is empty: take it out, so that the names lead")
+    if header.startswith(b"#"):
+        raise DialectError("line 1 is a comment (#): take it out, so that the names lead")
     if b"," in header:
         return data
     if header.lower().startswith(b"sep="):

@@ -25,14 +25,24 @@ def with_comma_decimals(text: str, between: str) -> str:
     return text.replace(",", between).replace(".", ",")
 
 
+def quoted(text: str, between: str) -> str:
+    rows = (row.split(between) for row in text.splitlines())
+    return "\n".join(between.join(f'"{cell}"' for cell in row) for row in rows)
+
+
 @pytest.mark.parametrize(
     "text",
     [
         PLAIN.replace(",", ";"),
         PLAIN.replace(",", "\t"),
+        PLAIN.replace("\n", "\r"),
         with_comma_decimals(PLAIN, ";"),
         with_comma_decimals(PLAIN, "\t"),
         "\ufeff" + with_comma_decimals(PLAIN, ";").replace("\n", "\r\n"),
+        quoted(PLAIN, ","),
+        quoted(HEADER, ",") + "\n" + "\n".join(ROWS),
+        HEADER + "\n" + quoted("\n".join(ROWS), ","),
+        "\ufeff" + quoted(with_comma_decimals(PLAIN, ";"), ";"),
     ],
 )
 @pytest.mark.parametrize("zipped", [False, True])
@@ -53,10 +63,21 @@ def test_a_refused_row_keeps_its_line(tmp_path: Path) -> None:
     assert [(r.line, r.reason) for r in table.rejected] == [(4, "missing"), (5, "unreadable")]
 
 
+def test_a_byte_that_is_none_of_utf_8_costs_its_row(tmp_path: Path) -> None:
+    """A remark of a Windows in German beside numbers, and a number that a disk has damaged."""
+    data = (HEADER + ",Höhe über Grund\n" + ROWS[0] + ",fährt\n" + ROWS[1] + ",\n").encode("cp1252")
+    table = read(tmp_path / "imu.csv", data)
+    assert len(table.t_s) == 2
+    damaged = read(tmp_path / "damaged.csv", data.replace(b"-9.80", b"-9\xff80"))
+    assert [(r.line, r.reason) for r in damaged.rejected] == [(3, "unreadable")]
+
+
 @pytest.mark.parametrize(
     ("data", "said"),
     [
         (PLAIN.replace(",", " ").encode(), "blanks between the cells"),
+        (b"# by a logger\n" + PLAIN.encode(), "line 1 is a comment"),
+        (b"\n" + PLAIN.encode(), "line 1 is empty"),
         (PLAIN.encode("utf-16"), "UTF-16"),
         (b"sep=;\n" + PLAIN.replace(",", ";").encode(), "line 1 is a spreadsheet's 'sep='"),
         (
@@ -65,7 +86,7 @@ def test_a_refused_row_keeps_its_line(tmp_path: Path) -> None:
         ),
         (gzip.compress(PLAIN.encode(), mtime=0)[:-20], "damaged .gz"),
     ],
-    ids=["blanks", "utf16", "sep", "mixed", "damaged"],
+    ids=["blanks", "comment", "empty", "utf16", "sep", "mixed", "damaged"],
 )
 def test_what_is_refused_has_a_name(tmp_path: Path, data: bytes, said: str) -> None:
     with pytest.raises(TableError, match=said):

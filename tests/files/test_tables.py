@@ -142,7 +142,7 @@ def test_a_file_that_is_no_table(tmp_path: Path) -> None:
         read_imu(write(tmp_path, IMU.rpartition(",")[0], "0,0,0,0,0,0"))
     with pytest.raises(TableError, match="'t_s' occurs twice"):
         read_imu(write(tmp_path, IMU + ",t_s", imu_row(0) + ",0"))
-    (tmp_path / "binary.csv").write_bytes(IMU.encode() + b"\n\xff\xfe\x00\x81")
+    (tmp_path / "binary.csv").write_bytes(b"\x81\xfe\x00\x81," + IMU.encode() + b"\n")
     with pytest.raises(TableError, match="not a text file"):
         read_imu(tmp_path / "binary.csv")
 
