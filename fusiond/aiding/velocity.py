@@ -143,10 +143,10 @@ class VelocityAid(Aid):
         m = 2 if model.hold_height else len(self.v_ned)
         rows = lent.get(m) or Innovation.unwritten(m, model.size)
         slots = model.column_of, at[self.time], at[self.rest], at[self.fix_time]
-        v, sd = self.v_ned, self.sd
-        if len(v) == 2:  # none down
-            v, sd = (*v, 0.0), (*sd[:2], 0.0)
-        velocity_rows(nav, xi, step, *slots, *v, *sd, *self.lever, self.sd_time_s, *rows)
+        north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
+        sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
+        measured = north, east, down, sd_n, sd_e, sd_d  # 0 where there is none down
+        velocity_rows(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
         return rows
 
     def offers(self) -> tuple[VelocityOffer, ...]:
