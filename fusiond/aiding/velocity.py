@@ -156,8 +156,8 @@ class VelocityAid(Aid):
         slots = model.column_of, at[self.time], at[self.rest], at[self.fix_time]
         north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
         sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
-        of_fix = north, east, down, sd_n, sd_e, sd_d
-        velocity_rows(nav, xi, step, *slots, *of_fix, *self.lever, self.sd_time_s, *rows)
+        measured = north, east, down, sd_n, sd_e, sd_d  # 0 where there is none down
+        velocity_rows(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
         return rows
 
     def offers(self) -> tuple[VelocityOffer, ...]:

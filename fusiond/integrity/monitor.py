@@ -213,8 +213,8 @@ class ConsistencyMonitor:
         if not finite.all():
             places = np.flatnonzero(finite).tolist()
             self.rejected["not_finite"] += len(rows) - len(places)
-            of_finite = self.take(rows[finite], nis[finite], energy[finite]) if places else []
-            return [(places[i], to) for i, to in of_finite]
+            turned = self.take(rows[finite], nis[finite], energy[finite]) if places else []
+            return [(places[i], to) for i, to in turned]
         if rows.shape[1] != self._m:
             self.restarts += self._m > 0
             self._m = rows.shape[1]
@@ -233,26 +233,18 @@ class ConsistencyMonitor:
             if k != self._limits_k and k >= FEWEST:
                 self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
                 self._limits_k = k
-            limits, turned = self._limits, np.empty((end - done, 2), dtype=np.int64)
-            dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+            limits, told = self._limits, np.empty((end - done, 2), dtype=np.int64)
             low, high = limits.nis_limits
+            dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+            window = self._rows, self._figures, self._products, self._sums
+            of_epochs = rows[now], nis[now], energy[now], limits.weights, self._rho
+            by = low, high, limits.portmanteau
             turns = _slide_over(
-                self._rows,
-                self._figures,
-                self._products,
-                self._sums,
-                first,
-                o.window,
-                *(rows[now], nis[now], energy[now], limits.weights, self._rho),
-                *(low, high, limits.portmanteau),
-                dof,
-                patience,
-                self._held,
-                turned,
+                *window, first, o.window, *of_epochs, *by, dof, patience, self._held, told
             )
             if k >= FEWEST:
                 self._average = float(self._sums[0]) / dof
-            found += [(done + i, word(to, o.shared)) for i, to in turned[:turns].tolist()]
+            found += [(done + i, word(to, o.shared)) for i, to in told[:turns].tolist()]
             done = end
         return found
 
