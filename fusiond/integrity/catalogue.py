@@ -6,8 +6,9 @@ a fault begins, each with its source; by which signature it enters the motion or
 
 Rates are an engineer's, of devices on vehicles in streets, where no standard counts them, and the
 same for all kinds for that reason: one an hour; but a device that is late by half a second or more
-from an instant on, or a wheel whose scale changes, is one in a thousand hours, and one that is
-carried off, position and velocity together, one in ten thousand.
+from an instant on, a wheel whose scale changes, or ground that turns below a vehicle at rest, is
+one in a thousand hours, and one that is carried off, position and velocity together, one in ten
+thousand.
 Ten times the rate is what a chi-square of 4.6 is: it moves no decision by an epoch. Sizes are one
 sigma of a normal prior, which bounds an estimate and tells no kinds apart but those that are known
 to be of a size.
@@ -260,12 +261,18 @@ def speed_kinds(device: str) -> list[Kind]:
 
 
 def row_kinds(
-    device: str, text: str, unit: str, sd: tuple[float, ...], per_unit: float, axes: tuple[str, ...]
+    device: str,
+    text: str,
+    unit: str,
+    sd: tuple[float, ...],
+    per_unit: float,
+    axes: tuple[str, ...],
+    per_hour: float = RECEIVER_PER_H,
 ) -> list[Kind]:
     """Of any other measurement: each of its rows is off."""
     of = Kind(
         *("offset", f"{device} {text}", unit, ROWS, OWN),
-        *(sd, RECEIVER_PER_H, per_unit),
+        *(sd, per_hour, per_unit),
         device=device,
         axes=axes,
     )
@@ -308,7 +315,8 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
         found += carried_kinds(TOGETHER)
     found.append(over_kind())
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
-    found += row_kinds("zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY)
+    of_ground = "zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY
+    found += row_kinds(*of_ground, per_hour=LATE_PER_H)
     return sorted(found, key=lambda kind: -kind.size)  # as a table of them has to be
 
 
