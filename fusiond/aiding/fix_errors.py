@@ -27,8 +27,8 @@ probability `NONE`), or any from 0 to 1. Its mean is what counts,
 
     E = (1 - NONE) int_0^1 y N(x; y, sigma) dy / (NONE N(x; 0, sigma) + (1 - NONE) int_0^1 N dy)
 
-a quarter before anything is shown; after a minute of white errors about nothing. So is weighed what
-is not white, 1 - W, and of that what is over in seconds, w / (1 - W); L is the rest.
+after a minute of white errors about nothing. So is weighed what is not white, 1 - W, and of that
+what is over in seconds, w / (1 - W); L is the rest.
 
 Source: Allan, Statistics of atomic frequency standards, Proc. IEEE 54 (1966); Gelb, Applied
 Optimal Estimation (1974), section 4.5 (Markov processes of a shaping filter); Mitchell, Beauchamp,
@@ -58,6 +58,12 @@ LAG_S, STEP_S = 20.0, 2.0
 """Means of fixes that are compared lie so far apart; each is of so much time."""
 NONE = 0.5
 """Probability that a receiver has nothing of a kind of error: nobody knows."""
+AT_FIRST, FIRST_STEPS = 0.75, 4.0
+"""Share of the variance that is taken to be shared before fixes have shown it, and how many steps,
+each axis one, it is worth. A filter that has once been too sure of its place stays so; one that was
+not is as sure as it may be with the next fix that counts as white."""
+FOR_SECONDS = 0.5
+"""What part of what is shared is taken to be over in seconds, worth one lag: a choice."""
 LEAST_WHITE = 0.01
 """Share of the variance that is white at least: a tenth of sigma. A receiver that smooths its fixes
 repeats its error; how it follows a turn is in no share."""
@@ -273,12 +279,15 @@ def _shares(packed: Array, offset_sd_s: float, wanders: bool, out: Array) -> Non
     supposed = (own * steps + 2.0) / (steps + 2.0)
     of_own = (0.5 * walks) ** 2 + 3.0 * supposed * supposed / max(steps, 0.1)
     shared = share_of(1.0 - own, math.sqrt(of_own) + LEAST_SCATTER)
+    shared = (shared * steps + AT_FIRST * FIRST_STEPS) / (steps + FIRST_STEPS)
     shared = min(shared, 1.0 - LEAST_WHITE)
     w = 0.0
     if wanders:
-        w = 0.5 * (1.0 - NONE)
+        w = FOR_SECONDS
         if count > 0.0:
+            alike = 2.0 * LAG_S / STEP_S
             w = share_of(estimate / max(shared, 1e-3), scatter / max(shared, 1e-3))
+            w = (w * count + FOR_SECONDS * alike) / (count + alike)
     out[0], out[1], out[2] = 1.0 - shared, w * shared, (1.0 - w) * shared
 
 

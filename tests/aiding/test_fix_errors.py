@@ -122,11 +122,10 @@ def test_what_velocities_do_not_resolve_is_not_told() -> None:
     assert fine.lasts == pytest.approx(0.5, abs=0.06)
 
 
-def test_before_anything_is_shown_a_quarter_is_shared() -> None:
+def test_before_anything_is_shown_most_is_shared() -> None:
     for white, wanders, lasts in (FixErrors(OFFSET_SD_S).shares(0), _shown(0, 2.0, rate_hz=0.3)):
-        assert white == pytest.approx(0.75, abs=0.02)
-        assert wanders == pytest.approx(0.25 * (1.0 - white))
-        assert lasts == pytest.approx(0.75 * (1.0 - white))
+        assert white == pytest.approx(0.25)
+        assert wanders == lasts == pytest.approx(0.375)
 
 
 def _fixes(count: int) -> list[Fix]:
