@@ -12,7 +12,7 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
-from fusiond.files.csv_tables import Rejection
+from fusiond.files.csv_tables import Rejection, TableError
 
 _GZIP = b"\x1f\x8b"
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
@@ -35,9 +35,11 @@ class LogBytes(NamedTuple):
 
 
 def log_bytes(path: Path) -> LogBytes:
-    """Bytes of the file at `path`. Raises `OSError`."""
+    """Bytes of the file at `path`. Raises `OSError`, and `TableError` where nothing can be unpacked."""
     data = path.read_bytes()
     found = _unpacked(data) if data.startswith(_GZIP) else LogBytes(data)
+    if found.cut and not found.data:
+        raise TableError(f"{path}: no gzip file that can be unpacked ({found.cut})")
     if found.data.startswith(_UTF_16):
         text = found.data.decode("utf-16", "replace")
         return found._replace(data=text.encode("latin-1", "replace"))
