@@ -166,8 +166,8 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
     covariances: list[Array] = []
     places: list[Array] = []
     count = round(DURATION_S / TICK_S)
-    instants: Array = np.arange(count) * TICK_S
-    true = true_nav(truth(), instants)
+    steps: Array = np.arange(0.0, count, 1.0)
+    true = true_nav(truth(), steps * TICK_S)
     for k in range(1, count):
         now_ns = round(k * TICK_S * 1e9)
         while following < len(fixes) and fixes[following].t_seen_ns <= now_ns:
