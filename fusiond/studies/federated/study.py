@@ -263,7 +263,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Experiments 1 and 2 as the paper's figures, and the courses of the faults, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(9.0, 13.0), layout="constrained")
     axes = figure.subplots(5, 1)
