@@ -273,7 +273,7 @@ def _finding(total: dict[str, Any], rows: list[dict[str, Any]], alpha: float) ->
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """False-alarm rates with intervals, and the epochs until a fault is noticed, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(11.0, 6.5), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -149,7 +149,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Plot the distribution of position NEES over drives, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.add_subplot()

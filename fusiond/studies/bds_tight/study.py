@@ -332,7 +332,7 @@ def _text(value: float | None) -> str:
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Horizontal RMS and mean NEES over time, one row a case, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     series = result["series"]
     figure = Figure(figsize=(11.0, 2.8 * (len(series) + 3)), layout="constrained")

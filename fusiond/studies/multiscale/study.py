@@ -301,7 +301,7 @@ def _beside_the_paper(result: dict[str, Any]) -> list[tuple[str, list[str], list
 def plot(result: dict[str, Any], path: Path) -> None:
     """Figures 1 to 3 of the paper, of run 0: velocity errors of both filters and what they state;
     below them position error over time by filter, one panel a case, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(9.0, 12.0), layout="constrained")
     panels = figure.subplots(5)

@@ -263,7 +263,7 @@ def _cell(value: float | None, form: str) -> str:
 def plot(result: dict[str, Any], path: Path) -> None:
     """Horizontal RMS over time by filter, one panel a case; below them the paper's figures 1 and 2,
     or 3 and 4, of run 0; to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     cases = [result, *result.get("variants", {}).values()]
     own = 2 if paper.SHOWN in result["strategies"] else 0

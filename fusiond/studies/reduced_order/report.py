@@ -83,7 +83,7 @@ def picture(series: dict[str, Any], path: Path) -> None:
 
     `series`: instants `t_s`, and of each of `models` the `true` and the `believed` `curves` there.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True)

@@ -147,7 +147,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Horizontal RMS and mean NEES over time, one row a problem, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     problems = result["problems"]
     figure = Figure(figsize=(11.0, 2.8 * len(problems)), layout="constrained")

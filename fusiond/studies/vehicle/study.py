@@ -87,7 +87,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """NEES by block and case with the interval of a matched filter, to `path`."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     names = list(dict.fromkeys(row["block"] for row in result["blocks"]))
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
