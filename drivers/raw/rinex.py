@@ -225,9 +225,7 @@ class ObservationReader:
             self._counters["half_cycle_open"] += 1
             carrier = None
         lock_s = 0.0 if flags & _LOCK_LOST else math.inf
-        return RawSignal(
-            system, prn, name, pseudorange, rate, carrier, cno, None, None, lock_s
-        )
+        return RawSignal(system, prn, name, pseudorange, rate, carrier, cno, None, None, lock_s)
 
     def _make_columns(self, system: System) -> _Columns:
         names = self._header.observables.get(system, [])

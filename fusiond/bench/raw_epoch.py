@@ -1,9 +1,10 @@
 """What an epoch of raw GNSS data costs: 40 satellites with two frequencies each.
 
 From the decoded epoch to the filter that has used it: signals chosen, carriers followed from the
-epoch before, satellites and corrections computed, 80 rows (ranges, rates by carriers) linearised, gated one by one, folded in and tested by their residuals, the
-solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again
-after the same one, so the choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
+epoch before, satellites and corrections computed, 80 rows (ranges, rates by carriers) linearised,
+gated one by one, folded in and tested by their residuals, the solution corrected; then what
+`health` and the verdicts keep. The same epoch comes again and again after the same one, so the
+choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
 """
 
 from __future__ import annotations

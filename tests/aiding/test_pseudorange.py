@@ -13,11 +13,11 @@ from fusiond.aiding.pseudorange import (
     CARRIER_CLOCK,
     NO_CLOCK,
     RANGE_SHARED,
-    UNUSED_VARIANCE,
     PseudorangeAid,
     epoch_values,
     nothing_left,
 )
+from fusiond.aiding.range_rows import UNUSED_VARIANCE
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.blocks import clock_blocks, shared_error
@@ -208,15 +208,13 @@ def test_refusals() -> None:
         _aid(nav, [0, 0])
 
 
-# --------------------------------------------------------------------------- carriers, shared errors
+# ---------------------------------------------------------------------- carriers, shared errors
 
 SPAN_S = 0.5
 FORCE = (0.6, -0.4, -9.7)
 
 
-def _moved(
-    error: Array, rate_b: Array, force_b: Array
-) -> tuple[Array, Array, Array, Array]:
+def _moved(error: Array, rate_b: Array, force_b: Array) -> tuple[Array, Array, Array, Array]:
     """Navigation state and step at either end of `SPAN_S`, by an IMU of 100 Hz."""
     nav = runs.level_nav(RPY, VELOCITY)
     nav = runs.with_error(nav, error[:9])

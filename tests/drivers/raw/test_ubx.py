@@ -63,7 +63,9 @@ def test_how_long_a_carrier_has_been_followed(ms: int, lock_s: float) -> None:
     assert found.signals[0].lock_s == lock_s
 
 
-@pytest.mark.parametrize(("track", "carrier", "opened"), [(7, 1.1e8, 0), (3, None, 1), (1, None, 0)])
+@pytest.mark.parametrize(
+    ("track", "carrier", "opened"), [(7, 1.1e8, 0), (3, None, 1), (1, None, 0)]
+)
 def test_a_carrier_with_half_a_cycle_open_is_none(
     track: int, carrier: float | None, opened: int
 ) -> None:
