@@ -104,8 +104,8 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
     Every measurement is counted as `measured_G`, `measured_E`, `measured_C`, or with the name of
     another system, and again where one of the three is refused: `signal_unknown`, `prn_unknown`,
     `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `rate_implausible`,
-    `signal_repeated`. A carrier with half a cycle open is left out: `half_cycle_open`. A leap second count that cannot be is counted as `leap_seconds_implausible`
-    and not known.
+    `signal_repeated`. A carrier with half a cycle open is left out: `half_cycle_open`. A leap
+    second count that cannot be is counted as `leap_seconds_implausible` and not known.
     """
     if len(payload) < _HEADER.size:
         return None

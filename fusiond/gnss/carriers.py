@@ -1,4 +1,4 @@
-r"""What the carriers of a satellite tell from epoch to epoch: its slant delay, and how far it moved.
+r"""What a satellite's carriers tell from epoch to epoch: its slant delay, and how far it moved.
 
 Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
 gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
@@ -32,7 +32,8 @@ s_L by a model of C/N0 and a scale, learned in the same way from d(L_a - L_b) of
 2 (s_La^2 + s_Lb^2).
 
 Refused, of each satellite: `lock_lost` (the receiver says so), `cycle_slip` (the carriers part by
-more than the ionosphere can, or the rate is not that of the Dopplers); of all at once: `clock_jump`.
+more than the ionosphere can, or the rate is not that of the Dopplers); of all at once:
+`clock_jump`.
 
 Source: Hatch, Proc. 3rd Int. Geodetic Symposium on Satellite Doppler Positioning (1982); Groves,
 2nd edition, 9.2.7 and 9.3.3; van Graas and Soloviev, Navigation 51 (2004), 277-292.
@@ -110,7 +111,7 @@ JUMP_M_S = 3.0
 @compiled("f8(f8[:, ::1])")
 def scale_squared(kept: Array) -> float:
     """What the model's variances of codes are to be multiplied by."""
-    found = (PRIOR_COUNT + kept[0, _SUM]) / (PRIOR_COUNT + kept[0, _COUNT])
+    found: float = (PRIOR_COUNT + kept[0, _SUM]) / (PRIOR_COUNT + kept[0, _COUNT])
     return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
 
 

@@ -21,8 +21,8 @@ until D1 or D2 has, Galileo E5 as a whole and E6.
 
 E5a with an I/NAV clock: both clocks serve E1, so dt_F - BGDa = dt_I - BGDb there, and dt_F follows.
 L1 C/A and L2C: the inter-signal corrections, in CNAV only as well, are the differential code biases
-C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5: the inter-signal correction is in CNAV only. IS-GPS-705J 20.3.3.3.1.2.1 has it within
-+-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
+C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5: the inter-signal correction is in CNAV only.
+IS-GPS-705J 20.3.3.3.1.2.1 has it within +-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
 
 Source: IS-GPS-200N 20.3.3.3.3.2; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0 5.2.4
 (equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none), BDS-SIS-ICD-B1C-1.0 7.6 and

@@ -16,9 +16,9 @@ those of its group
     var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) p (I0 - M)
 
 for with B known a model that is too strong or too weak errs by p (I0 - M), and by 0.3 p I0 from
-place to place in the sky. A group are the signals of one carrier of GPS, Galileo, BeiDou-3 or BeiDou-2; one without pairs has
-B = 0. So a satellite with one carrier, or a fresh one, has its delay of
-the model, at the level that the others measure.
+place to place in the sky. A group are the signals of one carrier of GPS, Galileo, BeiDou-3 or
+BeiDou-2; one without pairs has B = 0. So a satellite with one carrier, or a fresh one, has its
+delay of the model, at the level that the others measure.
 
 s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
 of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive while the
@@ -26,9 +26,9 @@ distance grows); dt, ddt the satellite's clock offset and drift, d the signal's 
 troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
 D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
 
-A carrier's rate is the mean over dt before the epoch: that of the middle, D at the epoch less dt / 2
-times the range's acceleration l . a + (|w|^2 - (l . w)^2) / rho (to 1e-5 m/s in 2 s), w = v - v_r,
-of which `PULL` has l . a, the satellite's; in the turning axes
+A carrier's rate is the mean over dt before the epoch: that of the middle, D at the epoch less
+dt / 2 times the range's acceleration l . a + (|w|^2 - (l . w)^2) / rho (to 1e-5 m/s in 2 s),
+w = v - v_r, of which `PULL` has l . a, the satellite's; in the turning axes
 
     a = -GM s / |s|^3 - 2 we x v - we x (we x s)
 

@@ -7,9 +7,9 @@ l (n, 3) lines of sight, one clock offset per system that is there, W = 1 / sigm
 models of ionosphere and troposphere leave in the whole sky, and BeiDou-2's offset, known beforehand
 to their sigmas (`fusiond.gnss.ranges.Rows.common`). Iterated until the
 step is under 1 mm, from the earth's centre if nothing better is known. Velocity and drift the same
-way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and |n|^2, against
-chi^2 with as many degrees of freedom as there are rows more than positions and clocks; while it
-fails, the row with the largest normalised residual
+way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and |n|^2,
+against chi^2 with as many degrees of freedom as there are rows more than positions and clocks;
+while it fails, the row with the largest normalised residual
 
     w_k = r_k / sqrt(S_kk),   S = W^-1 - H N^-1 H^T
 

@@ -39,8 +39,8 @@ NAV_SIZE = 10
 # noise that the latter has left, and for how long (s) the vehicle is known to rest.
 STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM, STEP_SMOOTH_N = 0, 3, 6, 9, 18
 STEP_SMOOTH_RATE_B, STEP_NOISE_B, STEP_RESTS_S = 21, 24, 27
-# Since the start, as the IMU alone has it and no feedback changes: the seconds, how much the velocity
-# has changed (NED, m/s), and the integral of that (m).
+# Since the start, as the IMU alone has it and no feedback changes: the seconds, how much the
+# velocity has changed (NED, m/s), and the integral of that (m).
 STEP_SECONDS, STEP_CHANGED_N, STEP_MOVED_N = 28, 29, 32
 STEP_SIZE = 35
 # Time constant (s) of both: a car's acceleration changes in a second, an engine shakes in 50 ms.

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import NotApplicable, State
-from fusiond.aiding.pseudorange import DISPLACED_BY, RANGE_BIAS, RANGE_SHARED
+from fusiond.aiding.pseudorange import RANGE_BIAS, RANGE_SHARED
+from fusiond.aiding.range_rows import DISPLACED_BY
 from fusiond.estimators.base import Estimator
 from fusiond.gnss.ecef import ned_axes
 from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude

@@ -145,8 +145,8 @@ class RawEpochAid(Aid):
 
 
 class RawGnss:
-    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`; `recent` are its last
-    epochs in the order of time."""
+    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`; `recent` are its
+    last epochs in the order of time."""
 
     def __init__(self, source: str, section: RawAiding) -> None:
         self.source = source

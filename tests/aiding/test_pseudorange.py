@@ -13,11 +13,11 @@ from fusiond.aiding.pseudorange import (
     CARRIER_CLOCK,
     NO_CLOCK,
     RANGE_SHARED,
-    UNUSED_VARIANCE,
     PseudorangeAid,
     epoch_values,
     nothing_left,
 )
+from fusiond.aiding.range_rows import UNUSED_VARIANCE
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.blocks import clock_blocks, shared_error
@@ -208,7 +208,7 @@ def test_refusals() -> None:
         _aid(nav, [0, 0])
 
 
-# --------------------------------------------------------------------------- carriers, shared errors
+# ---------------------------------------------------------------------- carriers, shared errors
 
 SPAN_S = 0.5
 FORCE = (0.6, -0.4, -9.7)

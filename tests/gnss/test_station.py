@@ -117,10 +117,11 @@ def placed(
     """By second of week, with what had been sent by then; of `signals`, one a system, if given."""
     store, at, found = EphemerisStore(), 0, {}
     model = RangeModel(store, RangeOptions(systems=systems))
-    for epoch in epochs:
+    for whole in epochs:
+        epoch = whole
         if signals is not None:
-            kept = tuple(s for s in epoch.signals if s.signal == signals[s.system])
-            epoch = replace(epoch, signals=kept)
+            kept = tuple(s for s in whole.signals if s.signal == signals[s.system])
+            epoch = replace(whole, signals=kept)
         now = epoch.week * 604_800 + epoch.tow_s
         while at < len(records) and records[at].gps_s <= now:
             store.add(records[at].message)

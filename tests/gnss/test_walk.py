@@ -68,12 +68,13 @@ def _errors(
 
 @pytest.mark.parametrize(
     ("systems", "epochs", "scatter_m"),
-    [(("G", "E", "C"), 400, 1.5), (("C",), 350, 1.5), (("E",), 300, 1.8), (("G",), 60, 1.0)],
+    [(("G", "E", "C"), 400, 1.5), (("C",), 350, 3.2), (("E",), 300, 1.8), (("G",), 60, 1.0)],
 )
 def test_scatter_about_the_mean(
     events: list[RawEvent], systems: tuple[System, ...], epochs: int, scatter_m: float
 ) -> None:
-    """How many epochs there are is when the ephemerides came: GPS's fourth 18 s before the end."""
+    """How many epochs there are is when the ephemerides came: GPS's fourth 18 s before the end.
+    BeiDou's is of its level, as satellites go over from B3I to B1C and B2a when B-CNAV comes."""
     errors, _, _ = _errors(events, systems)
     late = errors[-epochs:]
     assert len(errors) >= epochs
@@ -81,9 +82,9 @@ def test_scatter_about_the_mean(
 
 
 def test_systems_agree_with_each_other(events: list[RawEvent]) -> None:
-    """With one ionosphere for all. BDGIM, which is much nearer to what two carriers measure, parts
-    them less in height and more on the ground (north by 3.4 m, east by 2.5) than Klobuchar."""
-    for left_out, level_m, height_m in ((Bdgim, 3.0, 4.0), (Klobuchar, 3.6, 2.0)):
+    """With one ionosphere for all, and with what two carriers measure so far: within a minute or so
+    that is little, and noisy (north by 4.3 m, east by 3.1 with Klobuchar's)."""
+    for left_out, level_m, height_m in ((Bdgim, 5.0, 4.0), (Klobuchar, 5.0, 4.0)):
         of_one = [e for e in events if not isinstance(e, left_out)]
         means = [_errors(of_one, (s,))[0][-250:].mean(axis=0) for s in ("G", "E", "C")]
         apart = np.ptp(means, axis=0)

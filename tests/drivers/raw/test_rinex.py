@@ -49,8 +49,14 @@ def epochs(text: str) -> tuple[list[RawGnssEpoch], Counter[str]]:
 
 @pytest.mark.parametrize(
     ("flag", "lock_s", "carrier"),
-    [(" ", math.inf, 1.5), ("0", math.inf, 1.5), ("1", 0.0, 1.5), ("2", math.inf, None), ("3", 0.0, None)],
-)  # fmt: skip
+    [
+        (" ", math.inf, 1.5),
+        ("0", math.inf, 1.5),
+        ("1", 0.0, 1.5),
+        ("2", math.inf, None),
+        ("3", 0.0, None),
+    ],
+)
 def test_loss_of_lock_and_half_cycles(flag: str, lock_s: float, carrier: float | None) -> None:
     """Bit 0: the lock was lost since the epoch before. Bit 1: half a cycle may be missing."""
     line = f"G05{22_000_000.125:14.3f}  {1.5:14.3f}{flag}7{-1234.5:14.3f}  {45.0:14.3f}  \n"

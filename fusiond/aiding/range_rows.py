@@ -1,0 +1,287 @@
+"""Compiled kernels of `fusiond.aiding.pseudorange`: its rows, what is measured, sums by clock."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M, gravity
+from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    LON,
+    Q0,
+    STEP_CHANGED_N,
+    STEP_MOVED_N,
+    STEP_RATE_B,
+    STEP_SECONDS,
+    VN,
+)
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+DISPLACED_BY = 8.0
+"""Satellites, of which a displacement is as large as its block says."""
+UNUSED_VARIANCE = 1e6
+"""(m/s)^2, of a rate that only a carrier gives and nothing is known of the epoch before."""
+SAME_SPAN_S = 1e-3
+"""The IMU's time since the epoch before is that between the epochs, or it is of another start. A
+microsecond's rounding is less, an IMU's sample more."""
+# Rows of an epoch's values.
+BASIC, VALUES = 10, 17
+X, VX, RANGE, RATE, RANGE_VARIANCE, RATE_VARIANCE, SHARED = 0, 3, 6, 7, 8, 9, 10
+SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL = 13, 14, 15, 16
+# What an epoch leaves to the next: seconds, changed velocity, its integral, the lever arm (NED).
+LEFT = 10
+
+
+@compiled("void(b1[::1], f8[::1])", forceinline=True)
+def _hold(active: NDArray[np.bool_], g: Array) -> None:
+    """Nothing is told of navigation errors that are not estimated: zero in the row `g` (n,)."""
+    for j in range(CORE_SIZE):
+        if not active[j]:
+            g[j] = 0.0
+
+
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
+    "i8[::1], i8[::1], i8[::1], f8, f8, f8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1])"
+)
+def range_rows(
+    nav: Array,
+    xi: Array,
+    step: Array,
+    column_of: Indices,
+    active: NDArray[np.bool_],
+    values: Array,
+    clock: Indices,
+    offsets: Indices,
+    drifts: Indices,
+    displacement: Indices,
+    shared: Indices,
+    carrier: Indices,
+    l0: float,
+    l1: float,
+    l2: float,
+    rate_row: int,
+    before: Array,
+    left: Array,
+    r: Array,
+    z: Array,
+    h: Array,
+) -> None:
+    """Write z (m,), r (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates,
+    of which `rate_row` is the first.
+
+    Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors and of
+    the carriers' clock; none where the model has no such state. `before` and `left` (10,): what the
+    last epoch left and this one leaves; of 0 s where there is nothing.
+    """
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
+    a0 = c00 * l0 + c01 * l1 + c02 * l2
+    a1 = c10 * l0 + c11 * l1 + c12 * l2
+    a2 = c20 * l0 + c21 * l1 + c22 * l2
+    w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
+    t0, t1, t2 = w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0
+    b0 = c00 * t0 + c01 * t1 + c02 * t2
+    b1 = c10 * t0 + c11 * t1 + c12 * t2
+    b2 = c20 * t0 + c21 * t1 + c22 * t2
+    v0, v1, v2 = nav[VN] + b0, nav[VN + 1] + b1, nav[VN + 2] + b2
+    left[0] = step[STEP_SECONDS]
+    for j in range(3):
+        left[1 + j], left[4 + j] = step[STEP_CHANGED_N + j], step[STEP_MOVED_N + j]
+    left[7], left[8], left[9] = a0, a1, a2
+    weight = gravity(nav[LAT], nav[HEIGHT])
+    gone = left[0] - before[0] if before[0] > 0.0 else 0.0
+    sl, cl = math.sin(nav[LAT]), math.cos(nav[LAT])
+    so, co = math.sin(nav[LON]), math.cos(nav[LON])
+    root = math.sqrt(1.0 - ECCENTRICITY_SQUARED * sl * sl)
+    transverse, height = SEMI_MAJOR_M / root, nav[HEIGHT]
+    radius_n = transverse + height
+    radius_m = transverse * (1.0 - ECCENTRICITY_SQUARED) / (root * root) + height
+    x, y = radius_n * cl * co, radius_n * cl * so
+    zed = (transverse * (1.0 - ECCENTRICITY_SQUARED) + height) * sl
+
+    begin = end = CORE_SIZE
+    for slot in range(column_of.shape[0] - 1, CORE_SIZE - 1, -1):
+        if 0 <= column_of[slot] - RATE_ERROR < 3:
+            begin, end = slot, max(end, slot + 1)
+
+    there = 0
+    for i in range(clock.shape[0]):
+        there += math.isfinite(values[RANGE, i])
+    several = math.sqrt(DISPLACED_BY / max(there, 1))
+
+    range_row = 0
+    for i in range(clock.shape[0]):
+        # From the antenna to the satellite, north, east, down.
+        e0, e1, e2 = values[X, i] - x, values[X + 1, i] - y, values[X + 2, i] - zed
+        m0 = -sl * co * e0 - sl * so * e1 + cl * e2 - a0
+        m1 = -so * e0 + co * e1 - a1
+        m2 = -cl * co * e0 - cl * so * e1 - sl * e2 - a2
+        distance = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+        u0, u1, u2 = m0 / distance, m1 / distance, m2 / distance
+        if math.isfinite(values[RANGE, i]):
+            g = h[range_row]
+            innovation = distance - values[RANGE, i]
+            g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
+            g[6], g[7], g[8] = -u0, -u1, -u2
+            if clock[i] >= 0:
+                slot = offsets[clock[i]]
+                innovation += xi[slot]
+                g[slot] = -1.0
+            _hold(active, g)
+            for axis in range(displacement.shape[0]):
+                g[displacement[axis]] = -several * g[6 + axis]
+                innovation -= g[displacement[axis]] * xi[displacement[axis]]
+            r[range_row] = values[RANGE_VARIANCE, i]
+            for k in range(3):
+                one = values[SHARED + k, i]
+                if shared.shape[0] == 3:
+                    g[shared[k]] = -one
+                    innovation += one * xi[shared[k]]
+                else:
+                    r[range_row] += one * one
+            z[range_row] = innovation
+            range_row += 1
+        span = values[SPAN, i]
+        if math.isfinite(values[RATE, i]) or span > 0.0:
+            g = h[rate_row]
+            e0, e1, e2 = values[VX, i], values[VX + 1, i], values[VX + 2, i]
+            q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
+            q1 = -so * e0 + co * e1 - v1
+            q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
+            d0, d1, d2 = b0, b1, b2
+            known = carrier.shape[0] == 1 and span > 0.0 and abs(gone - span) < SAME_SPAN_S
+            if known:
+                k0 = left[1] - (left[4] - before[4]) / span + b0 - (a0 - before[7]) / span
+                k1 = left[2] - (left[5] - before[5]) / span + b1 - (a1 - before[8]) / span
+                k2 = left[3] - (left[6] - before[6]) / span + b2 - (a2 - before[9]) / span
+                q0, q1, q2 = q0 + k0, q1 + k1, q2 + k2
+                # What turns with the attitude of v~: b in it, less what the force has changed.
+                d0, d1, d2 = b0 - k0, b1 - k1, b2 - k2 + 0.5 * weight * span
+            along = u0 * q0 + u1 * q1 + u2 * q2
+            if known:
+                bend = values[PULL, i] + (q0 * q0 + q1 * q1 + q2 * q2 - along * along) / distance
+                innovation = along - 0.5 * span * bend - values[CARRIER_RATE, i]
+                innovation += xi[carrier[0]]
+                g[carrier[0]] = -1.0
+                r[rate_row] = values[CARRIER_VARIANCE, i]
+            elif math.isfinite(values[RATE, i]):
+                innovation = along - values[RATE, i]
+                r[rate_row] = values[RATE_VARIANCE, i]
+            else:
+                innovation = 0.0
+                r[rate_row] = UNUSED_VARIANCE
+            k0 = (along * u0 - q0) / distance
+            k1 = (along * u1 - q1) / distance
+            k2 = (along * u2 - q2) / distance
+            g[0] = d1 * u2 - d2 * u1 + k1 * a2 - k2 * a1
+            g[1] = d2 * u0 - d0 * u2 + k2 * a0 - k0 * a2
+            g[2] = d0 * u1 - d1 * u0 + k0 * a1 - k1 * a0
+            g[3], g[4], g[5] = -u0, -u1, -u2
+            # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
+            p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
+            g[6] = k0 + p1 / radius_m
+            g[7] = k1 + (p2 * sl / cl - p0) / radius_n
+            g[8] = k2
+            # C^T u x l, by axis.
+            n0 = c00 * u0 + c10 * u1 + c20 * u2
+            n1 = c01 * u0 + c11 * u1 + c21 * u2
+            n2 = c02 * u0 + c12 * u1 + c22 * u2
+            for slot in range(begin, end):
+                axis = column_of[slot] - RATE_ERROR
+                if axis == 0:
+                    g[slot] = n1 * l2 - n2 * l1
+                elif axis == 1:
+                    g[slot] = n2 * l0 - n0 * l2
+                elif axis == 2:
+                    g[slot] = n0 * l1 - n1 * l0
+            if known:
+                for slot in range(CORE_SIZE, column_of.shape[0]):
+                    axis = column_of[slot] - FORCE_ERROR
+                    if 0 <= axis < 3:
+                        g[slot] = 0.5 * span * (n0 if axis == 0 else n1 if axis == 1 else n2)
+            if clock[i] >= 0:
+                innovation += xi[drifts[0]]
+                g[drifts[0]] = -1.0
+            _hold(active, g)
+            z[rate_row] = innovation
+            rate_row += 1
+
+
+# What is wrong with the values of an epoch.
+SOUND, VARIANCES, CLOCKS = 0, 1, 2
+WRONG = {
+    VARIANCES: "variances must be positive and finite",
+    CLOCKS: "rates of satellites with and without a clock in one epoch",
+}
+
+
+@compiled("UniTuple(i8, 4)(f8[:, ::1], i8[::1], f8[::1])")
+def measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, int]:
+    """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
+    ranges and rates those are, how many clocks they have, and what is wrong with them."""
+    n = clock.shape[0]
+    row = finite = timed = clocks = 0
+    wrong = SOUND
+    for i in range(n):
+        clocks = max(clocks, clock[i] + 1)
+        if math.isfinite(values[RANGE, i]):
+            r[row] = values[RANGE_VARIANCE, i]
+            row += 1
+    finite = row
+    for i in range(n):
+        if math.isfinite(values[RATE, i]) or values[SPAN, i] > 0.0:
+            r[row] = values[RATE_VARIANCE, i]
+            if values[SPAN, i] > 0.0:
+                r[row] = values[CARRIER_VARIANCE, i]
+            row += 1
+            timed += clock[i] >= 0
+    if 0 < timed < row - finite:
+        wrong = CLOCKS
+    for a in range(row):
+        if not 0.0 < r[a] < math.inf:
+            wrong = VARIANCES
+    return finite, row - finite, clocks, wrong
+
+
+@compiled("i8(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1], i8[::1])")
+def by_clock(
+    values: Array,
+    clock: Indices,
+    kept: NDArray[np.bool_],
+    whitened: Array,
+    sums: Array,
+    first: Indices,
+) -> int:
+    """Write to `sums` (k, 2), for each clock that has both, the sum of what is `whitened` and
+    `kept` (m,) of its ranges and that of its rates, each over the root of its number; to `first`
+    (k,) the clocks' first satellites, by which they are ordered. How many clocks that are."""
+    found = 0
+    for i in range(clock.shape[0]):
+        new = clock[i] >= 0
+        for k in range(i):
+            new &= clock[k] != clock[i]
+        if not new:
+            continue
+        row, whole = 0, True
+        for kind in range(2):
+            total, count = 0.0, 0
+            for k in range(clock.shape[0]):
+                if math.isfinite(values[RANGE + kind, k]) or (kind == 1 and values[SPAN, k] > 0.0):
+                    if kept[row] and clock[k] == clock[i]:
+                        total += whitened[row]
+                        count += 1
+                    row += 1
+            sums[found, kind] = total / math.sqrt(max(count, 1))
+            whole &= count > 0
+        first[found] = i
+        found += whole
+    return found
