@@ -1,4 +1,4 @@
-r"""What a satellite's carriers tell from epoch to epoch: its slant delay, and how far it moved.
+r"""Carrier phases from epoch to epoch: slant delay of a satellite, and its displacement.
 
 Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
 gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
@@ -74,7 +74,7 @@ CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
 """Those of `fusiond.gnss.ranges.RangeNoise`, the first over a uniform sky above 10 deg: the mean of
 1 / sin^2 E is there 1 / sin 10 deg."""
 PRIOR_COUNT, MOST_COUNT = 20.0, 400.0
-"""What that is worth as a number of independent codes, a sky; older than so many are forgotten by
+"""Weight of that as a number of independent codes, a sky; older than so many are forgotten by
 halves: satellites of an hour."""
 SCALE_SQUARED = (0.1, 10.0)
 """Antennas from a choke ring to a hand in a street have code multipath of 0.15 to 3 m (Groves
@@ -94,7 +94,7 @@ LONGEST_S = 2.0
 FORGOTTEN_S = 120.0
 """After this the delay begins anew."""
 DELAY_RATE_M_S = 0.01
-"""How fast a slant delay changes at most by itself: ten times the quiet ionosphere's 1 mm/s
+"""Largest rate of a slant delay by itself: ten times the quiet ionosphere's 1 mm/s
 (Klobuchar, in Parkinson and Spilker 1996, vol. 1, chapter 12)."""
 SLIP_SIGMAS = 4.0
 """Carriers part by so many sigmas of their noise at most (one in 16,000), and by what the
@@ -104,13 +104,13 @@ SLIP_RATE_M_S = 0.5
 """Between the mean of two Dopplers and the carrier's rate, or a wavelength over dt where that is
 more. A hand that swings with 3 m/s^2 twice a second leaves 0.2 m/s over 0.25 s."""
 JUMP_M_S = 3.0
-"""What all satellites share beyond their Dopplers: three sigma of the filter's `carrier_clock`
+"""Common part of all satellites beyond their Dopplers: three sigma of the filter's `carrier_clock`
 (fusiond.navigator.intake.raw). A clock set by a millisecond within 2 s gives 150,000."""
 
 
 @compiled("f8(f8[:, ::1])")
 def scale_squared(kept: Array) -> float:
-    """What the model's variances of codes are to be multiplied by."""
+    """Factor on the model's variances of codes."""
     found: float = (PRIOR_COUNT + kept[0, _SUM]) / (PRIOR_COUNT + kept[0, _COUNT])
     return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
 

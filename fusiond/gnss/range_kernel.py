@@ -87,7 +87,7 @@ LOWEST_RADIUS_M = 6.3e6
 GM_M3_S2 = 3.986004418e14
 """For a satellite's acceleration, to 1e-3 of it: over half of two seconds 1e-3 m/s."""
 ATMOSPHERE_RATE_M_S = 0.002
-"""How fast ionosphere and troposphere change a range at the zenith beside their models."""
+"""Rate of a range at the zenith by ionosphere and troposphere beside their models."""
 BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
 """One sigma of what a receiver delays BeiDou-2 more than BeiDou-3: of B1I (a Septentrio's has
 0.5 m), and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13

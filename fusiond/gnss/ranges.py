@@ -165,7 +165,7 @@ class Followed(NamedTuple):
 
 
 def nothing_kept() -> Array:
-    """What is kept of carriers before the first epoch."""
+    """Carriers before the first epoch."""
     return np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
 

@@ -145,7 +145,7 @@ def gathered() -> Iterator[list[Callable[[], None]]]:
 
 
 def kernels_can_be_kept() -> bool:
-    """Whether other processes can compile for this one, and for the next start."""
+    """True if other processes can compile for this one, and for the next start."""
     return can_keep(FOLDER)
 
 

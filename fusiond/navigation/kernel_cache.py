@@ -282,7 +282,7 @@ def _linked(
 
 
 def can_keep(folder: Path) -> bool:
-    """Whether what is compiled can be written there."""
+    """True if what is compiled can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

@@ -92,7 +92,7 @@ class _Memory:
     kept: Array = field(default_factory=nothing_kept)
 
     def is_after(self, before: _Memory) -> bool:
-        """Whether the epoch has been followed from that one."""
+        """True if the epoch has been followed from that one."""
         return self.followed is not None and self.after is before.kept
 
 
