@@ -35,7 +35,7 @@ class LogBytes(NamedTuple):
 
 
 def log_bytes(path: Path) -> LogBytes:
-    """Bytes of the file at `path`. Raises `OSError`, and `TableError` where nothing can be unpacked."""
+    """Bytes of the file at `path`. Raises `OSError`, or `TableError`: nothing can be unpacked."""
     data = path.read_bytes()
     found = _unpacked(data) if data.startswith(_GZIP) else LogBytes(data)
     if found.cut and not found.data:

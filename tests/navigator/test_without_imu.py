@@ -110,7 +110,7 @@ def test_the_unit_is_taken_in_when_it_comes() -> None:
     took = next(i for i, s in enumerate(d.said) if not math.isnan(s.rpy_rad[2]))
     # No hole in service from the first fix to the last.
     assert all(s.mode is Mode.NAVIGATING for s in d.said[130:took])
-    assert d.said[took].reason == "heading from GNSS course, on the move"
+    assert d.said[took].reason == "Heading from GNSS course, on the move"
     assert not d.navigator.without_imu.active
     assert d.navigator.serving is d.navigator.estimator
 
