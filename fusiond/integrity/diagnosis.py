@@ -152,7 +152,8 @@ class Diagnosis:
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """The series of an aid, before it is folded in; one that repeats itself leaves service,
         with all of its device."""
-        one, shown = self._series.get(aid.source), aid.shown
+        # By its class: one that stands for another has its own offers.
+        one, shown = self._series.get(aid.source), getattr(type(aid), "shown", None)
         if one is None or aid.source in self._shared:
             one = self.own(aid)
         if aid.t_ns - one.heard_ns > FORGET_NS:
