@@ -143,7 +143,8 @@ async def listening(
 ) -> AsyncIterator[tuple[Listener, aiomqtt.Client]]:
     """A subscriber of its own; yields what it hears and its client, which may publish too."""
     listener = Listener()
-    async with aiomqtt.Client("127.0.0.1", broker.port, **options) as client:
+    patient = {"timeout": PATIENCE_S, **options}  # aiomqtt's own 10 s end on a busy host
+    async with aiomqtt.Client("127.0.0.1", broker.port, **patient) as client:
         await client.subscribe(topic, qos=1)
 
         async def listen() -> None:

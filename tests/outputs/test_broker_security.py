@@ -168,7 +168,9 @@ async def test_a_vehicle_speaks_for_itself_only(broker: Broker, certificates: Pa
     with broker:
         async with (
             listening(broker, tls_context=dashboard) as (seen, _),
-            aiomqtt.Client("127.0.0.1", broker.port, tls_context=truck) as client,
+            aiomqtt.Client(
+                "127.0.0.1", broker.port, tls_context=truck, timeout=PATIENCE_S
+            ) as client,
         ):
             await client.publish("fusiond/other/nav", b"false", qos=1)
             await client.publish("fusiond/truck/nav", b"true", qos=1)

@@ -56,7 +56,7 @@ def test_bytes_cross_a_serial_line_both_ways(serial_line: SerialLine) -> None:
 
 
 async def test_a_message_goes_round_through_the_broker(broker: Broker) -> None:
-    async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+    async with aiomqtt.Client("127.0.0.1", broker.port, timeout=PATIENCE_S) as client:
         await client.subscribe("fusiond/bench/#", qos=1)
         await client.publish("fusiond/bench/nav", b"\x00payload", qos=1)
         message = await asyncio.wait_for(anext(aiter(client.messages)), timeout=PATIENCE_S)
@@ -64,14 +64,14 @@ async def test_a_message_goes_round_through_the_broker(broker: Broker) -> None:
 
 
 async def test_the_broker_dies_and_returns_on_its_port(broker: Broker) -> None:
-    async with aiomqtt.Client("127.0.0.1", broker.port):
+    async with aiomqtt.Client("127.0.0.1", broker.port, timeout=PATIENCE_S):
         pass
     broker.kill()
     with pytest.raises(aiomqtt.MqttError):
-        async with aiomqtt.Client("127.0.0.1", broker.port):
+        async with aiomqtt.Client("127.0.0.1", broker.port, timeout=PATIENCE_S):
             pass
     broker.start()
-    async with aiomqtt.Client("127.0.0.1", broker.port):
+    async with aiomqtt.Client("127.0.0.1", broker.port, timeout=PATIENCE_S):
         pass
 
 
