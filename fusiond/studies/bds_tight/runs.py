@@ -45,7 +45,8 @@ from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.constellation import slots
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.orbit import WEEK_S
-from fusiond.gnss.ranges import SIGNAL_IN_SPACE_M, RangeModel, RangeOptions
+from fusiond.gnss.plan import SIGNAL_IN_SPACE_M
+from fusiond.gnss.ranges import RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
 from fusiond.models.catalogue import make_model
