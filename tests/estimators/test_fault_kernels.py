@@ -152,20 +152,20 @@ def test_what_the_unit_has_been_found_to_have_turned_is_open() -> None:
     nav = np.array([0.5, 2.0, 0.0, 20.0, 0.0, 0.0, *tilted])
     made.initialise(0, 0, nav, np.zeros(model.size), np.eye(model.size))
     yaw, turn = model.slots_of(MOUNTING)[1], math.radians(-10.0)
-    mean, of = np.zeros(model.size), (made.nav, made.xi, made.step, -1)
+    mean = np.zeros(model.size)
     mean[yaw] = turn
     bank = made.hypotheses
     assert bank is not None
     made.xi[yaw] = turn
-    bank.take(1, True, False, of, made.wider)
+    bank.take(1, True, False, fused=False)
     assert made.wider.max() == 0.0  # two sigma of how it may sit
     made.xi[yaw] = 0.0
     made.adopt(mean, np.zeros((model.size, model.size)))
-    bank.take(2, True, False, of, made.wider)
+    bank.take(2, True, False, fused=False)
     roll, pitch = math.tan(math.radians(6.0)), math.sin(math.radians(10.0)) * math.cos(0.105)
     assert np.sqrt(made.wider[6:]) == pytest.approx([-turn * roll, -turn * pitch, -turn], rel=1e-2)
     made.initialise(3, 0, nav, np.zeros(model.size), np.eye(model.size))
-    bank.take(3, True, False, of, made.wider)
+    bank.take(3, True, False, fused=False)
     assert made.wider.max() == 0.0
 
 
