@@ -102,7 +102,7 @@ class WithoutImu:
         silent = self._silent_ns * 1e-9 > BEARABLE_GAP_S
         if self.estimator is None:
             if silent:
-                self._begin(since_ns)
+                self._begin(since_ns if imu.end else 0)
         elif navigating and not silent:
             self._event("with_imu", "the inertial unit has aligned and navigates")
             self.stop()
@@ -162,7 +162,7 @@ class WithoutImu:
         fixes = [
             offer
             for aid in self._recent
-            if aid.t_ns >= since_ns and aid.unturned() is not None
+            if aid.t_ns > since_ns and aid.unturned() is not None
             for offer in aid.offers()
             if isinstance(offer, PositionOffer)
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import re
@@ -106,6 +107,7 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
 async def test_two_receivers_navigate_until_the_inertial_unit_comes(tmp_path: Path) -> None:
     run = Run("004", tmp_path)
     async with running(run.daemon, run.vehicle):
+        await asyncio.sleep(0)  # the vehicle plugs all in with its first step
         run.vehicle.unplug("imu")
         await until(lambda: run.usable and all(run.fused(name) >= 3 for name in AIDS["004"]))
         s = run.seen[-1]
