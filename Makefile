@@ -76,7 +76,7 @@ kernels: $(RUNTIME)
 	@echo "compiling the kernels once, before the tests share them"
 	$(BIN)/python -c 'import gc; gc.set_threshold(50000); \
 	import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
-	fusiond.estimators.federated.standing, fusiond.estimators.multiscale.filter, \
+	fusiond.estimators.federated.no_reset, fusiond.estimators.multiscale.filter, \
 	fusiond.estimators.unscented.filter'
 
 # On a fresh clone every worker would rewrite the assertions of all tests, three times the same 5 s;

@@ -4,9 +4,9 @@
 
 The servers alone, in this process, with messages at 10 Hz; attacked as by `benchmarks/attack.py`. A
 row has the processor time, ms, of the longest piece that was sent and heard, of the longest turn of
-the door (`fusiond.outputs.guests`) and of the longest look at who waits: what a tick may have to
-wait for at most, on whatever computer this is, however much else runs on it. The garbage collector
-is off, as it is in the daemon's ticks.
+the door (`fusiond.outputs.client_sockets`) and of the longest look at who waits: what a tick may
+have to wait for at most, on whatever computer this is, however much else runs on it. The garbage
+collector is off, as it is in the daemon's ticks.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.attackers import ATTACKS, OVER_THE_BROKER, Ports
 from fusiond.configuration.outputs import Foxglove, Gpsd, NmeaServed, Prometheus
 from fusiond.outputs.base import Output, Surroundings
+from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.foxglove.server import FoxgloveServer
 from fusiond.outputs.gpsd.server import GpsdServer
-from fusiond.outputs.guests import Guests
 from fusiond.outputs.nmea import NmeaServer
 from fusiond.outputs.prometheus import PrometheusEndpoint
 from fusiond.outputs.topics import NAV, TOPICS

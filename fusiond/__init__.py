@@ -41,8 +41,8 @@ if TYPE_CHECKING:  # the same names as in _HOMES, for whoever reads types
     from fusiond.models.model import Model as Model
     from fusiond.navigation.solution import Mode as Mode
     from fusiond.navigation.solution import Solution as Solution
-    from fusiond.navigator.filters import estimator_of as estimator_of
-    from fusiond.navigator.filters import model_of as model_of
+    from fusiond.navigator.assembly import estimator_of as estimator_of
+    from fusiond.navigator.assembly import model_of as model_of
     from fusiond.navigator.navigator import Navigator as Navigator
     from fusiond.offline.compare import NothingToCompareError as NothingToCompareError
     from fusiond.offline.compare import compare as compare
@@ -69,7 +69,7 @@ _HOMES = {
     "fusiond.models.catalogue": ("MODELS", "make_model"),
     "fusiond.models.model": ("Model",),
     "fusiond.navigation.solution": ("Mode", "Solution"),
-    "fusiond.navigator.filters": ("estimator_of", "model_of"),
+    "fusiond.navigator.assembly": ("estimator_of", "model_of"),
     "fusiond.navigator.navigator": ("Navigator",),
     "fusiond.offline.compare": ("NothingToCompareError", "compare"),
     "fusiond.offline.process": ("process",),

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.rest_evidence import Witnesses
 from fusiond.aiding.standstill import Rest
-from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator

@@ -28,8 +28,8 @@ MODULES = (
     "fusiond.offline.process",
     "fusiond.simulation.vehicle",
     "fusiond.navigator.raw_gnss",
-    "fusiond.navigator.levels",
-    "fusiond.estimators.federated.standing",
+    "fusiond.navigator.protection_levels",
+    "fusiond.estimators.federated.no_reset",
     "fusiond.estimators.federated.reset",
     "fusiond.estimators.unscented.filter",
 )

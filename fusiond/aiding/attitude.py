@@ -43,7 +43,7 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
-from fusiond.aiding.offers import HeadingOffer
+from fusiond.aiding.candidates import HeadingCandidate
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,
@@ -93,12 +93,12 @@ class AttitudeAid(Aid):
         turned = whiten @ (state.dcm @ state.rate_b) * self.sd_time_s
         return Innovation(whiten @ z, h, np.square(sd) + np.square(turned))
 
-    def offers(self) -> tuple[HeadingOffer, ...]:
+    def candidates(self) -> tuple[HeadingCandidate, ...]:
         """The yaw, unless the sensor is mounted askew: the start would have the misalignment, and
         the filter would then find the two to agree."""
         if self.block or math.isnan(self.rpy[2]):
             return ()
-        return (HeadingOffer(self.t_ns, self.rpy[2], self.sd[2]),)
+        return (HeadingCandidate(self.t_ns, self.rpy[2], self.sd[2]),)
 
 
 @immutable()
@@ -120,5 +120,5 @@ class HeadingAid(Aid):
         z = np.array([wrap_angle(yaw - self.yaw_rad)])
         return Innovation(z, h, np.array([self.sd_rad**2]))
 
-    def offers(self) -> tuple[HeadingOffer, ...]:
-        return (HeadingOffer(self.t_ns, self.yaw_rad, self.sd_rad),)
+    def candidates(self) -> tuple[HeadingCandidate, ...]:
+        return (HeadingCandidate(self.t_ns, self.yaw_rad, self.sd_rad),)

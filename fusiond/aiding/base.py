@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.offers import Offer
+from fusiond.aiding.candidates import Candidate
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -121,7 +121,7 @@ class Aid:
     """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
     attitude or the IMU's mounting is wrong."""
     shown: ClassVar[attrgetter[Any] | None] = None
-    """Value that a frozen sensor repeats to the bit; else the first of its `offers` says it."""
+    """Value that a frozen sensor repeats to the bit; else the first of its `candidates` says it."""
     waits: ClassVar[bool] = False
     """Its `feedback` is not always at once."""
     placed: ClassVar[bool] = False
@@ -175,7 +175,7 @@ class Aid:
         """Receive the outcome, for a receiver that keeps count of its rows
         (fusiond.estimators.screening); called again when a rewind brings it again."""
 
-    def offers(self) -> Sequence[Offer]:
+    def candidates(self) -> Sequence[Candidate]:
         """Candidates for the start of alignment."""
         return ()
 

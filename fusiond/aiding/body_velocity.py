@@ -18,8 +18,8 @@ minus estimated, and e_i the axis's unit vector:
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
         - tau e_i exp[m x] (e - C^T [g x] phi)) - ds_w + q sign(y) dp + v                 (wheel)
 
-a_forward = f + C^T g is smoothed, e what its force is wrong by (fusiond.aiding.felt): one sample of
-a shaken sensor would make the latency look smaller than it is.
+a_forward = f + C^T g is smoothed, e what its force is wrong by (fusiond.aiding.preintegration): one
+sample of a shaken sensor would make the latency look smaller than it is.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
 T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
-from fusiond.aiding.felt import add_of_force, turning
-from fusiond.aiding.offers import STEADY, SpeedOffer
+from fusiond.aiding.candidates import STEADY, SpeedCandidate
+from fusiond.aiding.preintegration import add_of_force, turning
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -341,6 +341,6 @@ class WheelSpeedAid(Aid):
         speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
 
-    def offers(self) -> tuple[SpeedOffer, ...]:
+    def candidates(self) -> tuple[SpeedCandidate, ...]:
         own = self.sd_m_s, self.rounding_sd_m_s, self.drifts
-        return (SpeedOffer(self.t_ns, self.speed_m_s, *own),)
+        return (SpeedCandidate(self.t_ns, self.speed_m_s, *own),)

@@ -23,7 +23,7 @@ import numpy as np
 from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingAid
 from fusiond.aiding.base import Innovation, NotApplicable, State
-from fusiond.aiding.offers import HeadingOffer
+from fusiond.aiding.candidates import HeadingCandidate
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
 
@@ -66,12 +66,12 @@ class CompassAid(HeadingAid):
         h[0, slots] = -by
         return Innovation(np.array([wrap_angle(found.z[0] + float(by @ of))]), h, found.r)
 
-    def offers(self) -> tuple[HeadingOffer, ...]:
+    def candidates(self) -> tuple[HeadingCandidate, ...]:
         """A claim: how wrong it is, the deviation shares."""
         by = lasting(self.yaw_rad)
         shared = ((self.deviation, by[:3]), (self.disturbance, by[3:]))
         sd = math.hypot(self.sd_rad, self.lasting_sd_rad)
-        return (HeadingOffer(self.t_ns, self.yaw_rad, sd, "compass", self.sd_rad, shared),)
+        return (HeadingCandidate(self.t_ns, self.yaw_rad, sd, "compass", self.sd_rad, shared),)
 
 
 def lasting(yaw: float) -> tuple[float, float, float, float]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.offers import HeightOffer
+from fusiond.aiding.candidates import HeightCandidate
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN
 
@@ -51,8 +51,8 @@ class HeightAid(Aid):
             np.array([self.height_m - state.nav[HEIGHT]]), h, np.array([self.sd_m**2])
         )
 
-    def offers(self) -> tuple[HeightOffer, ...]:
-        return (HeightOffer(self.height_m, self.sd_m),)
+    def candidates(self) -> tuple[HeightCandidate, ...]:
+        return (HeightCandidate(self.height_m, self.sd_m),)
 
 
 @immutable()

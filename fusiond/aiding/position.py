@@ -9,7 +9,7 @@ l is the lever arm from the IMU to the antenna, b an error that successive fixes
 ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
 as many more as the fix's own sigma is larger there (fusiond.aiding.fix_errors), tau how much later
 than its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the
-acceleration, smoothed (fusiond.aiding.felt); where the model has states for them they are
+acceleration, smoothed (fusiond.aiding.preintegration); where the model has states for them they are
 estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is not shared
 moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis. An error that lasts
 for seconds and has no state is noise.
@@ -47,8 +47,8 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
-from fusiond.aiding.felt import add_of_force
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.preintegration import add_of_force
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -248,7 +248,7 @@ class PositionAid(Aid):
         position_rows(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
         return rows
 
-    def offers(self) -> tuple[PositionOffer, ...]:
+    def candidates(self) -> tuple[PositionCandidate, ...]:
         measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever
         shared = self.bias, self.time, self.rest, self.bias_share, self.wander, self.wander_m
-        return (PositionOffer(*measured, *shared),)
+        return (PositionCandidate(*measured, *shared),)

@@ -40,7 +40,7 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
@@ -109,11 +109,11 @@ class RdssPositionAid(Aid):
             rows[1] /= sd_e
         return Innovation(z, h, np.ones(2))
 
-    def offers(self) -> tuple[PositionOffer, ...]:
+    def candidates(self) -> tuple[PositionCandidate, ...]:
         """The fix without its height, which is an aid of its own where it is believed."""
         sd_n, sd_e = math.sqrt(self.covariance[0]), math.sqrt(self.covariance[2])
         place = self.lat_rad, self.lon_rad, None
-        return (PositionOffer(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
+        return (PositionCandidate(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
 
 
 @immutable()

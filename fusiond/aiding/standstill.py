@@ -9,7 +9,7 @@ all that is known may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
     the mean of measured speeds is not zero, whatever
-    drifts, in the run of windows or in this one          `moving`    (fusiond.aiding.witnesses)
+    drifts, in the run of windows or in this one          `moving`    (fusiond.aiding.rest_evidence)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`    unless the speed is
                                                                     known to be zero
     the same mean is not zero, if nothing drifts          `moving`
@@ -55,7 +55,7 @@ from fusiond.aiding.base import (
     Vector3,
     rate_columns,
 )
-from fusiond.aiding.witnesses import Measured, Witnesses
+from fusiond.aiding.rest_evidence import Measured, RestEvidence
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.standstill import Window
@@ -113,7 +113,7 @@ class Rest:
     """The hypothesis that the vehicle stood in a quiet window; sigmas of the module's text."""
 
     window: Window
-    witnesses: Witnesses
+    rest_evidence: RestEvidence
     max_speed_m_s: float
     velocity_sd_m_s: float
     rate_sd_rad_s: float
@@ -128,7 +128,7 @@ class Rest:
         rows = 2 if state.model.hold_height else 3
         v, p_v = state.nav[VN : VN + rows], p[3 : 3 + rows, 3 : 3 + rows]
         sd = math.sqrt(max(p_v[0, 0], p_v[1, 1]))
-        self.witnesses.quiet_at_speed(w.end_ns, state.speed - 3.0 * sd > self.max_speed_m_s)
+        self.rest_evidence.quiet_at_speed(w.end_ns, state.speed - 3.0 * sd > self.max_speed_m_s)
         if state.speed > self.max_speed_m_s:
             return "moving"
         # A tenth of the sigma that the aid claims, beside P: a filter that is surer is not.
@@ -146,14 +146,14 @@ class Rest:
             return TURNING
         if measured.contradicts or lately.contradicts:
             return "moving"
-        if not known and self.witnesses.smooth_ride(w.end_ns):
+        if not known and self.rest_evidence.smooth_ride(w.end_ns):
             return "quiet_at_speed"
         return None
 
     def _measured(self, windows: int) -> Measured:
         """In the last of so many windows."""
         end_ns = self.window.end_ns
-        return self.witnesses.measured(end_ns - round(windows * self.window_s * 1e9), end_ns)
+        return self.rest_evidence.measured(end_ns - round(windows * self.window_s * 1e9), end_ns)
 
     def creeps(self, state: State) -> Array:
         """Variances (3,), rad^2/s^2, of what may have turned though nothing has refuted rest."""

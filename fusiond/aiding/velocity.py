@@ -4,11 +4,12 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
       = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ da + noise
 
 w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is how much later than its
-stamp the velocity is valid, a the acceleration (its error da: fusiond.aiding.felt), smoothed: with
-the noise of single samples in its Jacobian an offset would come out too small, and too sure. What
-is left of the product of the two errors is not taken for noise: on drive_0708 that cost a tenth of
-the accuracy in outages, and gave no more honest a sigma. A timing error of sigma s_t that is not
-shared changes the velocity by a s_t, which adds (a_i s_t)^2 to the variance of each axis.
+stamp the velocity is valid, a the acceleration (its error da: fusiond.aiding.preintegration),
+smoothed: with the noise of single samples in its Jacobian an offset would come out too small, and
+too sure. What is left of the product of the two errors is not taken for noise: on drive_0708 that
+cost a tenth of the accuracy in outages, and gave no more honest a sigma. A timing error of sigma
+s_t that is not shared changes the velocity by a s_t, which adds (a_i s_t)^2 to the variance of each
+axis.
 
 A velocity that lags behind the position of the same stamp, by tau_p - tau, has been averaged or
 filtered for about twice as long. Of a vehicle that speeds up evenly that is a delay; of one that
@@ -32,8 +33,8 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
-from fusiond.aiding.felt import add_of_force
-from fusiond.aiding.offers import VelocityOffer
+from fusiond.aiding.candidates import VelocityCandidate
+from fusiond.aiding.preintegration import add_of_force
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
@@ -160,5 +161,7 @@ class VelocityAid(Aid):
         velocity_rows(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
         return rows
 
-    def offers(self) -> tuple[VelocityOffer, ...]:
-        return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)
+    def candidates(self) -> tuple[VelocityCandidate, ...]:
+        return (
+            VelocityCandidate(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),
+        )

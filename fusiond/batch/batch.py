@@ -16,7 +16,7 @@ from pathlib import Path
 
 from fusiond.batch.drives import drive_row
 from fusiond.configuration.load import config_digest, load_config
-from fusiond.files.rows import Row, RowFile
+from fusiond.files.parquet_rows import Row, RowFile
 from fusiond.workers.outcome import Outcome, Runner
 
 _NAME = ("log", "config_digest", "version")

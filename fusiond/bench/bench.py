@@ -30,10 +30,10 @@ import numpy as np
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
+from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.late_fix import late_fix
 from fusiond.bench.raw_epoch import raw_epoch
 from fusiond.bench.start import start
-from fusiond.bench.way import ordinary_fix
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator
@@ -45,7 +45,7 @@ from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from fusiond.navigator.timeline import Timeline
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
@@ -95,7 +95,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     (`fusiond.studies.reduced_order.cost`).
 
     Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
-    to published sigma, and the modules that they are in (`fusiond.bench.way`).
+    to published sigma, and the modules that they are in (`fusiond.bench.fix_path`).
     """
     product = _product()
     figures: dict[str, Any] = {}

@@ -10,7 +10,7 @@ from rich.console import Console
 from fusiond.commands.tables import print_table
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, DEG_PER_HOUR, MILLI_G
-from fusiond.navigator.filters import model_of
+from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 
 # SI unit of a state: the unit that data sheets print, and how many SI units one of it is.

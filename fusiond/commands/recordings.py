@@ -199,7 +199,7 @@ def export(
 
 def _export_measurements(recording: Log, folder: Path, out: Path, to: str) -> dict[str, int]:
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-    from fusiond.replay.configured import config_of  # noqa: PLC0415
+    from fusiond.replay.replay_config import config_of  # noqa: PLC0415
     from fusiond.replay.rosbag import write_rosbag  # noqa: PLC0415
     from fusiond.replay.tables import write_tables  # noqa: PLC0415
 

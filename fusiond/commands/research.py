@@ -34,8 +34,8 @@ from fusiond.commands.shared import (
 from fusiond.studies import ABOUT, STUDIES
 
 if TYPE_CHECKING:
-    from fusiond.studies.kept import KeptRuns
     from fusiond.studies.monte_carlo import Lost
+    from fusiond.studies.stored_runs import KeptRuns
 
 FEWEST_RUNS = 8
 """A worker loads its kernels for some two seconds, in which a study makes several runs."""
@@ -108,8 +108,8 @@ def rows_kept(out: Path | None, name: str, seed: int) -> Iterator[KeptRuns | Non
     if out is None:
         yield None
         return
-    from fusiond.files.rows import RowFile  # noqa: PLC0415
-    from fusiond.studies.kept import KeptRuns  # noqa: PLC0415
+    from fusiond.files.parquet_rows import RowFile  # noqa: PLC0415
+    from fusiond.studies.stored_runs import KeptRuns  # noqa: PLC0415
 
     with row_errors(), RowFile(out) as file:
         kept = KeptRuns(file, name, seed)

@@ -7,9 +7,10 @@ itself. The measure is a minute without aids, t = 60 s, one sigma of the displac
     what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
 
 N and n the densities of velocity and attitude in the model, which is where a bias that it takes for
-noise is (`fusiond.models.left_out`). The bias is missing where it does more in that minute than the
-model knows. Every shipped model has gyro states. Scale factors do less than the gyro's noise in the
-classes that there are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that class 11 m.
+noise is (`fusiond.models.missing_states`). The bias is missing where it does more in that minute
+than the model knows. Every shipped model has gyro states. Scale factors do less than the gyro's
+noise in the classes that there are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that
+class 11 m.
 
 Source: Groves, 2nd ed., section 5.7 (short-term straight-line error propagation).
 """

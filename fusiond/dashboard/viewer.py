@@ -18,7 +18,7 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fusiond.dashboard.hub import Hub
-from fusiond.outputs.asked import NotUnderstoodError, parsed
+from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 
 FRAME_S = 0.1
 BEAT_S = 1.0

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
+from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import AHEAD, GAP, memory
@@ -30,10 +31,9 @@ from fusiond.estimators.propagation import (
     RECORD,
     propagate_for,
 )
-from fusiond.estimators.reading import WIDER, Published, sigmas, speed_sigma, widen
+from fusiond.estimators.published_state import WIDER, Published, sigmas, speed_sigma, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
-from fusiond.estimators.sensors import sensor_estimates
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model

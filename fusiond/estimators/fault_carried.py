@@ -1,9 +1,9 @@
 """Compiled kernel: the sensitivities of a bank of hypotheses, carried on between two aids.
 
 What lies between two aids is one transition, which is carried from crossing to crossing as the
-covariance is (fusiond.estimators.crossing), and V is multiplied by it where an aid is to be folded
-in. Most rows of it are those of the identity: of navigation errors nine, of others those that
-decay, grow with a rate, or are turned at rest.
+covariance is (fusiond.estimators.block_covariance), and V is multiplied by it where an aid is to be
+folded in. Most rows of it are those of the identity: of navigation errors nine, of others those
+that decay, grow with a rate, or are turned at rest.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.block_covariance import DENSITIES, STEPS
 from fusiond.estimators.covariance import transition_for
-from fusiond.estimators.crossing import DENSITIES, STEPS
 from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS
 from fusiond.estimators.fault_rows import add_rows, walk_path
 from fusiond.estimators.turned_axes import rest_rows

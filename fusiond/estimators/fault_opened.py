@@ -6,7 +6,8 @@ the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 
 for eight groups side by side. What is published is by the receiver's clock, whose offset tau a
-fault moves, too (fusiond.estimators.reading): v is V of p - v tau, of v - a tau, of phi + u tau.
+fault moves, too (fusiond.estimators.published_state): v is V of p - v tau, of v - a tau, of phi + u
+tau.
 
 The attitude is that of the axes that were configured, and the vehicle's as far as the unit sits on
 it so: pitch and yaw are open by what the mounting has beyond chance, too, and by all that the unit
@@ -46,7 +47,7 @@ from fusiond.estimators.fault_bank import (
     WEIGHT,
 )
 from fusiond.estimators.fault_odds import identified, judge
-from fusiond.estimators.reading import MOVING, moving, opened_variances
+from fusiond.estimators.published_state import MOVING, moving, opened_variances
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.navigation.strapdown import STEP_DCM
@@ -257,8 +258,8 @@ def judge_and_widen(
     """`judge`, if what has come was `measured` and is `used`, and `wider` (9,), unless a hypothesis
     is identified: at each measurement, and between two while a fault is likely enough to count.
 
-    `published` (3,) as of fusiond.estimators.reading. `mounting` (2, 2): slots of the mounting's
-    pitch and yaw in xi (n,), or -1, and what of their squares is chance.
+    `published` (3,) as of fusiond.estimators.published_state. `mounting` (2, 2): slots of the
+    mounting's pitch and yaw in xi (n,), or -1, and what of their squares is chance.
     """
     if measured and used:
         judge(bank, ints, numbers, lanes, epoch_s, found)

@@ -95,7 +95,7 @@ WIDE_SD_RAD = math.radians(30.0)
 BEGINNINGS_RAD = (0.5 * math.pi, -0.5 * math.pi, math.pi)
 TOLD = 0.99
 # What was felt is motion beyond so many sigmas of what does not turn.
-FELT_SIGMAS = 1.0
+SENSED_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
 # known to 0.5 m/s, and a speed that is off by a tenth changes what no slip says by 5 cm/s.
 PLAIN_SD_RAD = math.radians(2.0)
@@ -302,7 +302,7 @@ class InvariantFilter(TiltAxesFilter):
         as noise, and as a motion that turns, which would tell a parked vehicle its heading."""
         turned = p[DV : DV + 2, PHI + 2] / p[PHI + 2, PHI + 2]
         own = p[DV : DV + 2, DV : DV + 2] - np.outer(turned, turned) * p[PHI + 2, PHI + 2]
-        if float(turned @ turned) < FELT_SIGMAS**2 * float(np.trace(own)):
+        if float(turned @ turned) < SENSED_SIGMAS**2 * float(np.trace(own)):
             for axis in (0, 1):
                 p[DV + axis] -= turned[axis] * p[PHI + 2]
                 p[:, DV + axis] -= turned[axis] * p[:, PHI + 2]

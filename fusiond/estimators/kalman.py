@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
-from fusiond.estimators.fold import account_for, fold_and_account
+from fusiond.estimators.gated_update import account_for, fold_and_account
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, whiten, work
 from fusiond.models.model import Model

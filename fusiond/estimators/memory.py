@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.between import SIZE as BETWEEN
+from fusiond.estimators.block_covariance import SUMS
+from fusiond.estimators.block_sigmas import SIZE as BETWEEN
 from fusiond.estimators.covariance import KEPT, work_size
-from fusiond.estimators.crossing import SUMS
 from fusiond.estimators.fault_bank import FaultTable, bank_size, begin_bank
-from fusiond.estimators.reading import WIDER, Published
+from fusiond.estimators.published_state import WIDER, Published
 from fusiond.estimators.turned_axes import TURN_SIZE
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import COEFFICIENTS
@@ -55,10 +55,11 @@ def scratch_size(width: int) -> int:
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
     (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
-    `wider`, nav (10,), the last step (35,), the `sums` (25,) of fusiond.estimators.crossing, `xi`
-    (n,), `dxs` (k, n), `covs` (k, width, width), the `bank` of fusiond.estimators.fault_bank;
-    covariances before what has been added up, flat, `held`; `phi` (width, width) or (0, 0); `work`
-    for kernels that propagate a covariance; `shares` (k,)."""
+    `wider`, nav (10,), the last step (35,), the `sums` (25,) of
+    fusiond.estimators.block_covariance, `xi` (n,), `dxs` (k, n), `covs` (k, width, width), the
+    `bank` of fusiond.estimators.fault_bank; covariances before what has been added up, flat,
+    `held`; `phi` (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares`
+    (k,)."""
 
     array: Array
     head: NDArray[np.int64]

@@ -13,8 +13,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.between import ROW, ROWS, WAITING, begin, fill, first_order
-from fusiond.estimators.between import SIZE as BETWEEN
+from fusiond.estimators.block_covariance import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
+from fusiond.estimators.block_sigmas import ROW, ROWS, WAITING, begin, fill, first_order
+from fusiond.estimators.block_sigmas import SIZE as BETWEEN
+from fusiond.estimators.corrected_imu import compensate, sensor_estimates, slopes
 from fusiond.estimators.covariance import (
     decays,
     mirror,
@@ -23,7 +25,6 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
 from fusiond.estimators.fault_carried import carry_for, settle
 from fusiond.estimators.memory import (
     AHEAD,
@@ -43,7 +44,7 @@ from fusiond.estimators.memory import (
     XI_AT,
     scratch_size,
 )
-from fusiond.estimators.reading import (
+from fusiond.estimators.published_state import (
     ENTRIES,
     WIDER,
     entries,
@@ -52,7 +53,6 @@ from fusiond.estimators.reading import (
     sigmas_of,
     widen,
 )
-from fusiond.estimators.sensors import compensate, sensor_estimates, slopes
 from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients

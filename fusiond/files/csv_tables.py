@@ -1,8 +1,8 @@
 """Numeric CSV tables with a header row: read fast, and name every row that cannot be true.
 
-`fusiond.files.dialect` makes one dialect of several. Plain decimals are read by a compiled reader,
-other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank line), each
-row is read with care instead, so that what is refused carries its line and the reason.
+`fusiond.files.csv_dialect` makes one dialect of several. Plain decimals are read by a compiled
+reader, other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank
+line), each row is read with care instead, so that what is refused carries its line and the reason.
 
 Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
 (empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.files.dialect import DialectError, Text, first_line, plain_csv
+from fusiond.files.csv_dialect import DialectError, Text, first_line, plain_csv
 from fusiond.files.fixed_decimal import newlines, parse_rows
 
 Floats = NDArray[np.float64]

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import (
     DECIDED,
@@ -40,9 +40,9 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
-from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
-from fusiond.integrity.finding import Finding, Lasting
+from fusiond.integrity.device_agreement import Agreement
+from fusiond.integrity.fault_finding import Finding, Lasting
 from fusiond.integrity.service import DISAGREES, FORGET_NS, REPEATS, STILL, Series, value_of
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
@@ -163,7 +163,7 @@ class Diagnosis:
             if estimator.hypotheses is not None:  # it is no evidence of what waits to be judged
                 estimator.hypotheses.conclude()
             return one
-        value = value_of(aid.offers()) if shown is None else shown(aid)
+        value = value_of(aid.candidates()) if shown is None else shown(aid)
         if value is None:
             return one
         # A position that differs repeats nothing, whether it moves or not. How often others do in
@@ -351,11 +351,11 @@ def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
     spread = np.zeros((estimator.model.size, estimator.model.size))
     nav = estimator.nav
     lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)
-    for offer in aid.offers():
-        if isinstance(offer, PositionOffer):
-            north = (offer.lat_rad - lat) * meridian_radius(lat)
-            east = (offer.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)
-            down = 0.0 if offer.height_m is None else height - offer.height_m
+    for candidate in aid.candidates():
+        if isinstance(candidate, PositionCandidate):
+            north = (candidate.lat_rad - lat) * meridian_radius(lat)
+            east = (candidate.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)
+            down = 0.0 if candidate.height_m is None else height - candidate.height_m
             for row, apart in enumerate((north, east, down)):
                 spread[PLACE_ROW + row, PLACE_ROW + row] = apart * apart
     return Correction(np.zeros(len(spread)), spread)

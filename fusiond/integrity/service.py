@@ -37,7 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
+from fusiond.aiding.candidates import (
+    Candidate,
+    PositionCandidate,
+    SpeedCandidate,
+    VelocityCandidate,
+)
 from fusiond.integrity.noise import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
@@ -190,13 +195,13 @@ class Series:
 _EACH = attrgetter(*(each.name for each in fields(Series)))
 
 
-def value_of(offers: Sequence[Offer]) -> tuple[float, ...] | None:
+def value_of(candidates: Sequence[Candidate]) -> tuple[float, ...] | None:
     """Values that a frozen sensor repeats to the bit."""
-    for offer in offers:
-        if isinstance(offer, PositionOffer):
-            return offer.lat_rad, offer.lon_rad
-        if isinstance(offer, VelocityOffer):
-            return offer.v_ned
-        if isinstance(offer, SpeedOffer):
-            return (offer.speed_m_s,)
+    for candidate in candidates:
+        if isinstance(candidate, PositionCandidate):
+            return candidate.lat_rad, candidate.lon_rad
+        if isinstance(candidate, VelocityCandidate):
+            return candidate.v_ned
+        if isinstance(candidate, SpeedCandidate):
+            return (candidate.speed_m_s,)
     return None

@@ -24,11 +24,11 @@ from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.chain import Chain
 from fusiond.live.front import Front
 from fusiond.live.journal import handler
-from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.message_keeper import MessageKeeper
 from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
+from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
@@ -93,7 +93,7 @@ class Daemon:
             # A vehicle that stood knows more by what it kept then.
             self._warm.offer(self.navigator)
         messages = self._messages.load(self._chain.messaging)
-        self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration, messages)
+        self._loaded = RestoredState(saved, self._warm.loaded, self.navigator.calibration, messages)
         self.service = front.service
         self.scheduler = Scheduler(
             config.scheduler.rate_hz,
@@ -184,7 +184,7 @@ class Daemon:
             config_digest(self.config),
         )
         self.recorder.listen(self.sources.inputs)
-        self.recorder.arm(LOADED.dump_python(self._loaded, mode="json"))
+        self.recorder.arm(RESTORED_STATE.dump_python(self._loaded, mode="json"))
         self._events.listen(self._tell_outputs)
         self._serving.start(self.outputs)
         work = [

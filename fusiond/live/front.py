@@ -12,15 +12,15 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
+from fusiond.live.output_tasks import OutputTasks
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.service_manager import ServiceManager
-from fusiond.live.serving import Serving
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.reasons import reason
 from fusiond.outputs.base import Output
 from fusiond.outputs.catalogue import make_outputs
+from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.commands import Command, CommandRefusedError
-from fusiond.outputs.guests import Guests
 from fusiond.outputs.messages.health import SchedulerStatus
 from fusiond.outputs.messages.status import RecordingStatus, status_message
 from fusiond.outputs.topics import STATUS
@@ -44,7 +44,7 @@ class Front:
         self.clock = clock
         self.events = Events(clock)
         self.service = ServiceManager()
-        self.serving = Serving(self.events.report)
+        self.serving = OutputTasks(self.events.report)
         self.guests = Guests()
         self.on_command: Callable[[Command], str | Awaitable[str]] = _refuse
         self.outputs = self.make_outputs(config, {})

@@ -27,7 +27,7 @@ from fusiond.navigator.state_file import (
 )
 
 if TYPE_CHECKING:  # a vehicle without a terminal does without them
-    from fusiond.live.kept_messages import KeptBox, KeptMessages
+    from fusiond.live.stored_messages import KeptBox, KeptMessages
 
 log = logging.getLogger("fusiond")
 
@@ -58,7 +58,7 @@ class MessageKeeper:
         None where there is nothing."""
         if self._path is None or not os.path.lexists(self._path):
             return None
-        from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+        from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
 
         try:
             kept = read_state(self._path, KEPT_MESSAGES)
@@ -120,7 +120,7 @@ def _aged(box: KeptBox, passed_s: float) -> KeptBox:
 
 def _text(kept: KeptMessages) -> bytes:
     """As JSON, with as many of those that nobody was told as a state file has room for."""
-    from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+    from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
 
     text = KEPT_MESSAGES.dump_json(kept)
     while len(text) > MOST_BYTES - 100 and kept.untold:

@@ -32,7 +32,7 @@ from fusiond.outputs.topics import MESSAGE, Topic, fleet
 
 if TYPE_CHECKING:  # a vehicle without a terminal does without them
     from drivers.rdss.driver import RdssDriver
-    from fusiond.live.kept_messages import KeptMessages
+    from fusiond.live.stored_messages import KeptMessages
 
 MOST_UNTOLD = 40
 """Messages that a broker has yet to confirm: what a minute of all cards brings at the most."""
@@ -201,7 +201,7 @@ class Messaging:
 
     def state(self, t_ns: int) -> KeptMessages:
         """All that has to outlive the process."""
-        from fusiond.live.kept_messages import KeptMessages, kept_box  # noqa: PLC0415
+        from fusiond.live.stored_messages import KeptMessages, kept_box  # noqa: PLC0415
 
         utc_ns = self._clock.utc_ns(t_ns)
         return KeptMessages(
@@ -213,7 +213,7 @@ class Messaging:
 
     def resume(self, kept: KeptMessages) -> None:
         """Go on from what the run before has kept, at the instant when that was taken up."""
-        from fusiond.live.kept_messages import restore  # noqa: PLC0415
+        from fusiond.live.stored_messages import restore  # noqa: PLC0415
 
         t_ns = kept.taken_up_ns or 0
         self._serial = max(self._serial, kept.serial)

@@ -29,10 +29,10 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
-from fusiond.navigator.faults import worst
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import Seen
+from fusiond.navigator.source_status import worst
 from fusiond.outputs.messages.fault import FaultReport, fault_report
 from fusiond.outputs.messages.health import BeamHealth, SatelliteHealth, SkyHealth, SourceHealth
 

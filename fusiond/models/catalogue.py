@@ -21,7 +21,7 @@ from fusiond.models.blocks import (
     navigation_blocks,
     parameter,
 )
-from fusiond.models.left_out import with_force_biases_as_noise
+from fusiond.models.missing_states import with_force_biases_as_noise
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import FORCE_ERROR
 

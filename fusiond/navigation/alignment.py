@@ -58,13 +58,13 @@ def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
     " f8[:, ::1], f8[:, :, ::1])",
     allocates=True,
 )
-def judge_felt(
+def judge_sensed(
     t_s: Array,
     means: Array,
     gained: Array,
     turned: Array,
     slopes: Array,
-    felt_biases: Array,
+    sensed_biases: Array,
     velocity: Array,
     sd: Array,
     levers: Array,
@@ -85,12 +85,12 @@ def judge_felt(
     (`fusiond.navigator.alignment.motion_fit`).
 
     Of a stretch of samples: seconds (k,), rate and force (k, 6) as sensed at the fixes; the
-    integrals over it (fusiond.navigation.felt), with the biases that were taken off; of the fixes
-    velocity, sigma and lever (k, 3). Of the guess: C_0 (3, 3), the velocity (3,) at the first fix,
-    biases, C_0 D (3, 3) of the last fix, the offset `late` in its sigmas, `sd_late_s`. A velocity
-    gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its own.
+    integrals over it (fusiond.navigation.preintegration), with the biases that were taken off; of
+    the fixes velocity, sigma and lever (k, 3). Of the guess: C_0 (3, 3), the velocity (3,) at the
+    first fix, biases, C_0 D (3, 3) of the last fix, the offset `late` in its sigmas, `sd_late_s`. A
+    velocity gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its own.
     """
-    more = biases - felt_biases
+    more = biases - sensed_biases
     there, acceleration, arm, body = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     turn, weight = np.empty((3, 3)), np.empty(3)
     for k in range(t_s.shape[0]):

@@ -4,8 +4,8 @@ r"""Sensors whose axes are not square: what of it is noise, while the vehicle tu
 
 of gyros and accelerometers. As long as the vehicle turns about one axis u of the body, the gyros
 tell the turn of a body that is turned by a constant, M u: attitude is as good as ever, of axes
-which sit otherwise than the housing by m (`fusiond.estimators.reading` publishes it so), and
-against them gravity has an error that is constant in the body, which is a bias of the
+which sit otherwise than the housing by m (`fusiond.estimators.published_state` publishes it so),
+and against them gravity has an error that is constant in the body, which is a bias of the
 accelerometers. Nothing grows. u is the vertical of a vehicle on a road, here the direction of the
 mean force. What turns about another axis does not fit: a bend of angle Theta about it leaves an
 error of m Theta about the axes across, and the bend back takes it away again. A filter without

@@ -15,10 +15,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.navigation.alignment import judge_felt
+from fusiond.navigation.alignment import judge_sensed
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.navigation.felt import integrate_felt
+from fusiond.navigation.preintegration import integrate_sensed
 from fusiond.navigation.rotation import turn_to_dcm
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def judge_guess(
     gained: Array,
     turned: Array,
     slopes: Array,
-    felt_biases: Array,
+    sensed_biases: Array,
     velocity: Array,
     sd: Array,
     levers: Array,
@@ -71,7 +71,7 @@ def judge_guess(
     rows: Array,
 ) -> None:
     """Write what a guess leaves (3 k + 10,) and the slopes (3 k + 10, 13) of what it says by its
-    steps, in sigmas; the rest as of `judge_felt`."""
+    steps, in sigmas; the rest as of `judge_sensed`."""
     k = t_s.shape[0]
     biases, first = guess[BIASES:LATE], guess[FIRST:]
     # C_0, since which the axes have turned to C_T.
@@ -84,7 +84,7 @@ def judge_guess(
     phi = np.zeros(3)
     for i in range(3):
         for j in range(3):
-            phi[i] += slopes[k - 1, i, j] * (biases[3 + j] - felt_biases[3 + j])
+            phi[i] += slopes[k - 1, i, j] * (biases[3 + j] - sensed_biases[3 + j])
     turn_to_dcm(phi[0], phi[1], phi[2], turn)
     for i in range(3):
         for j in range(3):
@@ -99,13 +99,13 @@ def judge_guess(
             for n in range(3):
                 dcm_turns[i, j] += dcm[i, n] * slopes[k - 1, n, j]
     rows[:] = 0.0
-    judge_felt(
+    judge_sensed(
         t_s,
         means,
         gained,
         turned,
         slopes,
-        felt_biases,
+        sensed_biases,
         velocity,
         sd,
         levers,
@@ -174,12 +174,12 @@ def least_squares(rows: Array, z: Array, step: Array) -> bool:
 
 
 @compiled("b1(f8[::1], f8[::1], f8)")
-def _bent(biases: Array, felt: Array, seconds: float) -> bool:
+def _bent(biases: Array, sensed: Array, seconds: float) -> bool:
     """True if integrals over so long, with biases (6,) of theirs, must be made anew for others."""
     force, rate = 0.0, 0.0
     for j in range(3):
-        force = max(force, abs(biases[j] - felt[j]))
-        rate = max(rate, abs(biases[3 + j] - felt[3 + j]))
+        force = max(force, abs(biases[j] - sensed[j]))
+        rate = max(rate, abs(biases[3 + j] - sensed[3 + j]))
     bent: bool = max(rate * seconds, force / STANDARD_GRAVITY_M_S2) > BENT_RAD
     return bent
 
@@ -199,7 +199,7 @@ def descend(
     gained: Array,
     turned: Array,
     slopes: Array,
-    felt_biases: Array,
+    sensed_biases: Array,
     velocity: Array,
     sd: Array,
     levers: Array,
@@ -211,17 +211,17 @@ def descend(
     """Move a `guess` (19,) to where the fit is best, and write what it leaves there; whether that
     has converged. A step that makes the fit worse is halved.
 
-    Of the stretch times (m + 1,) ns, samples (m, 6) and counts (k,), as of `integrate_felt`; the
+    Of the stretch times (m + 1,) ns, samples (m, 6) and counts (k,), as of `integrate_sensed`; the
     rest as of `judge_guess`."""
     gained, turned, slopes = gained.copy(), turned.copy(), slopes.copy()
-    made = felt_biases.copy()
+    made = sensed_biases.copy()
     gained_there, turned_there, slopes_there = gained.copy(), turned.copy(), slopes.copy()
     made_there, there = made.copy(), guess.copy()
     left, by_steps, step = z.copy(), rows.copy(), np.empty(SOUGHT)
     seconds = t_s[t_s.shape[0] - 1]
     if _bent(guess[BIASES:LATE], made, seconds):
         made[:] = guess[BIASES:LATE]
-        integrate_felt(times, samples, made, counts, gained, turned, slopes)
+        integrate_sensed(times, samples, made, counts, gained, turned, slopes)
     judge_guess(
         t_s, means, gained, turned, slopes, made, velocity, sd, levers, asked, guess, z, rows
     )
@@ -243,7 +243,7 @@ def descend(
             if anew:
                 a, b, c, taken_off = gained_there, turned_there, slopes_there, made_there
                 taken_off[:] = there[BIASES:LATE]
-                integrate_felt(times, samples, taken_off, counts, a, b, c)
+                integrate_sensed(times, samples, taken_off, counts, a, b, c)
             else:
                 a, b, c, taken_off = gained, turned, slopes, made
             judge_guess(

@@ -165,15 +165,15 @@ class CalibrationWatch:
     """Follows the calibration of a filter of `model`; `on_event(code, text)` hears `calibrated`
     when a parameter has settled, once for each, and when the last one has.
 
-    `askew_rad` is one sigma of what the IMU's axes are out of square by: to no more than that can
-    anybody say how it is mounted.
+    `misalignment_rad` is one sigma of what the IMU's axes are out of square by: to no more than
+    that can anybody say how it is mounted.
     """
 
     def __init__(
-        self, model: Model, on_event: Callable[[str, str], None], askew_rad: float = 0.0
+        self, model: Model, on_event: Callable[[str, str], None], misalignment_rad: float = 0.0
     ) -> None:
         self._slots = calibration_slots(model)
-        self._least_sd = np.array([askew_rad * (s.kind == MOUNTING) for s in self._slots])
+        self._least_sd = np.array([misalignment_rad * (s.kind == MOUNTING) for s in self._slots])
         self._indices = np.array([s.index for s in self._slots], dtype=np.int64)
         self._prior = np.array([s.prior_sd / s.factor for s in self._slots])
         yaws = (k for k, s in enumerate(self._slots) if s.kind == MOUNTING and "yaw" in s.name)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fusiond.estimators.base import Estimator
-from fusiond.estimators.finite import first_not_finite
+from fusiond.estimators.finite_check import first_not_finite
 
 _STATE = "the navigation state is", "the estimated parameters are", "the covariance is"
 RAISED_BY_NUMBERS = (ArithmeticError, ValueError)

@@ -1,10 +1,10 @@
 """Choice of the inertial unit: the first, or the spare that takes over.
 
 The rule is that of gaps: once `gap_s` long no sample of the unit in use has been taken, whether it
-is silent, or says what cannot be true (stuck, saturated, dead: fusiond.navigator.imu_door), and the
-spare sends, the spare is used. Its samples of that time have been kept, so that it goes on where
-the other ended. It stays until the daemon starts again: a unit that has failed once is not trusted
-until somebody has looked at it, and two that fail in turn must not take turns.
+is silent, or says what cannot be true (stuck, saturated, dead: fusiond.navigator.imu_screening),
+and the spare sends, the spare is used. Its samples of that time have been kept, so that it goes on
+where the other ended. It stays until the daemon starts again: a unit that has failed once is not
+trusted until somebody has looked at it, and two that fail in turn must not take turns.
 
 All of it happens in ticks and depends on arrivals alone: a replay chooses alike.
 """

@@ -18,7 +18,7 @@ from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
-from fusiond.estimators.finite import first_not_finite
+from fusiond.estimators.finite_check import first_not_finite
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.catalogue import SENSOR, Kind
 from fusiond.models.model import Model
@@ -28,29 +28,29 @@ from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.alignment.start_check import StartCheck
-from fusiond.navigator.calibration import CalibrationWatch
-from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
-from fusiond.navigator.faults import SourceService
-from fusiond.navigator.filters import (
+from fusiond.navigator.assembly import (
     estimator_of,
     imu_buffer_of,
     kinds_of_config,
     model_of,
     verdicts_of,
 )
+from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
-from fusiond.navigator.imu_door import ImuDoor
-from fusiond.navigator.imu_units import RateUnits
+from fusiond.navigator.imu_screening import ImuScreening
+from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
+from fusiond.navigator.motion_constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.protection import NO_BOUND, ProtectionWatch
-from fusiond.navigator.readout import publish_by_own_clock, solution_of
+from fusiond.navigator.published_solution import publish_by_own_clock, solution_of
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.service_events import ServiceEvents
+from fusiond.navigator.source_status import SourceService
 from fusiond.navigator.state_file import RefusedStateError
-from fusiond.navigator.status import Begun, NavigationStatus
+from fusiond.navigator.status import NavigationStatus, StartedNavigation
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
 from fusiond.navigator.without_imu import WithoutImu, counted_together
 
@@ -90,7 +90,7 @@ class Navigator:
         of_aids = self._intake.extra_blocks()
         self.model = model_of(config, *of_vehicle, *of_aids)
         self.imu = imu_buffer_of(config)
-        self._door = ImuDoor(imu, e.buffer_s, self._event)
+        self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         kinds = kinds_of_config(config, self.model)
         self.estimator = estimator(config, self.model, kinds)
@@ -123,7 +123,9 @@ class Navigator:
         self._latency = LatencySearch(
             alignment_options(config), self._noise, self.model, self._event
         )
-        self._status = NavigationStatus(config, self.estimator, self.imu, self._door, self._units)
+        self._status = NavigationStatus(
+            config, self.estimator, self.imu, self._screening, self._units
+        )
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -141,22 +143,22 @@ class Navigator:
         """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.
 
         What cannot be true is refused by name; what leaves too much unknown ends the navigation:
-        alignment begins anew (fusiond.navigator.imu_door).
+        alignment begins anew (fusiond.navigator.imu_screening).
         """
         taken = 0
-        for run in self._door.admit(times, samples, self.imu, self.started is not None):
+        for run in self._screening.admit(times, samples, self.imu, self.started is not None):
             if run.ends:
                 self._begin_anew(run.ends)
             if appended := self.imu.append(run.times, run.samples):
-                self._feel(appended)
+                self._sense(appended)
             taken += appended
-        if self._door.restarts(self.imu):
+        if self._screening.restarts(self.imu):
             self._begin_anew(reason("imu_stamps_back"))
         return taken
 
     def change_imu(self) -> None:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
-        self._door.change()
+        self._screening.change()
         self._units.change()
         self.calibrating.restart()  # of the first unit
         publish_by_axes(self.estimator, self.config.imu, spare=True)
@@ -170,14 +172,14 @@ class Navigator:
         self.imu.restart()
         self.reset(why, saved)
 
-    def _feel(self, taken: int) -> None:
+    def _sense(self, taken: int) -> None:
         """The newest samples have come: what they say by themselves."""
         new = max(0, self.imu.end - taken)
-        felt = self._constraints.feed(self.imu, new)
+        sensed = self._constraints.feed(self.imu, new)
         self._units.samples(self.imu, new)
         if self.started is None:
-            self._aligner.felt(felt.windows, felt.aids)
-        for aid in felt.aids:
+            self._aligner.sensed(sensed.windows, sensed.aids)
+        for aid in sensed.aids:
             self.timeline.insert(aid)
 
     def learn(self, message: NavigationMessage) -> None:
@@ -205,7 +207,7 @@ class Navigator:
         if self.started is None:
             self._aligner.aids(aids)
         self._units.fix(m, t_ns, self.imu, aids)
-        self._constraints.witnesses.hear(aids)
+        self._constraints.rest_evidence.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
         return "accepted"
@@ -299,7 +301,7 @@ class Navigator:
         if start is None:
             return False
         doubted = any(f.kind.of == SENSOR for f in self.timeline.diagnosis.findings)
-        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses, doubted)
+        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.rest_evidence, doubted)
         if wrong is None:
             return False
         self._event(*wrong)
@@ -368,10 +370,10 @@ class Navigator:
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """Mode at `t_ns`, and why."""
-        begun = None
+        started = None
         if self.started is not None:
-            begun = Begun(self.started.how, self.unconfirmed, self._last_position_ns)
-        return self._status.of(t_ns, begun, self._aligner.reason)
+            started = StartedNavigation(self.started.how, self.unconfirmed, self._last_position_ns)
+        return self._status.of(t_ns, started, self._aligner.reason)
 
     @property
     def serving(self) -> Estimator:

@@ -1,6 +1,7 @@
 """Events of protection levels that pass the alert limits.
 
-What computes the levels (fusiond.navigator.levels) is imported where a limit is configured.
+What computes the levels (fusiond.navigator.protection_levels) is imported where a limit is
+configured.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.navigation.solution import Bound, BoundState
 
 if TYPE_CHECKING:
-    from fusiond.navigator.levels import Level, Levels
+    from fusiond.navigator.protection_levels import Level, Levels
 
 RETURN_NS = 5_000_000_000
 """The levels must have been inside the limits for this long before the alarm ends: a level that
@@ -40,7 +41,7 @@ class ProtectionWatch:
         options = config.integrity
         self._levels: Levels | None = None
         if isinstance(estimator, SeparatedEstimator):
-            from fusiond.navigator.levels import Levels  # noqa: PLC0415
+            from fusiond.navigator.protection_levels import Levels  # noqa: PLC0415
 
             self._levels = Levels(config, estimator)
         self.watches = self._levels is not None

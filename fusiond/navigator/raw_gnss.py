@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
@@ -131,7 +131,7 @@ class RawEpochAid(Aid):
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return self.at(state.nav).innovation(state)
 
-    def offers(self) -> Sequence[Offer]:
+    def candidates(self) -> Sequence[Candidate]:
         """Position and velocity of the epoch alone; none without a solution."""
         return self.receiver.alone(self)
 
@@ -207,21 +207,21 @@ class RawGnss:
         memory.followed = found = self._model.follow(aid.picked, memory.kept)
         return found
 
-    def alone(self, aid: RawEpochAid) -> list[Offer]:
+    def alone(self, aid: RawEpochAid) -> list[Candidate]:
         """Position and velocity of an epoch alone, for the alignment; none without a solution."""
         found = single_point(self._model, self.followed(aid), self._guess)
-        offers: list[Offer] = []
+        candidates: list[Candidate] = []
         if isinstance(found, str) or not found.consistent:
             self.refused[found if isinstance(found, str) else "inconsistent"] += 1
         else:
             self._guess = found.position
-            offers = self._fix(found, aid.t_ns)
+            candidates = self._fix(found, aid.t_ns)
         left_out = aid.picked.plan.refused
         if self._guess is not None:
             left_out = self._model.evaluate(self.followed(aid), self._guess).refused
         self._judged, self._left_out = None, dict(left_out)
         self._count(aid, left_out)
-        return offers
+        return candidates
 
     def correct(
         self, aid: RawEpochAid, followed: Followed, guess: Array
@@ -304,19 +304,19 @@ class RawGnss:
             _seen(epoch_aid.epoch, corrected.rows),
         )
 
-    def _fix(self, found: SinglePoint, t_ns: int) -> list[Offer]:
+    def _fix(self, found: SinglePoint, t_ns: int) -> list[Candidate]:
         x, y, z = (float(v) for v in found.position)
         lat, lon, height = to_geodetic(x, y, z)
         axes = ned_axes(lat, lon)
         covariance = axes.T @ found.covariance @ axes
         n, e, d = np.sqrt(np.diag(covariance)).tolist()
         lever = self._section.lever_arm_m
-        offers: list[Offer] = [PositionOffer(t_ns, lat, lon, height, (n, e, d), lever)]
+        candidates: list[Candidate] = [PositionCandidate(t_ns, lat, lon, height, (n, e, d), lever)]
         if found.velocity is not None:
             v_n, v_e, v_d = (axes.T @ found.velocity).tolist()
             sd = self._section.start_velocity_sd_m_s
-            offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd), lever))
-        return offers
+            candidates.append(VelocityCandidate(t_ns, (v_n, v_e, v_d), (sd, sd, sd), lever))
+        return candidates
 
 
 def _instant(aid: RawEpochAid) -> int:

@@ -15,12 +15,12 @@ from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import VE, VN
-from fusiond.navigator.imu_door import ImuDoor
-from fusiond.navigator.imu_units import RateUnits
+from fusiond.navigator.imu_screening import ImuScreening
+from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.reasons import joined, reason
 
 
-class Begun(NamedTuple):
+class StartedNavigation(NamedTuple):
     """Start of the navigation: `how` its heading came about; `unconfirmed`: what the heading hangs
     on and nothing has shown, empty where it does not; `position_ns`: of the last position fused."""
 
@@ -37,7 +37,7 @@ class NavigationStatus:
         config: Config,
         estimator: Estimator,
         imu: ImuBuffer,
-        door: ImuDoor,
+        screening: ImuScreening,
         units: RateUnits,
     ) -> None:
         self._gap_s = config.imu.gap_s
@@ -45,31 +45,33 @@ class NavigationStatus:
         self._max_speed_m_s = config.plausibility.max_speed_m_s
         self._estimator = estimator
         self._imu = imu
-        self._door = door
+        self._screening = screening
         self._units = units
 
-    def of(self, t_ns: int, begun: Begun | None, aligning: str) -> tuple[Mode, str]:
+    def of(self, t_ns: int, started: StartedNavigation | None, aligning: str) -> tuple[Mode, str]:
         """The mode at `t_ns`; without a navigation `aligning` is what the alignment waits for."""
         if not self._imu.end:
-            return Mode.WAITING, self._door.silence(None)
+            return Mode.WAITING, self._screening.silence(None)
         if self._units.wrong is not None:
             return Mode.INVALID, self._units.wrong
         silent = (t_ns - self._imu.latest_ns) * 1e-9
         if silent > self._gap_s:
-            return Mode.WAITING if begun is None else Mode.INVALID, self._door.silence(silent)
-        if begun is None:
+            return Mode.WAITING if started is None else Mode.INVALID, self._screening.silence(
+                silent
+            )
+        if started is None:
             return Mode.ALIGNING, aligning
         sd = self._estimator.sigmas()
         sd_m = math.hypot(sd.item(0), sd.item(1))
         if not sd_m <= self._limits.invalid_sd_m:
             limit = self._limits.invalid_sd_m
             return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
-        heading = reason("heading_from", how=begun.how)
-        if begun.unconfirmed:
-            return Mode.COASTING, joined((heading, begun.unconfirmed))
+        heading = reason("heading_from", how=started.how)
+        if started.unconfirmed:
+            return Mode.COASTING, joined((heading, started.unconfirmed))
         if (why := self._units.unproven(self._estimator)) is not None:
             return Mode.COASTING, why
-        unaided = (t_ns - begun.position_ns) * 1e-9
+        unaided = (t_ns - started.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:
             return Mode.COASTING, reason("no_fix", seconds=unaided)
         return Mode.NAVIGATING, heading

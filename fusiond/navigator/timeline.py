@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fusiond.aiding.base import Aid, Feedback
-from fusiond.aiding.offers import Offer
+from fusiond.aiding.candidates import Candidate
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis, Memory
@@ -97,7 +97,7 @@ class Timeline:
         self.diagnosis = Diagnosis(kinds)
         self._isolates = estimator.isolates
 
-    def start(self, used: Collection[Offer] = ()) -> None:
+    def start(self, used: Collection[Candidate] = ()) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
         it was made of, `used`, once more."""
         self._next = 0
@@ -108,8 +108,8 @@ class Timeline:
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
         for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
-            offers = self._entries[row].aid.offers()
-            if any(_same(one, other) for one in offers for other in used):
+            candidates = self._entries[row].aid.candidates()
+            if any(_same(one, other) for one in candidates for other in used):
                 self._count(self._entries[row], Outcome("start"))
                 del self._entries[row], self._keys[row]
         self.imu.needed = self.estimator.sample
@@ -308,7 +308,7 @@ class Timeline:
             self._next -= stale
 
 
-def _same(one: Offer, other: Offer) -> bool:
+def _same(one: Candidate, other: Candidate) -> bool:
     """True if two offers are alike; vectors may be arrays, as a caller from Python gives them."""
     return type(one) is type(other) and all(
         a is b or np.array_equal(np.asarray(a), np.asarray(b))

@@ -214,11 +214,11 @@ def _manoeuvre(estimator: Estimator, imu: ImuBuffer) -> tuple[float, float]:
     if rows.start == rows.stop:
         return 0.0, 0.0
     dcm = dcm_from_quaternion(estimator.nav[6:])
-    felt = imu.samples[rows].mean(axis=0) - estimator.sensor_errors[:6]
+    sensed = imu.samples[rows].mean(axis=0) - estimator.sensor_errors[:6]
     v = estimator.nav[3:5]
     speed = float(np.hypot(*v))
-    push = float((dcm @ felt[3:])[:2] @ v) / speed if speed > SLOW_M_S else 0.0
-    return float((dcm @ felt[:3])[2]), push
+    push = float((dcm @ sensed[3:])[:2] @ v) / speed if speed > SLOW_M_S else 0.0
+    return float((dcm @ sensed[:3])[2]), push
 
 
 def _gone_on(turn: float, push: float, t_s: float) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 r"""Navigation without an inertial unit: position and velocity by fixes and a constant velocity.
 
 While the unit is absent, or has been silent for longer than navigation can bridge
-(`fusiond.navigator.imu_door`), the same timeline, filters and aids run on samples that a vehicle
-would feel which is level, faces north and goes on as it goes:
+(`fusiond.navigator.imu_screening`), the same timeline, filters and aids run on samples that a
+vehicle would feel which is level, faces north and goes on as it goes:
 
     w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
 
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.models.blocks import Block
@@ -36,9 +36,9 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Bound, Mode, Solution
 from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, VD, VE, VN
 from fusiond.navigator.alignment.start import UNKNOWN_HEIGHT_SD_M
-from fusiond.navigator.filters import estimator_without_imu
-from fusiond.navigator.imu_door import BEARABLE_GAP_S
-from fusiond.navigator.readout import solution_of
+from fusiond.navigator.assembly import estimator_without_imu
+from fusiond.navigator.imu_screening import BEARABLE_GAP_S
+from fusiond.navigator.published_solution import solution_of
 from fusiond.navigator.reasons import joined, reason
 from fusiond.navigator.timeline import Entry, Timeline
 
@@ -160,15 +160,15 @@ class WithoutImu:
     def _begin(self, since_ns: int) -> None:
         """Start at the newest fix since the samples ended, if there is one."""
         fixes = [
-            offer
+            candidate
             for aid in self._recent
             if aid.t_ns > since_ns and aid.unturned() is not None
-            for offer in aid.offers()
-            if isinstance(offer, PositionOffer)
+            for candidate in aid.candidates()
+            if isinstance(candidate, PositionCandidate)
         ]
         if not fixes:
             return
-        fix = max(fixes, key=lambda offer: offer.t_ns)
+        fix = max(fixes, key=lambda candidate: candidate.t_ns)
         config = self._config
         model = constant_velocity(config.plausibility.manoeuvre, self._blocks)
         estimator = estimator_without_imu(config, model, GAP_S)
@@ -185,7 +185,7 @@ class WithoutImu:
         sd = model.initial.copy()
         sd[3:6] = self._max_speed_m_s / math.sqrt(3.0)
         sd[6:8], sd[8] = START_SD_M, UNKNOWN_HEIGHT_SD_M
-        self._imu.append(np.array([fix.t_ns], dtype=np.int64), _felt(nav))
+        self._imu.append(np.array([fix.t_ns], dtype=np.int64), _sensed(nav))
         estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
         self._timeline.start()
         self.estimator = estimator
@@ -207,7 +207,7 @@ class WithoutImu:
         count = (t_ns - self._imu.latest_ns) // STEP_NS
         if count > 0:
             times = self._imu.latest_ns + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
-            self._imu.append(times, np.repeat(_felt(e.nav), count, axis=0))
+            self._imu.append(times, np.repeat(_sensed(e.nav), count, axis=0))
         self._timeline.run()
         if not (np.isfinite(e.nav).all() and np.isfinite(e.covariance).all()):
             self._event("filter_not_finite", "Without an IMU: starting again")
@@ -239,7 +239,7 @@ def counted_together(
     return found
 
 
-def _felt(nav: Array) -> Array:
+def _sensed(nav: Array) -> Array:
     """Rate and force (1, 6) of a vehicle in the state (10,) that keeps facing north, level, at its
     velocity."""
     lat, height = float(nav[LAT]), float(nav[HEIGHT])

@@ -48,7 +48,7 @@ from fusiond.navigator.calibration import (
     calibration_slots,
 )
 from fusiond.navigator.navigator import Navigator
-from fusiond.offline.calibrated import ROLL, calibrated, configured, fragment
+from fusiond.offline.calibration_config import ROLL, calibrated, configured, fragment
 from fusiond.offline.process import process
 
 Array = NDArray[np.float64]

@@ -29,14 +29,14 @@ from fusiond.files.tables import ImuTable
 from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import longest_step
-from fusiond.navigator.filters import estimator_of
+from fusiond.navigator.assembly import estimator_of
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import Arrival
+from fusiond.offline.failure_reasons import FileRead, apart, nothing_navigated, wrong_units
 from fusiond.offline.outages import Outage
-from fusiond.offline.reasons import FileRead, apart, nothing_navigated, wrong_units
-from fusiond.offline.recorded import BROADCAST, Recorded, read_recorded, valid_ns
-from fusiond.offline.rows import Rows, RowsWriter
+from fusiond.offline.run_input import BROADCAST, Recorded, read_recorded, valid_ns
+from fusiond.offline.solution_rows import Rows, RowsWriter
 
 if TYPE_CHECKING:
     from fusiond.offline.smooth import SmoothedRows

@@ -26,13 +26,13 @@ from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.estimators.smoothing.backward import Corrections, Smoother, correct, joined
 from fusiond.estimators.smoothing.node import Nodes
-from fusiond.estimators.smoothing.taped import NEVER, Node, TapedKalman, nodes_of
+from fusiond.estimators.smoothing.node_recorder import NEVER, Node, TapedKalman, nodes_of
 from fusiond.files.solution_csv import SMOOTHED, STATUS
 from fusiond.integrity.catalogue import Kind, table_of
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
-from fusiond.offline.rows import Rows, RowsWriter
+from fusiond.offline.solution_rows import Rows, RowsWriter
 
 Held = list[NDArray[Any]] | tuple[int, int]
 """Arrays, or where they are in the file and how many."""

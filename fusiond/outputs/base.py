@@ -10,7 +10,7 @@ from typing import Protocol
 
 from drivers.base import DriverStatus
 from fusiond.clock.clock import Clock
-from fusiond.outputs.guests import Guests
+from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import Topic

@@ -11,9 +11,9 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket
+from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.gpsd.server import GpsdServer
-from fusiond.outputs.guests import Guests
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer

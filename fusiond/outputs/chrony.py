@@ -19,7 +19,7 @@ from drivers.base import DriverStatus
 from fusiond.clock.results import TimeSample
 from fusiond.configuration.outputs import Chrony
 from fusiond.outputs.base import Surroundings
-from fusiond.outputs.latest import Latest
+from fusiond.outputs.latest_value import Latest
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.topics import Topic
 

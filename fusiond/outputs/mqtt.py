@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, incoming, packet_limit
+from fusiond.outputs import broker_access, packet_limit, subscriptions
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
@@ -27,7 +27,7 @@ from fusiond.outputs.messages.events import MOST_KEPT, events_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.mqtt_endings import FAREWELL_S, abandon, end, hang_up, honour_cancellation
 from fusiond.outputs.mqtt_version import MqttVersion
-from fusiond.outputs.reconnecting import Reconnecting
+from fusiond.outputs.reconnection import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
@@ -102,7 +102,7 @@ class MqttPublisher:
         """Hears each queued message that the broker has taken."""
         self._reconnecting = Reconnecting()
         self._version = MqttVersion(MAX_PAYLOAD_BYTES + packet_limit.LONGEST_TOPIC)
-        self._quiet = incoming.quiet()
+        self._quiet = subscriptions.quiet()
         self.status = DriverStatus()
 
     # ------------------------------------------------------------------ for the tick
@@ -323,7 +323,7 @@ class MqttPublisher:
         addresses = [*self._heard]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")
-        coming = incoming.Incoming(client, self.counters, self._quiet)
+        coming = subscriptions.Incoming(client, self.counters, self._quiet)
         while True:
             for address in addresses:
                 await self._version.subscribe(client, address)
@@ -331,7 +331,7 @@ class MqttPublisher:
             quiet_s = await coming.flood()
             await client.unsubscribe(addresses)
             honour_cancellation()
-            most = f"{incoming.MESSAGES.per_s:.0f} a second"
+            most = f"{subscriptions.MESSAGES.per_s:.0f} a second"
             text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
             self._on_event("mqtt_flooded", text)
             await asyncio.sleep(quiet_s)

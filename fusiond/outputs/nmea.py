@@ -21,8 +21,8 @@ from drivers.base import DriverStatus
 from fusiond.configuration.outputs import NmeaServed
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
-from fusiond.outputs.figures import known, motion, usable
-from fusiond.outputs.latest import Latest
+from fusiond.outputs.derived_figures import known, motion, usable
+from fusiond.outputs.latest_value import Latest
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.port import Port

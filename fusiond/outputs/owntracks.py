@@ -17,7 +17,7 @@ from pydantic import RootModel
 from drivers.base import DriverStatus
 from fusiond.configuration.outputs import OwnTracks
 from fusiond.outputs.base import Surroundings
-from fusiond.outputs.figures import known, motion
+from fusiond.outputs.derived_figures import known, motion
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.tracker import TrackerMessage

@@ -20,7 +20,7 @@ from fusiond.configuration.outputs import Prometheus
 from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
-from fusiond.outputs.figures import motion, usable
+from fusiond.outputs.derived_figures import motion, usable
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage

@@ -1,10 +1,10 @@
 """A TCP port and its clients, none of whom holds up another, or a tick.
 
-Whatever a client causes is done in a turn of the door (`fusiond.outputs.guests`) and charged to its
-allowance: who sends too much is read more slowly, who asks too often is dropped. What a client has
-not read waits in its connection: 16 KiB in the process and as much again in the kernel. While that
-is full its epochs are skipped; who skips thirty in a row, or takes nothing for half a minute, is
-dropped. A connection counts until its descriptor is closed.
+Whatever a client causes is done in a turn of the door (`fusiond.outputs.client_sockets`) and
+charged to its allowance: who sends too much is read more slowly, who asks too often is dropped.
+What a client has not read waits in its connection: 16 KiB in the process and as much again in the
+kernel. While that is full its epochs are skipped; who skips thirty in a row, or takes nothing for
+half a minute, is dropped. A connection counts until its descriptor is closed.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fusiond.outputs.activation import activated
-from fusiond.outputs.allowance import Allowance
-from fusiond.outputs.guests import Guests
-from fusiond.outputs.places import gives_way, host_of
+from fusiond.outputs.client_slots import gives_way, host_of
+from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.port import Port
+from fusiond.outputs.rate_limits import Allowance
 from fusiond.outputs.sockets import LINGER_NOT, bound, tune
 
 MOST_CLIENTS = 256

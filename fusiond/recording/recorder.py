@@ -30,9 +30,8 @@ from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.status import RecordingState, RecordingStatus
 from fusiond.outputs.topics import INNOVATIONS, Topic
-from fusiond.recording.about import about_run
-from fusiond.recording.again import Again
 from fusiond.recording.channels import INNOVATION, INPUT, STATE, innovation
+from fusiond.recording.log_metadata import about_run
 from fusiond.recording.log_writer import Item, LogWriter, log_stem
 from fusiond.recording.records import (
     NO_SOURCE,
@@ -45,6 +44,7 @@ from fusiond.recording.records import (
     reading,
     tick_payload,
 )
+from fusiond.recording.retry import Again
 
 MESSAGE_BYTES = 64 * 1024
 """Inputs that come without a tick (it is late, or none is left) make a message of their own."""
@@ -60,7 +60,7 @@ class Recorder:
     """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
 
     `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`;
-    a recording that failed takes up again by itself (`fusiond.recording.again`).
+    a recording that failed takes up again by itself (`fusiond.recording.retry`).
     `begin` and `end` may be called whenever; `listen` connects the drivers.
     """
 

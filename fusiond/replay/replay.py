@@ -24,7 +24,7 @@ from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
-from fusiond.live.loaded import LOADED, Loaded
+from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.warm_keeper import KEPT_STATE
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.state_file import DamagedStateError
@@ -123,11 +123,11 @@ class Replay:
         start: dict[str, Any] = json.loads(record.payload) if record.kind is Kind.START else {}
         from_start = bool(start.get("from_start"))
         system_clock = start.get("system_clock") or _system_clock(record, self._log)
-        loaded, after_ns = Loaded(), 0
+        loaded, after_ns = RestoredState(), 0
         if self._afresh:
             self.began = "an alignment, as was asked"
         elif from_start:
-            loaded = LOADED.validate_json(
+            loaded = RESTORED_STATE.validate_json(
                 json.dumps({name: start.get(name) for name in ("saved", "warm", "calibration")})
             )
             self.began = "the daemon's start"
@@ -154,7 +154,7 @@ class Replay:
         self._finish()
         return after_ns
 
-    def _on_the_way(self, start: dict[str, Any]) -> tuple[Loaded, int]:
+    def _on_the_way(self, start: dict[str, Any]) -> tuple[RestoredState, int]:
         """The first state that the log holds, and its instant."""
         for message in self._log.messages(STATE):
             try:
@@ -162,9 +162,9 @@ class Replay:
             except ValidationError:
                 break
             self.began = "a state on the way"
-            return Loaded(warm=kept), message.t_log_ns - self._log.about.epoch_ns
+            return RestoredState(warm=kept), message.t_log_ns - self._log.about.epoch_ns
         self.began = "an alignment: the log begins on the way and holds no state"
-        return Loaded(), 0
+        return RestoredState(), 0
 
     def _listener(self, name: str) -> Callable[[str, int, Any], None]:
         def heard(kind: str, t_ns: int, payload: Any) -> None:

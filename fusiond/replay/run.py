@@ -26,8 +26,8 @@ from fusiond.outputs.messages.health import SchedulerStatus
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.reader import Log
-from fusiond.replay.configured import config_of
 from fusiond.replay.replay import Replay, ReplayedTick
+from fusiond.replay.replay_config import config_of
 
 SOLUTION, EVENTS = "solution.csv", "events.csv"
 ROWS = 4096

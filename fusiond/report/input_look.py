@@ -27,7 +27,7 @@ from drivers.measurements import (
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 from fusiond.configuration.load import driver_entry_points
 from fusiond.files.csv_tables import Floats
-from fusiond.recording.about import CONFIG, dbc_name
+from fusiond.recording.log_metadata import CONFIG, dbc_name
 from fusiond.recording.reader import About
 from fusiond.recording.records import (
     NO_SOURCE,

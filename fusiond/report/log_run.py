@@ -13,9 +13,9 @@ import numpy as np
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 from fusiond.files.csv_tables import Floats
 from fusiond.files.tables import TrajectoryTable
-from fusiond.recording.about import CONFIG
 from fusiond.recording.channels import INNOVATION, STATE
 from fusiond.recording.info import info
+from fusiond.recording.log_metadata import CONFIG
 from fusiond.recording.reader import Log, LogMessage
 from fusiond.recording.records import Record
 from fusiond.report.bias_states import Biases

@@ -65,7 +65,7 @@ def imu_output(
     state, the same bytes.
     """
     n, dt = len(gyro), 1.0 / imu.rate_hz
-    askew = (imu.misalignment_deg if misalignment_deg is None else misalignment_deg) * DEG
+    misalignment = (imu.misalignment_deg if misalignment_deg is None else misalignment_deg) * DEG
     vibration = vibration or Vibration()
     phase = rng.uniform(0.0, 2.0 * math.pi, 6)
     omega = 2.0 * math.pi * vibration.frequency_hz
@@ -97,7 +97,7 @@ def imu_output(
         ),
     ):
         misaligned = np.eye(3)
-        misaligned[~np.eye(3, dtype=bool)] = rng.standard_normal(6) * askew
+        misaligned[~np.eye(3, dtype=bool)] = rng.standard_normal(6) * misalignment
         value = truth @ (misaligned @ matrix).T
         if amplitude > 0.0:
             value += amplitude * average * np.sin(omega * middle + phases)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.files.rows import Row, flat
+from fusiond.files.parquet_rows import Row, flat
 from fusiond.files.tables import TrajectoryTable
 from fusiond.files.trajectory import trajectory_of
 from fusiond.navigation.solution import Solution

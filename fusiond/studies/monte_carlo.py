@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from fusiond.workers.outcome import Outcome, Runner
 
 if TYPE_CHECKING:
-    from fusiond.studies.kept import KeptRuns
+    from fusiond.studies.stored_runs import KeptRuns
 
 TAIL = (1.0 - 0.95) / 2.0
 """Share of either side outside a 95 % interval."""

@@ -91,8 +91,8 @@ def state_of(model: Model, nav: Array, xi: Array) -> State:
         scale = sum(xi[s] for s in model.parameters(15 + axis))
         step[3 + axis] = (RATE_SENSED[axis] - bias) / (1.0 + scale)
     step[9:18] = dcm_from_quaternion(nav[6:]).ravel()
-    felt = np.array(ACCELERATION) - [0.0, 0.0, gravity(float(nav[0]), float(nav[2]))]
-    force = dcm_from_rpy(*RPY).T @ felt
+    sensed = np.array(ACCELERATION) - [0.0, 0.0, gravity(float(nav[0]), float(nav[2]))]
+    force = dcm_from_rpy(*RPY).T @ sensed
     for axis in range(3):
         force[axis] -= sum(xi[s] for s in model.parameters(12 + axis))
         force[axis] /= 1.0 + sum(xi[s] for s in model.parameters(18 + axis))

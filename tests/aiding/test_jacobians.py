@@ -186,8 +186,8 @@ def test_barometer_jacobian_and_what_explains_it() -> None:
     nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
     xi[-3:] = 70.0, 0.05, 0.2
     lift_m = 0.2 * math.hypot(*VELOCITY[:2]) ** 2 / (2.0 * 9.80665)
-    felt = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
-    assert innovation_of(felt, state_of(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
+    sensed = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
+    assert innovation_of(sensed, state_of(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
 
 
 def test_scale_factors_are_left_out_of_lever_arms() -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from fusiond.aiding.base import Innovation, State
 from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.rest_evidence import SMOOTH_WINDOWS, RestEvidence
 from fusiond.aiding.standstill import ZeroRateAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.aiding.witnesses import SMOOTH_WINDOWS, Witnesses
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.catalogue import make_model
@@ -32,20 +32,20 @@ def _state(speed_m_s: float, sd_m_s: float, sd_bias_deg_s: float = 0.002) -> Sta
     return State(nav, np.zeros(MODEL.size), np.zeros(STEP_SIZE), MODEL, np.diag(sd**2))
 
 
-def _fixes(speed_m_s: float, count: int, sd_m_s: float = 0.1) -> Witnesses:
+def _fixes(speed_m_s: float, count: int, sd_m_s: float = 0.1) -> RestEvidence:
     """`count` fixes in the last second before END_S, whose errors have the stated sigma."""
-    witnesses, rng = Witnesses(), np.random.default_rng(3)
+    rest_evidence, rng = RestEvidence(), np.random.default_rng(3)
     for k in range(count):
         t_ns = round((END_S - 0.9 * k / count) * 1e9)
         north, east = (float(e) for e in sd_m_s * rng.standard_normal(2))
         v = (speed_m_s + north, east, 0.0)
         aid = VelocityAid("gnss_velocity", t_ns, 0.999, v, (sd_m_s,) * 3, (0.0, 0.0, 0.0))
-        witnesses.hear([aid])
-    return witnesses
+        rest_evidence.hear([aid])
+    return rest_evidence
 
 
 def test_nothing_speaks_against_a_vehicle_that_stands() -> None:
-    assert runs.rest(witnesses=_fixes(0.0, 10)).doubt(_state(0.01, 0.02)) is None
+    assert runs.rest(rest_evidence=_fixes(0.0, 10)).doubt(_state(0.01, 0.02)) is None
 
 
 @pytest.mark.parametrize(
@@ -61,26 +61,26 @@ def test_the_filter_s_own_velocity_must_be_near_zero_within_its_sigma(
 @pytest.mark.parametrize(("speed_m_s", "doubt"), [(0.0, None), (0.2, "moving"), (0.45, "moving")])
 def test_fixes_average(speed_m_s: float, doubt: str | None) -> None:
     """A filter that believes to stand cannot see the creeping that five fixes show."""
-    assert runs.rest(witnesses=_fixes(speed_m_s, 5)).doubt(_state(0.0, 0.01)) == doubt
+    assert runs.rest(rest_evidence=_fixes(speed_m_s, 5)).doubt(_state(0.0, 0.01)) == doubt
 
 
 def test_a_fix_before_the_quiet_windows_says_nothing() -> None:
-    witnesses = Witnesses()
+    rest_evidence = RestEvidence()
     before_ns = round((END_S - 1.5) * 1e9)
     sd = (0.1, 0.1, 0.1)
     aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
-    witnesses.hear([aid])
-    assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) is None
-    assert runs.rest(witnesses=witnesses, run=2).doubt(_state(0.0, 0.02)) == "moving"
+    rest_evidence.hear([aid])
+    assert runs.rest(rest_evidence=rest_evidence).doubt(_state(0.0, 0.02)) is None
+    assert runs.rest(rest_evidence=rest_evidence, run=2).doubt(_state(0.0, 0.02)) == "moving"
 
 
 def test_windows_of_half_a_second_look_at_their_own() -> None:
     """What was measured 0.75 s before the end was measured before the window."""
-    witnesses, sd = Witnesses(), (0.1, 0.1, 0.1)
+    rest_evidence, sd = RestEvidence(), (0.1, 0.1, 0.1)
     before_ns = round((END_S - 0.75) * 1e9)
     aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
-    witnesses.hear([aid])
-    rest = replace(runs.rest(witnesses=witnesses), window_s=0.5)
+    rest_evidence.hear([aid])
+    rest = replace(runs.rest(rest_evidence=rest_evidence), window_s=0.5)
     assert rest.doubt(_state(0.0, 0.02)) is None
     assert replace(rest, window_s=1.0).doubt(_state(0.0, 0.02)) == "moving"
 
@@ -89,21 +89,21 @@ def test_a_vehicle_that_turns_back_is_not_at_rest() -> None:
     """Three quiet windows of a vehicle that rolls to a stop and on the other way: the mean of what
     was measured in them is nothing, that of the last is not. The filter's own velocity, a second
     after the last fix, says as little."""
-    witnesses, sd = Witnesses(), (0.05, 0.05, 0.05)
+    rest_evidence, sd = RestEvidence(), (0.05, 0.05, 0.05)
     for ago_s, north in ((2.9, -0.35), (1.9, -0.05), (0.9, 0.25)):
         t_ns = round((END_S - ago_s) * 1e9)
         v = (north, 0.0, 0.0)
-        witnesses.hear([VelocityAid("gnss_velocity", t_ns, 0.999, v, sd, (0.0, 0.0, 0.0))])
+        rest_evidence.hear([VelocityAid("gnss_velocity", t_ns, 0.999, v, sd, (0.0, 0.0, 0.0))])
     span = round((END_S - 3.0) * 1e9), round(END_S * 1e9)
-    assert not witnesses.measured(*span).contradicts
-    assert runs.rest(witnesses=witnesses, run=3).doubt(_state(0.4, 0.15)) == "moving"
+    assert not rest_evidence.measured(*span).contradicts
+    assert runs.rest(rest_evidence=rest_evidence, run=3).doubt(_state(0.4, 0.15)) == "moving"
 
 
 def test_a_wheel_that_turns_is_no_rest() -> None:
-    witnesses = Witnesses()
+    rest_evidence = RestEvidence()
     t_ns = round((END_S - 0.5) * 1e9)
-    witnesses.hear([WheelSpeedAid("wheel", t_ns, 0.999, 0.4, 0.1, (0.0, 0.0, 0.0))])
-    assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
+    rest_evidence.hear([WheelSpeedAid("wheel", t_ns, 0.999, 0.4, 0.1, (0.0, 0.0, 0.0))])
+    assert runs.rest(rest_evidence=rest_evidence).doubt(_state(0.0, 0.02)) == "moving"
 
 
 def test_a_turn_is_no_bias() -> None:
@@ -120,8 +120,8 @@ def test_a_turn_is_the_gyros_where_the_speed_is_known_to_be_zero() -> None:
     """By the filter or by fixes: nothing on wheels turns on the spot, and the rows of the zero rate
     say that the gyros have changed."""
     mean_rate = (0.0, 0.0, 1.0 * DEG)
-    for witnesses, sd_m_s in ((Witnesses(), 0.02), (_fixes(0.0, 10), 0.5)):
-        rest = runs.rest(mean_rate=mean_rate, witnesses=witnesses)
+    for rest_evidence, sd_m_s in ((RestEvidence(), 0.02), (_fixes(0.0, 10), 0.5)):
+        rest = runs.rest(mean_rate=mean_rate, rest_evidence=rest_evidence)
         state = _state(0.0, sd_m_s)
         assert rest.doubt(state) is None
         aid = ZeroRateAid("rate", rest.window.end_ns, 0.9999, mean_rate, 0.1 * DEG, rest)
@@ -134,7 +134,7 @@ def test_what_a_creep_may_turn_is_bounded_by_what_is_known_of_the_speed() -> Non
     """About down alone, by the better of filter and measurements: 5 m are a car's least radius."""
     turns = (0.2 / 5.0) ** 2
     assert runs.rest().creeps(_state(0.0, 0.2)) == pytest.approx([0.0, 0.0, turns], rel=1e-3)
-    measured = runs.rest(witnesses=_fixes(0.0, 4)).creeps(_state(0.0, 0.2))
+    measured = runs.rest(rest_evidence=_fixes(0.0, 4)).creeps(_state(0.0, 0.2))
     assert measured == pytest.approx([0.0, 0.0, (0.05 / 5.0) ** 2], rel=1e-3)
     aid = ZeroRateAid("zero_rate", round(END_S * 1e9), 0.9999, (0.0,) * 3, 1e-3, runs.rest())
     innovation = aid.innovation(_state(0.0, 0.2))
@@ -163,22 +163,27 @@ def test_a_creep_turns_by_no_more_than_its_windows_scatter(count: int) -> None:
 
 def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
     """Once quiet windows at speed have been seen, rest takes evidence as good as its claim."""
-    witnesses = Witnesses()
+    rest_evidence = RestEvidence()
     doubtful, sure = _state(0.1, 0.3), _state(0.01, 0.03)
-    assert runs.rest(witnesses=witnesses).doubt(doubtful) is None
+    assert runs.rest(rest_evidence=rest_evidence).doubt(doubtful) is None
     for k in range(SMOOTH_WINDOWS):
-        assert runs.rest(witnesses=witnesses, end_s=5.0 + k).doubt(_state(20.0, 0.3)) == "moving"
-    assert runs.rest(witnesses=witnesses).doubt(doubtful) == "quiet_at_speed"
-    assert runs.rest(witnesses=witnesses).doubt(sure) is None
-    witnesses.hear([WheelSpeedAid("wheel", round(END_S * 1e9), 0.9, 0.0, 0.03, (0.0, 0.0, 0.0))])
-    assert runs.rest(witnesses=witnesses).doubt(doubtful) is None
+        assert (
+            runs.rest(rest_evidence=rest_evidence, end_s=5.0 + k).doubt(_state(20.0, 0.3))
+            == "moving"
+        )
+    assert runs.rest(rest_evidence=rest_evidence).doubt(doubtful) == "quiet_at_speed"
+    assert runs.rest(rest_evidence=rest_evidence).doubt(sure) is None
+    rest_evidence.hear(
+        [WheelSpeedAid("wheel", round(END_S * 1e9), 0.9, 0.0, 0.03, (0.0, 0.0, 0.0))]
+    )
+    assert runs.rest(rest_evidence=rest_evidence).doubt(doubtful) is None
 
 
 def test_a_rewind_may_take_a_window_at_speed_back() -> None:
-    witnesses = Witnesses()
+    rest_evidence = RestEvidence()
     for k in range(SMOOTH_WINDOWS):
-        runs.rest(witnesses=witnesses, end_s=5.0 + k).doubt(_state(20.0, 0.3))
-    assert witnesses.smooth_ride(round(END_S * 1e9))
-    assert not witnesses.smooth_ride(round(5.0 * 1e9))  # what came later is not known yet
-    runs.rest(witnesses=witnesses, end_s=5.0).doubt(_state(0.0, 0.02))
-    assert not witnesses.smooth_ride(round(END_S * 1e9))
+        runs.rest(rest_evidence=rest_evidence, end_s=5.0 + k).doubt(_state(20.0, 0.3))
+    assert rest_evidence.smooth_ride(round(END_S * 1e9))
+    assert not rest_evidence.smooth_ride(round(5.0 * 1e9))  # what came later is not known yet
+    runs.rest(rest_evidence=rest_evidence, end_s=5.0).doubt(_state(0.0, 0.02))
+    assert not rest_evidence.smooth_ride(round(END_S * 1e9))

@@ -13,8 +13,8 @@ from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import SIGN_SIGMAS, WheelSpeedAid
 from fusiond.aiding.height import BarometerAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.aiding import BarometerAiding, HeightAiding, WheelAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
@@ -67,7 +67,7 @@ def test_the_direction_is_the_filters_own_beyond_its_sigmas() -> None:
 
 def test_a_speed_that_reads_zero_long_is_no_rest_below_its_step() -> None:
     """Averaging takes noise away, not rounding: a car that creeps at 0.2 m/s reads 0 for ever."""
-    rounded, fine = Witnesses(), Witnesses()
+    rounded, fine = RestEvidence(), RestEvidence()
     sd = KM_H / math.sqrt(3.0)
     for k in range(40):
         reading = WheelSpeedAid("wheel", k * SECOND // 4, 0.99, 0.0, sd, (0.0, 0.0, 0.0))
@@ -76,7 +76,7 @@ def test_a_speed_that_reads_zero_long_is_no_rest_below_its_step() -> None:
     assert rounded.measured(0, 10 * SECOND) == (False, pytest.approx(sd), False)
     assert fine.measured(0, 10 * SECOND).sd == pytest.approx(sd / math.sqrt(40.0))
     # Two km/h contradict rest all the same, even one reading of them.
-    moving = Witnesses()
+    moving = RestEvidence()
     moving.hear([WheelSpeedAid("wheel", 0, 0.99, 2.0 * KM_H, 0.1, (0.0,) * 3, False, 0.08)])
     assert moving.measured(0, SECOND).contradicts
 
@@ -95,7 +95,7 @@ def test_rounding_enters_the_noise_of_every_kind() -> None:
     (wheel,) = aids(WHEEL)
     assert isinstance(wheel, WheelSpeedAid)
     assert (wheel.sd_m_s, wheel.signed, wheel.rounding_sd_m_s) == (pytest.approx(0.5), False, 0.4)
-    assert wheel.offers()[0].drifts == (WheelAiding().drift_sd_m_s, WheelAiding().drift_s)
+    assert wheel.candidates()[0].drifts == (WheelAiding().drift_sd_m_s, WheelAiding().drift_s)
     fix = PositionFix("gnss", SECOND, STAMP, 0.9, 0.2, 50.0, sd_ned_m=(3.0, 3.0, 6.0))
     fix = replace(fix, v_ned_m_s=(5.0, 0.0, None), sd_v_ned_m_s=(0.3, 0.3, None))
     coarse = replace(fix, rounding_sd_ned_m=(4.0, 0.0, 8.0), rounding_sd_v_m_s=0.4)
@@ -119,7 +119,7 @@ def test_a_barometer_is_refused_by_name_where_no_state_knows_the_weather() -> No
         (aid,) = intake.aids(height, SECOND, 0.0)
         assert isinstance(aid, BarometerAid)
         assert aid.sd_m == pytest.approx(5.0)
-        assert not aid.offers()
+        assert not aid.candidates()
         blocks = [block.name for block in intake.extra_blocks()]
         assert blocks == [aid.offset, aid.scale, aid.airflow]
         assert aid.offset == "barometer_offset" + ("_baro" if name == "baro" else "")

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from fusiond.batch.drives import drive_row
 from fusiond.commands.app import app
-from fusiond.files.rows import Row, read_rows
+from fusiond.files.parquet_rows import Row, read_rows
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 

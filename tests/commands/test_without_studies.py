@@ -85,14 +85,14 @@ def test_the_daemon_and_all_its_filters_but_one_are_there(environment: dict[str,
 import sys
 from pathlib import Path
 import fusiond.live.daemon, fusiond.demo.demo, fusiond.doctor.doctor, fusiond.replay.run
-import fusiond.recording.about, fusiond.batch.batch
+import fusiond.recording.log_metadata, fusiond.batch.batch
 from fusiond.configuration.load import load_config
 from fusiond.navigator.navigator import Navigator
 config = load_config(Path("config/vehicle.toml"))
 for name in ("kalman", "federated", "unscented"):
     estimator = config.estimator.model_copy(update={"filter": name})
     Navigator(config.model_copy(update={"estimator": estimator}))
-print(fusiond.recording.about._versions().keys() >= {"numpy"})
+print(fusiond.recording.log_metadata._versions().keys() >= {"numpy"})
 """
     done = subprocess.run(
         [sys.executable, "-c", code],

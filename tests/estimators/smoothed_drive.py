@@ -24,7 +24,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.smoothing.backward import Smoothed, Smoother
 from fusiond.estimators.smoothing.node import Nodes
-from fusiond.estimators.smoothing.taped import NEVER, TapedKalman, nodes_of
+from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes_of
 from fusiond.models import vehicle
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.catalogue import make_model
@@ -79,7 +79,7 @@ class Drawn:
     def at(self, nav: Array) -> Drawn:
         return self
 
-    def offers(self) -> tuple[()]:
+    def candidates(self) -> tuple[()]:
         """Its nominal values are no measurements that anything may be told from."""
         return ()
 

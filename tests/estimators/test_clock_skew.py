@@ -7,7 +7,7 @@ import pytest
 
 from fusiond.configuration.schema import Config
 from fusiond.models.vehicle import CLOCK_SKEW, CLOCK_SKEW_SD, FIX_TIME, VELOCITY_TIME
-from fusiond.navigator.filters import model_of
+from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults.published import against

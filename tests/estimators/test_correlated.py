@@ -13,7 +13,7 @@ from fusiond.estimators.federated.correlated import CorrelatedFilter, best_combi
 from fusiond.estimators.federated.fusion import fuse_correlated
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from tests import runs
 from tests.estimators.test_federated import IMU, NAMES, centralised, distance, drive
 from tests.estimators.test_fusion import covariance, least_squares

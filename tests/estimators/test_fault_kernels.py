@@ -38,7 +38,7 @@ from fusiond.estimators.fault_odds import MOST_OF_UNIT
 from fusiond.estimators.fault_rows import _at_past, _past, walk_path
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.reading import MOVING, moving, opened_variances
+from fusiond.estimators.published_state import MOVING, moving, opened_variances
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import MOUNTING, mounting

@@ -19,12 +19,12 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.filter import FederatedFilter
+from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions, Mode, local_of
-from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from fusiond.navigator.timeline import Timeline
 from fusiond.studies.federated import runs as study
 from tests import runs
@@ -169,7 +169,7 @@ def test_local_filters_fuse_to_what_is_published(mode: Mode) -> None:
     """After an update and its feedback the information of all adds up to the master's."""
     estimator = make(mode)
     drive().run(estimator, 60)
-    assert isinstance(estimator, StandingFilter)
+    assert isinstance(estimator, NoResetFilter)
     used = estimator.model.active
     infos, vectors = [], []
     parts = [estimator.local(name) for name in NAMES]
@@ -259,7 +259,7 @@ def test_a_source_that_never_speaks_or_sees_one_state_stays_finite(mode: Mode) -
     p = estimator.covariance[np.ix_(model.active, model.active)]
     scale = np.sqrt(np.diag(p))
     assert np.linalg.eigvalsh(p / np.outer(scale, scale)).min() > -1e-9
-    if isinstance(estimator, StandingFilter):
+    if isinstance(estimator, NoResetFilter):
         for name in ("v", "mute"):
             dx, cov = estimator.local(name)
             assert np.isfinite(dx).all()

@@ -17,14 +17,14 @@ from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.isolation import INNOVATION
+from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions, Mode
-from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.gnss.constellation import EPOCH_S, Constellation, constellation
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.models.blocks import CLOCK_OFFSET, clock_blocks
 from fusiond.models.catalogue import make_model
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from tests import runs
 from tests.estimators.screened_ranges import Ranges, ranges
 from tests.estimators.town_drive import IMU, LEVER, SECONDS, begun, drive
@@ -137,7 +137,7 @@ def test_a_bad_satellite_is_refused_by_name_and_nobody_learns_of_it(mode: Mode) 
     assert all(not o.rows or not any(o.rows) for o in through(absent, sky(math.nan)))
     assert bad.nav == pytest.approx(absent.nav, rel=1e-12, abs=1e-9)
     assert bad.covariance == pytest.approx(absent.covariance, rel=1e-9, abs=1e-15)
-    if isinstance(bad, StandingFilter) and isinstance(absent, StandingFilter):
+    if isinstance(bad, NoResetFilter) and isinstance(absent, NoResetFilter):
         for name in ("raw", "gnss"):
             for own, other in zip(bad.local(name), absent.local(name), strict=True):
                 assert own == pytest.approx(other, rel=1e-6, abs=1e-9)
@@ -149,7 +149,7 @@ def test_every_filter_learns_that_a_clock_was_set(mode: Mode, names: tuple[str, 
     """Of an aid of its own source and of a common one: nobody goes on with the old offset."""
     epochs = sky(0.0, set_at=SET_AT)
     estimator = make(mode, names)
-    assert isinstance(estimator, StandingFilter)
+    assert isinstance(estimator, NoResetFilter)
     through(estimator, epochs[:SET_AT])
     slot = MODEL.slots_of(CLOCK_OFFSET)[0]
 

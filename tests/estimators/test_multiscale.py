@@ -16,7 +16,7 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.catalogue import make_model
-from fusiond.navigator.filters import estimator_of
+from fusiond.navigator.assembly import estimator_of
 from fusiond.navigator.timeline import Timeline
 from tests import runs
 from tests.estimators.town_drive import IMU, LEVER, SD_V, begun, drive, run

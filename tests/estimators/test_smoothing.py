@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Linearised
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
-from fusiond.estimators.reading import Published
+from fusiond.estimators.published_state import Published
 from fusiond.estimators.smoothing.backward import Smoother
-from fusiond.estimators.smoothing.taped import NEVER, TapedKalman, nodes_of
+from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes_of
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

@@ -32,7 +32,7 @@ LOOSE_FORCE_M_S2 = 0.5
 HEADING_SD_RAD = math.radians(3.0)
 
 
-def _felt(f: InvariantFilter) -> Array:
+def _sensed(f: InvariantFilter) -> Array:
     """What tilt and force biases make of the acceleration, north, east, down: rows (3, n)."""
     rows = np.zeros((3, f.model.size))
     rows[:2, PHI : PHI + 2] = STANDARD_GRAVITY_M_S2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -56,9 +56,9 @@ def _straight_on(
     p[DV : DV + 6, DV : DV + 6] = 0.01 * np.eye(6)
     p[12:15, 12:15] = np.diag([force_sd**2, force_sd**2, KNOWN_SD**2])
     f.initialise(0, 0, nav, np.zeros(n), np.eye(n))
-    felt = np.eye(n)
-    felt[[PHI, PHI + 1, 14]] = _felt(f)
-    from_felt = np.linalg.inv(felt)
+    sensed = np.eye(n)
+    sensed[[PHI, PHI + 1, 14]] = _sensed(f)
+    from_felt = np.linalg.inv(sensed)
     f.covariance[:] = from_felt @ p @ from_felt.T
     return f
 
@@ -75,7 +75,7 @@ def test_a_turned_heading_leaves_what_tilt_and_bias_make_together(
         f.covariance[2, 2] = sd**2
         yaw = math.radians(yaw_deg) + off * sd
         assert f.update(HeadingAid("compass", 0, 0.9999, yaw, sd)).name == "fused"
-        known = _felt(f) @ f.covariance @ _felt(f).T
+        known = _sensed(f) @ f.covariance @ _sensed(f).T
         assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
         assert np.sqrt(np.diag(f.covariance)[12:14]) == pytest.approx(force_sd, rel=0.01)
         assert f.covariance == pytest.approx(f.covariance.T, abs=1e-15)
@@ -91,7 +91,7 @@ def test_a_corrected_tilt_leaves_what_the_biases_make_downward(turns: bool) -> N
     level = math.radians(2.0)
     aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
     assert f.update(aid).name == "fused"
-    known = _felt(f) @ f.covariance @ _felt(f).T
+    known = _sensed(f) @ f.covariance @ _sensed(f).T
     assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
 
 
@@ -106,8 +106,8 @@ def test_a_corrected_tilt_does_not_move_the_vehicle_downward(turns: bool) -> Non
     assert f.update(aid).name == "fused"
     attitude = dcm_from_quaternion(f.nav[6:])
     assert math.degrees(rpy_from_dcm(attitude)[0]) > 2.5
-    felt = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
-    assert abs(attitude[2] @ (felt - f.xi[12:15]) + STANDARD_GRAVITY_M_S2) < 1e-3
+    sensed = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
+    assert abs(attitude[2] @ (sensed - f.xi[12:15]) + STANDARD_GRAVITY_M_S2) < 1e-3
 
 
 @pytest.mark.parametrize("turns", [False, True])

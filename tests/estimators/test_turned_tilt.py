@@ -169,11 +169,11 @@ def test_an_unknown_tilt_turns_what_the_biases_make_downward() -> None:
 
 def _apart(f: TiltAxesFilter) -> Array:
     """P (2, 2) of the tilt, given what tilt and force biases make of the acceleration."""
-    felt, c = np.zeros((2, f.model.size)), dcm_from_quaternion(f.nav[6:])
-    felt[:, :2] = G * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    felt[:, [f.model.parameters(FORCE_ERROR + axis)[0] for axis in range(3)]] = c[:2]
-    both = f.covariance @ felt.T
-    apart: Array = f.covariance - both @ np.linalg.solve(felt @ both + 1e-12 * np.eye(2), both.T)
+    sensed, c = np.zeros((2, f.model.size)), dcm_from_quaternion(f.nav[6:])
+    sensed[:, :2] = G * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    sensed[:, [f.model.parameters(FORCE_ERROR + axis)[0] for axis in range(3)]] = c[:2]
+    both = f.covariance @ sensed.T
+    apart: Array = f.covariance - both @ np.linalg.solve(sensed @ both + 1e-12 * np.eye(2), both.T)
     return apart[:2, :2]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.integrity.agreement import Agreement
+from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import (
     DISAGREES,

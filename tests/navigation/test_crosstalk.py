@@ -10,14 +10,14 @@ import pytest
 from fusiond.navigation.crosstalk import STOP_M_S, Crosstalk
 
 PERIOD_S, G = 0.02, 9.8
-ASKEW = math.radians(0.2)
+MISALIGNED = math.radians(0.2)
 REST = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -G], (6000, 1))
 
 
-def densities(samples: np.ndarray, askew: float = ASKEW) -> np.ndarray:
+def densities(samples: np.ndarray, misalignment: float = MISALIGNED) -> np.ndarray:
     """After each of `samples`, behind two minutes at rest."""
     out = np.zeros((len(REST) + len(samples), 6))
-    Crosstalk(PERIOD_S, askew).follow(np.vstack((REST, samples)), out)
+    Crosstalk(PERIOD_S, misalignment).follow(np.vstack((REST, samples)), out)
     return out[len(REST) :]
 
 
@@ -36,7 +36,7 @@ def test_a_vehicle_that_turns_about_its_vertical_learns_nothing_wrong() -> None:
 def test_gyros_out_of_square_tell_the_turn_of_a_turned_body() -> None:
     """The claim itself: the attitude that they tell is the true one times a constant turn."""
     rng = np.random.default_rng(1)
-    m = rng.normal(0.0, ASKEW, (3, 3))
+    m = rng.normal(0.0, MISALIGNED, (3, 3))
     told, true = np.eye(3), np.eye(3)
 
     def turned(c: np.ndarray, w: np.ndarray, h: float) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_gyros_out_of_square_tell_the_turn_of_a_turned_body() -> None:
 def test_a_bend_about_another_axis_leaves_the_angle_across_it(axis: int) -> None:
     bend = densities(turning(axis, 0.5, math.pi))
     across = math.sqrt(float(bend[:, 2].sum()) * PERIOD_S)
-    assert across == pytest.approx(0.5 * math.pi * ASKEW, rel=0.15)
+    assert across == pytest.approx(0.5 * math.pi * MISALIGNED, rel=0.15)
     assert bend[:, axis].max() < 1e-3 * bend[:, 2].max()
 
 
@@ -69,7 +69,7 @@ def test_a_stop_leaves_a_velocity_down_and_little_along() -> None:
     stop[:, 3] = -STOP_M_S / 2.5
     stop = np.vstack((stop, REST[:100]))
     left = np.sqrt(densities(stop)[:, 3:].sum(axis=0) * PERIOD_S)
-    assert left[2] == pytest.approx(math.sqrt(2.0) * ASKEW * STOP_M_S, rel=0.15)
+    assert left[2] == pytest.approx(math.sqrt(2.0) * MISALIGNED * STOP_M_S, rel=0.15)
     assert left[1] < 0.5 * left[2]
 
 
@@ -78,7 +78,7 @@ def test_a_bias_is_no_motion_and_square_axes_have_no_noise() -> None:
     biased = REST.copy()
     biased[:, :3] = 0.01
     out = np.zeros_like(biased)
-    Crosstalk(PERIOD_S, ASKEW).follow(biased, out)
+    Crosstalk(PERIOD_S, MISALIGNED).follow(biased, out)
     assert out.max() < 1e-9 * G
     assert not densities(turning(2, 0.4, 4.0), 0.0).any()
 
@@ -87,8 +87,8 @@ def test_pieces_are_as_the_whole() -> None:
     rng = np.random.default_rng(3)
     samples = REST + rng.normal(0.0, 0.3, REST.shape)
     whole, parts = np.zeros_like(samples), np.zeros_like(samples)
-    Crosstalk(PERIOD_S, ASKEW).follow(samples, whole)
-    in_parts = Crosstalk(PERIOD_S, ASKEW)
+    Crosstalk(PERIOD_S, MISALIGNED).follow(samples, whole)
+    in_parts = Crosstalk(PERIOD_S, MISALIGNED)
     for begin, end in ((0, 1), (1, 700), (700, len(samples))):
         in_parts.follow(samples[begin:end], parts[begin:end])
     assert np.array_equal(whole, parts)

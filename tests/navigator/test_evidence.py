@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.navigator.alignment.evidence import AlignmentEvidence, Fix
@@ -35,9 +35,9 @@ def _looked_at(
         place[1] += strayed_m * (k == 10)
         lat, lon = place / METRES
         north, east = rng.normal(0.0, SD_M_S, 2) + wrong[k]
-        velocity = VelocityOffer(t_ns, (SPEED_M_S + north, east, 0.0), (SD_M_S, SD_M_S, SD_M_S))
+        velocity = VelocityCandidate(t_ns, (SPEED_M_S + north, east, 0.0), (SD_M_S, SD_M_S, SD_M_S))
         sd = (SD_M, SD_M, SD_M)
-        position = PositionOffer(t_ns, float(lat), float(lon), 0.0, sd, (0.0, 0.0, 0.0))
+        position = PositionCandidate(t_ns, float(lat), float(lon), 0.0, sd, (0.0, 0.0, 0.0))
         known.fixes.append(Fix(velocity, position))
         confirmed = known.position_confirms(known.fixes[-1])
     return known, confirmed

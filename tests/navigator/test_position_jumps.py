@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigator.alignment.position_jumps import (
     LOOKED_NS,
     Epoch,
@@ -42,8 +42,8 @@ def epochs(
         lon = math.remainder(lon_rad + east / (RADIUS_M * math.cos(0.5)), 2.0 * math.pi)
         place = 0.5 + north / RADIUS_M, lon, 40.0
         t_ns = round(t_s * 1e9)
-        velocity = VelocityOffer(t_ns, v, (0.05, 0.05, 0.1), NO_LEVER)
-        found.append(Epoch(velocity, PositionOffer(t_ns, *place, SD, NO_LEVER)))
+        velocity = VelocityCandidate(t_ns, v, (0.05, 0.05, 0.1), NO_LEVER)
+        found.append(Epoch(velocity, PositionCandidate(t_ns, *place, SD, NO_LEVER)))
     return found
 
 
@@ -96,8 +96,8 @@ def test_a_change_that_is_within_what_is_told_of_a_lateness_is_none() -> None:
 
 
 def test_a_vehicle_that_stands_leaps_nowhere() -> None:
-    standing = epochs((0.0, 0.8, 0.0), speed_m_s=0.0)
-    assert len(since_leap(standing)) == len(standing)
+    standstill = epochs((0.0, 0.8, 0.0), speed_m_s=0.0)
+    assert len(since_leap(standstill)) == len(standstill)
 
 
 def test_an_interval_that_is_too_long_to_tell_and_velocities_alone_are_left_whole() -> None:
@@ -134,8 +134,8 @@ def road(
         seen = north - speed * (late_s if t_s >= since_s else 0.0) + 0.5 * rng.standard_normal()
         t_ns = round(t_s * 1e9)
         place = 0.5 + seen / RADIUS_M, 1.9, 40.0
-        velocity = VelocityOffer(t_ns, (speed, 0.0, 0.0), (0.05, 0.05, 0.1), NO_LEVER)
-        found.append(Epoch(velocity, PositionOffer(t_ns, *place, SD, NO_LEVER)))
+        velocity = VelocityCandidate(t_ns, (speed, 0.0, 0.0), (0.05, 0.05, 0.1), NO_LEVER)
+        found.append(Epoch(velocity, PositionCandidate(t_ns, *place, SD, NO_LEVER)))
     return found
 
 

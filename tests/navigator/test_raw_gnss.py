@@ -12,7 +12,7 @@ import pytest
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
@@ -92,9 +92,9 @@ def test_without_ephemerides_an_epoch_does_not_apply_and_says_why() -> None:
 
 def test_an_epoch_alone_starts_the_alignment() -> None:
     raw, sim = informed(), receiver()
-    position, velocity = raw.aid(sim.epoch(0), 7).offers()
-    assert isinstance(position, PositionOffer)
-    assert isinstance(velocity, VelocityOffer)
+    position, velocity = raw.aid(sim.epoch(0), 7).candidates()
+    assert isinstance(position, PositionCandidate)
+    assert isinstance(velocity, VelocityCandidate)
     assert (position.t_ns, velocity.t_ns) == (7, 7)
     lat, lon, height = place(0)
     assert abs(position.lat_rad - lat) * 6.37e6 < 5.0 * position.sd[0]
@@ -102,7 +102,7 @@ def test_an_epoch_alone_starts_the_alignment() -> None:
     assert position.height_m is not None
     assert abs(position.height_m - height) < 5.0 * position.sd[2]
     few = replace(sim.epoch(1), signals=sim.epoch(1).signals[:3])
-    assert raw.aid(few, 8).offers() == []
+    assert raw.aid(few, 8).candidates() == []
     assert raw.refused["too_few"] == 1
 
 

@@ -42,16 +42,16 @@ def shifted(imu: ImuBuffer, force: np.ndarray) -> sensed_motion.Span:
 def test_slopes_by_biases_are_those_of_differences(imu: ImuBuffer) -> None:
     at, step = instants(imu), 1e-4
     bias = np.array([0.01, -0.02, 0.03])
-    f = sensed_motion.felt(imu, at, bias)
+    f = sensed_motion.sensed(imu, at, bias)
     for axis in range(3):
         unit = np.eye(3)[axis] * step
-        ahead = sensed_motion.felt(shifted(imu, unit), at, bias)
-        behind = sensed_motion.felt(shifted(imu, -unit), at, bias)
+        ahead = sensed_motion.sensed(shifted(imu, unit), at, bias)
+        behind = sensed_motion.sensed(shifted(imu, -unit), at, bias)
         slope = (ahead.gained - behind.gained) / (2.0 * step)
         assert f.slopes[:, :, axis] == pytest.approx(slope, abs=1e-6)
         ahead, behind = (
-            sensed_motion.felt(imu, at, bias + unit),
-            sensed_motion.felt(imu, at, bias - unit),
+            sensed_motion.sensed(imu, at, bias + unit),
+            sensed_motion.sensed(imu, at, bias - unit),
         )
         slope = (ahead.gained - behind.gained) / (2.0 * step)
         # Of 600 m/s per rad/s: steps of 10 ms are of the first order.
@@ -62,7 +62,7 @@ def test_slopes_by_biases_are_those_of_differences(imu: ImuBuffer) -> None:
 
 def test_rates_at_fixes_are_the_means_around_them(imu: ImuBuffer) -> None:
     at = instants(imu)
-    rates = sensed_motion.felt(imu, at, np.zeros(3)).rates
+    rates = sensed_motion.sensed(imu, at, np.zeros(3)).rates
     means = [sensed_motion.samples_at(imu, int(t_ns))[:3] for t_ns in at]
     assert rates == pytest.approx(np.array(means), abs=1e-12)
 
@@ -93,7 +93,7 @@ def test_velocities_that_are_late_tilt_nobody_who_asks_whether_they_are(sd_late_
     """What tilt and force bias make together is known to some mm/s^2: is it right?"""
     imu, m = pulling_off()
     noise = imu_noise(Imu())
-    f = sensed_motion.felt(imu, m.instants, sensed_motion.rate_before_motion(imu, m))
+    f = sensed_motion.sensed(imu, m.instants, sensed_motion.rate_before_motion(imu, m))
     found = motion_fit.fit(imu, f, m, noise, 9.8, 0.0, 0.02, sd_late_s)
     h = np.zeros((2, 10))
     h[:, :2] = 9.8 * np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -118,7 +118,7 @@ def test_what_a_guess_says_moves_by_its_slopes(imu: ImuBuffer) -> None:
     at = instants(imu)
     v, levers = rng.normal(0.0, 5.0, (len(at), 3)), np.tile((1.4, 0.2, -1.2), (len(at), 1))
     m = sensed_motion.Measured(at, v, np.full(v.shape, 0.1), levers)
-    f = sensed_motion.felt(imu, at, np.array([0.01, -0.02, 0.03]))
+    f = sensed_motion.sensed(imu, at, np.array([0.01, -0.02, 0.03]))
     asked = motion_fit.Asked(imu_noise(Imu()), 9.8, 0.3, np.full(10, 0.1), 0.1)
     guess = motion_fit.Guess(dcm_from_rpy(0.02, -0.03, 0.4), f.biases, 0.0, v[0])
     packed = guess.packed()
@@ -162,7 +162,7 @@ def test_a_span_is_felt_as_the_buffer_it_was_taken_from(imu: ImuBuffer) -> None:
     at, none = instants(imu), np.zeros(3)
     span = sensed_motion.span_since(imu, int(at[0]))
     assert len(span.times) < imu.end
-    there, here = sensed_motion.felt(span, at, none), sensed_motion.felt(imu, at, none)
+    there, here = sensed_motion.sensed(span, at, none), sensed_motion.sensed(imu, at, none)
     assert np.array_equal(there.gained, here.gained)
     assert there.rates == pytest.approx(here.rates, abs=1e-12)
 
@@ -184,7 +184,7 @@ def test_gyros_that_nobody_calibrated_lead_no_fit_astray(seed: int) -> None:
     m = sensed_motion.Measured(
         at, v, np.full(v.shape, 0.05), np.tile((1.4, 0.2, -1.2), (len(at), 1))
     )
-    f = sensed_motion.felt(past, at, sensed_motion.rate_before_motion(past, m))
+    f = sensed_motion.sensed(past, at, sensed_motion.rate_before_motion(past, m))
     for yaw in (0.0, np.pi):
         found = motion_fit.fit(past, f, m, spare, 9.8, yaw, np.radians(5.0), 0.1)
         assert found.converged

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.measurements import PositionFix
 from drivers.nmea.geoid import GEOID_SD_M
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.navigation.solution import Mode, Solution
@@ -139,7 +139,7 @@ def test_a_saved_place_without_a_height_tells_none() -> None:
         place = known.place()
         assert place is not None
         assert (place.where[2], place.sd_height) == (height or 0.0, sd_m)
-        here = PositionOffer(0, lat, lon, None, (1.0, 1.0, 9.0), (0.0, 0.0, 0.0))
+        here = PositionCandidate(0, lat, lon, None, (1.0, 1.0, 9.0), (0.0, 0.0, 0.0))
         assert known.place_of(here).sd_height == sd_m
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.imu_door import BEARABLE_GAP_S
+from fusiond.navigator.imu_screening import BEARABLE_GAP_S
 from fusiond.navigator.navigator import Navigator
 from tests import runs
 from tests.navigator.vehicle import CONFIG, START_NS, drive

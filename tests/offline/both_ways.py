@@ -18,7 +18,7 @@ from fusiond.live.events import Events
 from fusiond.live.sources import Source
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
-from fusiond.offline.recorded import read_recorded
+from fusiond.offline.run_input import read_recorded
 from tests.clock.host_time import Host
 from tests.offline.options_drive import aids
 

@@ -17,7 +17,7 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.process import process
-from fusiond.offline.recorded import Recorded, read_recorded
+from fusiond.offline.run_input import Recorded, read_recorded
 from tests.offline.nmea_lines import sentence
 
 BEGIN = datetime(2026, 3, 24, 7, 33, tzinfo=UTC)

@@ -11,7 +11,7 @@ from drivers.rdss.wording import worded
 from fusiond.clock.results import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
-from fusiond.integrity.finding import Finding
+from fusiond.integrity.fault_finding import Finding
 from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter

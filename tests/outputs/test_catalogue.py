@@ -10,7 +10,7 @@ from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.outputs.base import Output
 from fusiond.outputs.catalogue import MAKERS, make_outputs
-from fusiond.outputs.guests import Guests
+from fusiond.outputs.client_sockets import Guests
 
 
 def made(config: Config) -> dict[str, Output]:

@@ -13,7 +13,7 @@ from drivers.rdss.cycle import REFUSALS
 from drivers.rdss.mail import ENDS, Fault
 from fusiond.integrity.verdicts import Verdict
 from fusiond.navigation.solution import Mode
-from fusiond.navigator.imu_door import TEXTS
+from fusiond.navigator.imu_screening import TEXTS
 from fusiond.outputs.messages.event_catalogue import EVENTS, UNKNOWN, entry_of
 from tests.places import REPOSITORY
 from tools.event_page import PAGE, page

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from websockets import Subprotocol
 from websockets.asyncio.client import connect
 
-from fusiond.outputs.asked import DEEPEST, NotUnderstoodError, parsed
 from fusiond.outputs.foxglove.viewer import PROTOCOLS
+from fusiond.outputs.json_requests import DEEPEST, NotUnderstoodError, parsed
 from tests.outputs.guest_servers import foxglove, gpsd, url
 from tests.outputs.serving import connected
 

@@ -11,7 +11,7 @@ import pytest
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs.mqtt import MqttPublisher
-from fusiond.outputs.reconnecting import (
+from fusiond.outputs.reconnection import (
     LONGEST_CONTESTED_S,
     PEACE_S,
     TAKEN_COUNT,

@@ -17,8 +17,8 @@ from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
-from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.publishing import Publishing
+from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.scheduler import Scheduler
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.solution import Solution
@@ -66,7 +66,7 @@ class Rig:
         self.solutions: list[Solution] = []
         self.digests: list[bytes] = []
         self.recorder.listen(self.inputs)
-        self.recorder.arm(LOADED.dump_python(Loaded(), mode="json"))
+        self.recorder.arm(RESTORED_STATE.dump_python(RestoredState(), mode="json"))
         self.events.listen(partial(self.recorder.take, EVENT))
         for name in self.inputs:
             self.take(name, "open")

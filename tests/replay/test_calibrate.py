@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.navigator.navigator import Navigator
 from fusiond.recording.reader import Log
-from fusiond.replay.configured import config_of
+from fusiond.replay.replay_config import config_of
 from fusiond.replay.watched import watched
 from fusiond.simulation.can.imu import SIM_IMU
 from tests.live.daemon_bench import RDSS, imu_section

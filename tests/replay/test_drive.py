@@ -28,8 +28,8 @@ from fusiond.recording.export import WRITERS, Point
 from fusiond.recording.info import info
 from fusiond.recording.reader import Log, LogError
 from fusiond.recording.records import Kind
-from fusiond.replay.configured import config_of
 from fusiond.replay.replay import Replay
+from fusiond.replay.replay_config import config_of
 from fusiond.replay.run import Wish, replay
 from tests.clock.host_time import S
 from tests.recording.driven import Drive

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
-from fusiond.recording.about import about_run
 from fusiond.recording.channels import CHANNELS
 from fusiond.recording.log_file import About, LogFile
+from fusiond.recording.log_metadata import about_run
 
 SECOND = 1_000_000_000
 EPOCH_NS = 1_800_000_000 * SECOND

@@ -22,7 +22,7 @@ What becomes of the local filters after a fusion, which is after every update:
 `rescale`       a local filter that was updated keeps the part `retained` of its information and
                 hands the rest to the master's own estimate: P_i <- P_i / retained.
 
-The first and the last are in fusiond.estimators.federated.standing, those with a reset in
+The first and the last are in fusiond.estimators.federated.no_reset, those with a reset in
 fusiond.estimators.federated.reset; here is what they share.
 
 Source: Carlson, IEEE Trans. AES 26 (1990), 517; Carlson and Berarducci, NAVIGATION 41 (1994), 297;

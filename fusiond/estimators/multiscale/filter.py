@@ -39,7 +39,7 @@ from fusiond.estimators.multiscale.block import (
     rows_on,
 )
 from fusiond.estimators.multiscale.wavelet import wavelet_matrix
-from fusiond.estimators.reading import sigmas
+from fusiond.estimators.published_state import sigmas
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, update, work
 from fusiond.models.model import Model

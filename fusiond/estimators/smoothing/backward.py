@@ -20,14 +20,14 @@ innovations for what they were. So feedback needs none either: lambda says how f
 whatever navigation state the filter had then, and where that state jumps because an estimate f was
 fed back, dx_s jumps by f with it.
 
-What is published is by the receiver's clock (fusiond.estimators.reading): with d = dx_s, the
-navigation state v, C, acceleration a and rate w, and tau the offset,
+What is published is by the receiver's clock (fusiond.estimators.published_state): with d = dx_s,
+the navigation state v, C, acceleration a and rate w, and tau the offset,
 
     D_p = d_r + tau d_v - v d_tau + d_v d_tau,   D_v = d_v - a d_tau,   D_phi = d_phi + C w d_tau
 
-Between nodes D and the variances are taken for linear (fusiond.estimators.smoothing.taped). As an
-update lowers every variance and process noise is never negative, a smoothed sigma is at most the
-filter's, but for that line: the smaller of the two is stated.
+Between nodes D and the variances are taken for linear (fusiond.estimators.smoothing.node_recorder).
+As an update lowers every variance and process noise is never negative, a smoothed sigma is at most
+the filter's, but for that line: the smaller of the two is stated.
 
 Source: Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973), 65;
 Bryson, Frazier, Smoothing for linear and nonlinear dynamic systems, ASD-TDR-63-119 (1963);
@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.reading import Published, sigmas
+from fusiond.estimators.published_state import Published, sigmas
 from fusiond.estimators.smoothing.node import PUBLISHED, Nodes, links
 from fusiond.estimators.update import feed_back
 from fusiond.models.model import Model

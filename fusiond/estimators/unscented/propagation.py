@@ -30,15 +30,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.block_covariance import shake, widen_for_gap
+from fusiond.estimators.corrected_imu import compensate, sensor_estimates, slopes
 from fusiond.estimators.covariance import (
     covariance_for,
     kept_part,
     mirror,
     propagate_parameters,
 )
-from fusiond.estimators.crossing import shake, widen_for_gap
-from fusiond.estimators.reading import in_fix_time, sigmas
-from fusiond.estimators.sensors import compensate, sensor_estimates, slopes
+from fusiond.estimators.published_state import in_fix_time, sigmas
 from fusiond.estimators.unscented.sigma_points import NO_PIVOT
 from fusiond.estimators.update import feed_back
 from fusiond.navigation.compiled import compiled

@@ -75,7 +75,7 @@ class Aligner:
         self._track.hear(aids)
         self._news = True
 
-    def felt(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
+    def sensed(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
         """Windows of the standstill detector have ended; constraints that hold."""
         for window in windows:
             self.known.window(window)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
-from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standing
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standstill
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.saved_state import SavedState
 
@@ -33,7 +33,7 @@ class Basis(NamedTuple):
 
 
 def rest_bias(
-    noise: ImuNoise, standing: Standing, dcm: Array, lat: float, sd_yaw: float = 0.0
+    noise: ImuNoise, standstill: Standstill, dcm: Array, lat: float, sd_yaw: float = 0.0
 ) -> tuple[Array, float]:
     """Rate bias (3,) seen at rest and its sigma.
 
@@ -45,5 +45,5 @@ def rest_bias(
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
     rest = sd_yaw**2 + 2.0 - 2.0 * (1.0 + sd_yaw**2) * math.exp(-0.5 * sd_yaw**2)
     wrong = float(earth[0]) * math.sqrt(0.5 * rest)
-    white = noise.rate_noise / math.sqrt(standing.seconds)
-    return standing.mean_rate - dcm.T @ earth, math.hypot(white, wrong)
+    white = noise.rate_noise / math.sqrt(standstill.seconds)
+    return standstill.mean_rate - dcm.T @ earth, math.hypot(white, wrong)

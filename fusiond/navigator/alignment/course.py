@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.offers import VelocityOffer
+from fusiond.aiding.candidates import VelocityCandidate
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.alignment import level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
@@ -35,7 +35,7 @@ from fusiond.navigation.rotation import (
 )
 from fusiond.navigator.alignment import motion_fit, sensed_motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.evidence import Fix, Standing
+from fusiond.navigator.alignment.evidence import Fix, Standstill
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
     BACKWARD,
@@ -89,8 +89,8 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """Heading from the course over ground, forward or backward as the IMU felt it."""
     known = by.known
     # A fix of before the first sample is one of a gap: nothing was felt since.
-    felt = (f for f in reversed(known.fixes) if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns)
-    latest = next(felt, None)
+    sensed = (f for f in reversed(known.fixes) if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns)
+    latest = next(sensed, None)
     if latest is None or latest.velocity.t_ns == known.tried_ns:
         return None  # the same data say the same
     speed = math.hypot(*latest.velocity.v_ned[:2])
@@ -101,7 +101,7 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     if not known.position_confirms(latest):
         known.why = reason("confirming_course")
         return None
-    s = known.standing
+    s = known.standstill
     here = known.place_of(latest.position, latest.velocity)
     if (
         s is not None
@@ -121,43 +121,45 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def _moved_off(
-    by: Basis, imu: ImuBuffer, standing: Standing, velocity: VelocityOffer, place: Place
+    by: Basis, imu: ImuBuffer, standstill: Standstill, velocity: VelocityCandidate, place: Place
 ) -> Start | str | None:
     """A start, why not yet, or None where what was felt since the quiet began to end is not the
     velocity: it was no rest."""
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
-    f = sensed_motion.felt(imu, np.array([standing.end_ns, velocity.t_ns]), standing.mean_rate)
-    rested = dcm_from_rpy(*level(standing.mean_force), 0.0)
+    f = sensed_motion.sensed(
+        imu, np.array([standstill.end_ns, velocity.t_ns]), standstill.mean_rate
+    )
+    rested = dcm_from_rpy(*level(standstill.mean_force), 0.0)
     gained = rested @ f.gained[1] + [0.0, 0.0, g * f.of.t_s[1]]
     dcm = rested @ f.turned[1]
     roll, pitch, turned = rpy_from_dcm(dcm)
     rate = f.rates[1]
     antenna = gained + dcm @ np.cross(rate, velocity.lever)
-    felt_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
-    sd_felt = _felt_sd(by, g, (velocity.t_ns - standing.end_ns) * 1e-9, turned, speed)
+    sensed_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
+    sd_sensed = _sensed_sd(by, g, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, speed)
     acceleration = dcm @ f.of.means[1, 3:] + [0.0, 0.0, g]
     late = math.hypot(*acceleration[:2]) * _sd_late_s(by, velocity)
     sd_speed = math.hypot(max(velocity.sd[:2]), late)
-    if abs(felt_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_felt, sd_speed):
+    if abs(sensed_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_sensed, sd_speed):
         return None
-    felt = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
-    backward = abs(felt) > math.pi / 2.0
+    sensed = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
+    backward = abs(sensed) > math.pi / 2.0
     by_course = _along(by.options, velocity, rate, backward)
-    apart = wrap_angle(felt - by_course.angle)
+    apart = wrap_angle(sensed - by_course.angle)
     if abs(apart) > COURSE_AGREEMENT_RAD:
         return by.known.doubted(reason("imu_sideways"))
     if backward:
-        if not by.known.seen_at_rest(standing):
+        if not by.known.seen_at_rest(standstill):
             return None  # braking from twice the speed feels the same
         if why := _reversing(by, velocity):
             return why
-    sd_felt_angle = math.hypot(sd_felt, sd_speed) / speed
-    share = by_course.sd**2 / (by_course.sd**2 + sd_felt_angle**2)
+    sd_sensed_angle = math.hypot(sd_sensed, sd_speed) / speed
+    share = by_course.sd**2 / (by_course.sd**2 + sd_sensed_angle**2)
     angle = by_course.angle + share * apart
-    sd = by_course.sd * sd_felt_angle / math.hypot(by_course.sd, sd_felt_angle)
+    sd = by_course.sd * sd_sensed_angle / math.hypot(by_course.sd, sd_sensed_angle)
     yaw = math.atan2(velocity.v_ned[1], velocity.v_ned[0]) - angle
-    at_rest = dcm_from_rpy(*level(standing.mean_force), yaw - turned)
+    at_rest = dcm_from_rpy(*level(standstill.mean_force), yaw - turned)
     return _build(
         by,
         imu,
@@ -167,8 +169,8 @@ def _moved_off(
         max(sd, LEAST_YAW_SD_RAD),
         rate,
         "GNSS course" + (BACKWARD if backward else ""),
-        rest_bias(by.noise, standing, at_rest, lat),
-        Levelled(at_rest, _level_sd(by, (velocity.t_ns - standing.end_ns) * 1e-9, turned, lat)),
+        rest_bias(by.noise, standstill, at_rest, lat),
+        Levelled(at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)),
     )
 
 
@@ -186,7 +188,7 @@ def _level_sd(by: Basis, seconds: float, turned: float, lat: float) -> float:
     )
 
 
-def _felt_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -> float:
+def _sensed_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -> float:
     """Sigma (m/s) of a velocity integrated from rest: white noise of both sensors, level, force
     bias (which the level hides until the vehicle has turned), scale."""
     n = by.noise
@@ -200,7 +202,7 @@ def _felt_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -
 
 
 def _along(
-    options: AlignmentOptions, velocity: VelocityOffer, rate: Array, backward: bool
+    options: AlignmentOptions, velocity: VelocityCandidate, rate: Array, backward: bool
 ) -> Along:
     """Direction of the antenna's motion, in a body that turns and does not slide."""
     no_slip = options.no_slip_m
@@ -214,7 +216,7 @@ def _along(
     return Along(math.atan2(across, -forward if backward else forward), sd)
 
 
-def _reversing(by: Basis, velocity: VelocityOffer) -> str:
+def _reversing(by: Basis, velocity: VelocityCandidate) -> str:
     """Reason why a start backward must wait; empty if it need not.
 
     An IMU mounted backwards feels a vehicle that drives off forward just as one that reverses; the
@@ -237,10 +239,10 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
 class Ways:
     """Measured velocities against what the IMU felt; what fits best is asked for each way."""
 
-    felt: sensed_motion.Felt
+    sensed: sensed_motion.Sensed
     _past: sensed_motion.Past
     _measured: sensed_motion.Measured
-    _latest: VelocityOffer
+    _latest: VelocityCandidate
     _options: AlignmentOptions
     _noise: ImuNoise
     _g: float
@@ -250,16 +252,16 @@ class Ways:
         """The best fit of a vehicle that drives forward, or backward."""
         velocity = self._latest
         course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
-        along = _along(self._options, velocity, self.felt.rates[-1], backward)
+        along = _along(self._options, velocity, self.sensed.rates[-1], backward)
         yaw = course - along.angle
-        given = self._past, self.felt, self._measured, self._noise, self._g
+        given = self._past, self.sensed, self._measured, self._noise, self._g
         return motion_fit.fit(*given, yaw, along.sd, self._sd_late_s)
 
 
 def ways(
     past: sensed_motion.Past,
     m: sensed_motion.Measured,
-    latest: VelocityOffer,
+    latest: VelocityCandidate,
     options: AlignmentOptions,
     noise: ImuNoise,
     g: float,
@@ -267,7 +269,7 @@ def ways(
 ) -> Ways:
     """Of velocities in order of time, `latest` the last; they are late by 0 to within
     `sd_late_s`."""
-    f = sensed_motion.felt(past, m.instants, sensed_motion.rate_before_motion(past, m))
+    f = sensed_motion.sensed(past, m.instants, sensed_motion.rate_before_motion(past, m))
     return Ways(f, past, m, latest, options, noise, g, sd_late_s)
 
 
@@ -286,7 +288,7 @@ def _on_the_move(
     late = _sd_late_s(by, velocity)
     m, g = sensed_motion.measured(usable, sensed_motion.MOST_FIXES), gravity(lat, height)
     either = ways(imu, m, usable[-1], by.options, by.noise, g, late)
-    rate = either.felt.rates[-1]
+    rate = either.sensed.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
     # Where even the better fit is poor, the sigmas are too small by as much.
@@ -335,7 +337,7 @@ def _on_the_move(
     )
 
 
-def _sd_late_s(by: Basis, velocity: VelocityOffer) -> float:
+def _sd_late_s(by: Basis, velocity: VelocityCandidate) -> float:
     """One sigma of how late a receiver's velocities are; 0 where that is not estimated."""
     return float(sum(by.model.initial[slot] for slot in by.model.slots_of(velocity.time)))
 
@@ -347,7 +349,7 @@ def _fitted(fit: motion_fit.Fit, doubt: float) -> Fitted:
 def _build(
     by: Basis,
     imu: ImuBuffer,
-    offer: VelocityOffer,
+    candidate: VelocityCandidate,
     place: Place,
     dcm: Array,
     sd_yaw: float,
@@ -358,9 +360,9 @@ def _build(
     fitted: Fitted | None = None,
 ) -> Start:
     """With the antenna's velocity taken to the body."""
-    velocity, sd = velocity_of(offer)
-    velocity = velocity - dcm @ np.cross(rate, offer.lever)
-    force = sensed_motion.samples_at(imu, offer.t_ns)[3:]
+    velocity, sd = velocity_of(candidate)
+    velocity = velocity - dcm @ np.cross(rate, candidate.lever)
+    force = sensed_motion.samples_at(imu, candidate.t_ns)[3:]
     if fitted is not None:
         force = force - fitted.biases[:3]
     acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]
@@ -368,7 +370,7 @@ def _build(
         velocity = velocity - acceleration * fitted.late_s
     return build_start(
         by.model,
-        offer.t_ns,
+        candidate.t_ns,
         place,
         dcm,
         sd_yaw,
@@ -379,5 +381,5 @@ def _build(
         levelled=levelled,
         fitted=fitted,
         unexplained=by.known.unexplained,
-        moves=Moves(offer, rate, acceleration),
+        moves=Moves(candidate, rate, acceleration),
     )

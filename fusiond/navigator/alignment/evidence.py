@@ -12,8 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
-from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
+from fusiond.aiding.candidates import (
+    HeadingCandidate,
+    HeightCandidate,
+    PositionCandidate,
+    VelocityCandidate,
+)
+from fusiond.aiding.rest_evidence import LEAST_SD_M_S, RestEvidence
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
@@ -56,8 +61,8 @@ CONFIRMED_S = 15.0
 class Fix(NamedTuple):
     """A measurement that offered both."""
 
-    velocity: VelocityOffer
-    position: PositionOffer
+    velocity: VelocityCandidate
+    position: PositionCandidate
 
 
 def _instant(fix: Fix) -> int:
@@ -65,7 +70,7 @@ def _instant(fix: Fix) -> int:
 
 
 @dataclass(slots=True)
-class Standing:
+class Standstill:
     """Sums over the quiet windows since the vehicle came to rest."""
 
     start_ns: int
@@ -106,17 +111,17 @@ class AlignmentEvidence:
         """Instant of the last fix that a course was tried with."""
         self.moving_since_ns = 0
         """The first fix since which all were fast enough for a course."""
-        self.witnesses = Witnesses()
-        self.standing: Standing | None = None
+        self.rest_evidence = RestEvidence()
+        self.standstill: Standstill | None = None
         """The last standstill, also when the vehicle has moved off since."""
-        self.left: Standing | None = None
+        self.left: Standstill | None = None
         """The last standstill that one could level by and that has ended."""
         self.ever_moved = False
         self.unexplained = np.zeros(3)
         """The largest rates (3,) of quiet windows that no bias of the data sheet explains: a turn,
         or a gyro that is not what its sheet says."""
-        self.heading: HeadingOffer | None = None
-        self.compass: HeadingOffer | None = None
+        self.heading: HeadingCandidate | None = None
+        self.compass: HeadingCandidate | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
         self.contradicted_ns: int | None = None
@@ -125,8 +130,8 @@ class AlignmentEvidence:
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
-        self._position: PositionOffer | None = None
-        self._positions: list[PositionOffer] = []
+        self._position: PositionCandidate | None = None
+        self._positions: list[PositionCandidate] = []
 
     def window(self, latest: Window) -> None:
         """A window of the standstill detector has ended.
@@ -154,11 +159,11 @@ class AlignmentEvidence:
         w, self._pending = self._pending, latest
         if w is None:
             return
-        if not self._at_rest or self.standing is None:
+        if not self._at_rest or self.standstill is None:
             start = w.end_ns - round(self._options.window_s * 1e9)
-            self.standing = Standing(start, w.end_ns)
+            self.standstill = Standstill(start, w.end_ns)
             self._at_rest = True
-        s = self.standing
+        s = self.standstill
         s.end_ns = w.end_ns
         s.seconds += self._options.window_s
         s.rate_sum += w.mean_rate * self._options.window_s
@@ -166,24 +171,24 @@ class AlignmentEvidence:
 
     def aids(self, aids: Sequence[Aid]) -> None:
         """A measurement has arrived, as the aids it stands for."""
-        self.witnesses.hear(aids)
-        offers = [offer for aid in aids for offer in aid.offers()]
-        height = next((o for o in offers if isinstance(o, HeightOffer)), None)
-        position: PositionOffer | None = None
-        velocity: VelocityOffer | None = None
-        for offer in offers:
-            match offer:
-                case PositionOffer(height_m=None, sd=(n, e, _)) if height is not None:
+        self.rest_evidence.hear(aids)
+        candidates = [candidate for aid in aids for candidate in aid.candidates()]
+        height = next((o for o in candidates if isinstance(o, HeightCandidate)), None)
+        position: PositionCandidate | None = None
+        velocity: VelocityCandidate | None = None
+        for candidate in candidates:
+            match candidate:
+                case PositionCandidate(height_m=None, sd=(n, e, _)) if height is not None:
                     sd = n, e, height.sd_m
-                    position = offer._replace(height_m=height.height_m, sd=sd)
-                case PositionOffer():
-                    position = offer
-                case VelocityOffer():
-                    velocity = offer
-                case HeadingOffer(how="compass"):
-                    self.compass = offer
-                case HeadingOffer():
-                    self.heading = offer
+                    position = candidate._replace(height_m=height.height_m, sd=sd)
+                case PositionCandidate():
+                    position = candidate
+                case VelocityCandidate():
+                    velocity = candidate
+                case HeadingCandidate(how="compass"):
+                    self.compass = candidate
+                case HeadingCandidate():
+                    self.heading = candidate
         if position is not None:
             insort(self._positions, position, key=lambda p: p.t_ns)
             del self._positions[:-MOST_POSITIONS]
@@ -201,24 +206,24 @@ class AlignmentEvidence:
         """True if the last windows were quiet."""
         return self._at_rest
 
-    def levelled(self) -> Standing | None:
+    def levelled(self) -> Standstill | None:
         """The standstill that the vehicle is in, once it is long enough to level by."""
-        s = self.standing
+        s = self.standstill
         if s is None or not self._at_rest or s.seconds < self._options.levelling_s:
             return None
         return s if self.rested(s, ANY_TIME_NS) else None
 
-    def rested(self, s: Standing, until_ns: int = 0) -> bool:
+    def rested(self, s: Standstill, until_ns: int = 0) -> bool:
         """True if no measured speed contradicts a standstill, up to its end or later; nor the way
         between positions, where no speed was measured."""
         end_ns = max(s.end_ns, until_ns)
-        seen = self.witnesses.measured(s.start_ns, end_ns)
+        seen = self.rest_evidence.measured(s.start_ns, end_ns)
         if math.isfinite(seen.sd):
             return not seen.contradicts
         slope, sd = self._way(s.start_ns, end_ns)
         return slope <= max(self._options.rest_speed_m_s, CONTRADICTION_SIGMAS * sd)
 
-    def confirmed_rest(self, s: Standing) -> bool:
+    def confirmed_rest(self, s: Standstill) -> bool:
         """True if a standstill that nothing contradicts was measured to be one."""
         if self.seen_at_rest(s):
             return True
@@ -236,9 +241,9 @@ class AlignmentEvidence:
                 trend = trend.with_one(Offset(n, e, max(p.sd[:2])), (p.t_ns - begin_ns) * 1e-9)
         return trend.slope
 
-    def seen_at_rest(self, s: Standing) -> bool:
+    def seen_at_rest(self, s: Standstill) -> bool:
         """True if speeds were measured in a standstill, and were zero."""
-        seen = self.witnesses.measured(s.start_ns, s.end_ns)
+        seen = self.rest_evidence.measured(s.start_ns, s.end_ns)
         return math.isfinite(seen.sd) and not seen.contradicts
 
     def doubted(self, why: str) -> str:
@@ -329,7 +334,7 @@ class AlignmentEvidence:
             return Place(None, np.array([lat, lon, 0.0]), sd, UNKNOWN_HEIGHT_SD_M)
         return Place(None, np.array([lat, lon, height]), sd, sd)
 
-    def place_of(self, p: PositionOffer, velocity: VelocityOffer | None = None) -> Place:
+    def place_of(self, p: PositionCandidate, velocity: VelocityCandidate | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
         height, sd_height = self._height_at(p)
         where = np.array([p.lat_rad, p.lon_rad, height])
@@ -346,7 +351,7 @@ class AlignmentEvidence:
             return self._saved.position, self._saved.sd_position_m
         return None
 
-    def _height_at(self, p: PositionOffer) -> tuple[float, float]:
+    def _height_at(self, p: PositionCandidate) -> tuple[float, float]:
         """Height (m) of a fix and one sigma; where it has none, that of the place that was told, as
         far as roads climb on the way from there; 0 where nothing has told any."""
         if p.height_m is not None:

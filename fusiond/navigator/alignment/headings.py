@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusiond.aiding.offers import HeadingOffer
+from fusiond.aiding.candidates import HeadingCandidate
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -42,29 +42,34 @@ REST_VELOCITY_SD = np.full(3, 0.1)
 
 
 def _at_standstill(
-    by: Basis, place: Place, yaw: float, sd: float, how: str, offer: HeadingOffer | None = None
+    by: Basis,
+    place: Place,
+    yaw: float,
+    sd: float,
+    how: str,
+    candidate: HeadingCandidate | None = None,
 ) -> Start | None:
-    standing = by.known.levelled()
-    if standing is None:
+    standstill = by.known.levelled()
+    if standstill is None:
         return None
     if sd > POOR_SD_RAD and ON_THE_WAY.intersection(by.options.heading):
         by.known.poor_claims[how] = reason("poor_heading", heading=how, sd=math.degrees(sd))
         return None
-    roll, pitch = level(standing.mean_force)
+    roll, pitch = level(standstill.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
     wide = sd > PLAIN_CLAIM_RAD
     start = build_start(
         by.model,
-        standing.end_ns,
+        standstill.end_ns,
         place,
         dcm,
         sd,
         np.zeros(3),
         REST_VELOCITY_SD,
         how,
-        bias=rest_bias(by.noise, standing, dcm, place[1][0], sd if wide else 0.0),
+        bias=rest_bias(by.noise, standstill, dcm, place[1][0], sd if wide else 0.0),
         levelled=Levelled(dcm),
-        heading=offer,
+        heading=candidate,
     )
     return turned_at_rest(by.model, start, place, dcm) if wide else start
 
@@ -109,30 +114,34 @@ def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """Compass candidate, while it is fresh, until the vehicle has shown it to be wrong."""
-    offer = by.known.compass
-    if offer is None or imu.latest_ns - offer.t_ns > HEADING_AGE_NS:
+    candidate = by.known.compass
+    if candidate is None or imu.latest_ns - candidate.t_ns > HEADING_AGE_NS:
         return None
-    start = _at_standstill(by, place, offer.yaw_rad, offer.sd_rad, COMPASS, offer)
+    start = _at_standstill(by, place, candidate.yaw_rad, candidate.sd_rad, COMPASS, candidate)
     return start and replace(start, confirmed=False)
 
 
 def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """The direction of the Earth's rate, once the standstill is long enough for it."""
-    standing = by.known.standing
-    if standing is None or standing.seconds < by.options.gyrocompass_s or not by.known.levelled():
+    standstill = by.known.standstill
+    if (
+        standstill is None
+        or standstill.seconds < by.options.gyrocompass_s
+        or not by.known.levelled()
+    ):
         return None
     lat = float(place[1][0])
     bias = math.hypot(by.noise.rate_bias_initial, by.noise.rate_bias_instability)
-    sd = gyrocompass_sd(lat, bias, by.noise.rate_noise, standing.seconds)
+    sd = gyrocompass_sd(lat, bias, by.noise.rate_noise, standstill.seconds)
     if sd > by.options.gyrocompass_max_sd_rad:
         return None
-    roll, pitch = level(standing.mean_force)
-    yaw = gyrocompass(standing.mean_rate, roll, pitch)
-    white = by.noise.rate_noise / math.sqrt(standing.seconds)
+    roll, pitch = level(standstill.mean_force)
+    yaw = gyrocompass(standstill.mean_rate, roll, pitch)
+    white = by.noise.rate_noise / math.sqrt(standstill.seconds)
     dcm = dcm_from_rpy(roll, pitch, yaw)
     return build_start(
         by.model,
-        standing.end_ns,
+        standstill.end_ns,
         place,
         dcm,
         white / (EARTH_RATE_RAD_S * math.cos(lat)),

@@ -26,7 +26,7 @@ smoothing of receivers moves tau* by 0.1 s.
 
 What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
 fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
-are published by (fusiond.estimators.reading).
+are published by (fusiond.estimators.published_state).
 
 Source: Wu and Pan (as motion); profile likelihood: Venzon, Moolgavkar, Applied Statistics 37
 (1988), 87; the offset in time as a parameter of alignment: Li, Mourikis, Online temporal
@@ -45,7 +45,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.estimators.base import gate_threshold
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
@@ -130,9 +130,11 @@ class _Heard:
     def epochs(self) -> list[Epoch]:
         """Its velocities, each with its position."""
         if self.found is None:
-            offers = [offer for aid in self.aids for offer in aid.offers()]
-            position = next((o for o in offers if isinstance(o, PositionOffer)), None)
-            self.found = [Epoch(o, position) for o in offers if isinstance(o, VelocityOffer)]
+            candidates = [candidate for aid in self.aids for candidate in aid.candidates()]
+            position = next((o for o in candidates if isinstance(o, PositionCandidate)), None)
+            self.found = [
+                Epoch(o, position) for o in candidates if isinstance(o, VelocityCandidate)
+            ]
         return self.found
 
 
@@ -343,7 +345,7 @@ class LatencySearch:
         receiver.suspect(Delay(max(0.0, late.seconds), late.sd), t_ns)
 
 
-def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer | None]:
+def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityCandidate], PositionCandidate | None]:
     """Velocities of one delay, and a position. What repeats the one before to the bit is no
     measurement, but of a vehicle that stands."""
     left = since_leap(epochs)

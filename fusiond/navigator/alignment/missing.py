@@ -98,7 +98,7 @@ def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
 
 def _rest(by: Basis, imu: ImuBuffer) -> list[str]:
     """Missing conditions of a rest for levelling."""
-    o, s = by.options, by.known.standing
+    o, s = by.options, by.known.standstill
     if s is not None:
         if s.seconds >= o.levelling_s:
             return []
@@ -145,7 +145,7 @@ def _of_source(source: str, by: Basis, imu: ImuBuffer, latitude: float) -> list[
 
 def _gyrocompass(by: Basis, latitude: float) -> list[str]:
     """Duration of the rest for gyrocompassing, or that standing does not help."""
-    o, n, s = by.options, by.noise, by.known.standing
+    o, n, s = by.options, by.noise, by.known.standstill
     bias = math.hypot(n.rate_bias_initial, n.rate_bias_instability)
     sd = gyrocompass_sd(latitude, bias, n.rate_noise, o.gyrocompass_s)
     if sd > o.gyrocompass_max_sd_rad:

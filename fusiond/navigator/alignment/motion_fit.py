@@ -44,7 +44,7 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.motion_descent import BIASES, FIRST, LATE, PRIORS, SOUGHT, descend
 from fusiond.navigation.rotation import dcm_from_rpy
-from fusiond.navigator.alignment.sensed_motion import Felt, Measured, Past, stretch
+from fusiond.navigator.alignment.sensed_motion import Measured, Past, Sensed, stretch
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Fit(NamedTuple):
 
 def fit(
     past: Past,
-    f: Felt,
+    f: Sensed,
     m: Measured,
     noise: ImuNoise,
     g: float,
@@ -89,7 +89,7 @@ def fit(
     asked = Asked(noise, g, yaw, prior, sd_late_s)
     here = Guess(dcm_from_rpy(0.0, 0.0, yaw), f.biases, 0.0, m.velocity[0])
     for part in _parts(m, rate):
-        begun = stretch(past, part.instants).felt(here.biases)
+        begun = stretch(past, part.instants).sensed(here.biases)
         here = _descend(begun, part, asked, here.since(part)).here
     found = _descend(f, m, asked, here.since(m))
     here, scale = found.here, np.array([1.0] * 9 + [sd_late_s])
@@ -146,7 +146,7 @@ def _parts(m: Measured, rate_sd: float) -> list[Measured]:
     return found
 
 
-def _descend(f: Felt, m: Measured, asked: Asked, here: Guess) -> Descent:
+def _descend(f: Sensed, m: Measured, asked: Asked, here: Guess) -> Descent:
     """By Gauss-Newton from a guess, begun at `f`."""
     of, rows = f.of, 3 * len(m.velocity) + PRIORS
     z, slopes, guess = np.empty(rows), np.empty((rows, SOUGHT)), here.packed()

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigation.distributions import median
 from fusiond.navigator.alignment.start import as_geodetic
 
@@ -50,8 +50,8 @@ SHOWING_M_S = 5.0
 class Epoch(NamedTuple):
     """A measurement's velocity and, where it has one, its position."""
 
-    velocity: VelocityOffer
-    position: PositionOffer | None
+    velocity: VelocityCandidate
+    position: PositionCandidate | None
 
 
 def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import MOUNTING, mounting
@@ -34,13 +34,13 @@ from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy, skew
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.evidence import FIXES_NS, Standing
+from fusiond.navigator.alignment.evidence import FIXES_NS, Standstill
 from fusiond.navigator.alignment.heading_bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
 from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
-from fusiond.navigator.constraints import GATE
+from fusiond.navigator.motion_constraints import GATE
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.timeline import MOST_WAITING
 
@@ -96,7 +96,7 @@ class Track:
         self._own_slip = not model.slots_of(MOUNTING) and bool(self._model.slots_of(MOUNTING))
         self._aids: list[Aid] = []
         self._bank: HeadingBank | None = None
-        self._left: Standing | None = None
+        self._left: Standstill | None = None
         self._begun_ns = 0
 
     def hear(self, aids: Sequence[Aid]) -> None:
@@ -125,7 +125,7 @@ class Track:
             self._bank = self._begin(by, imu, place, until_ns)
         bank = self._bank
         if bank is None:
-            self._forget(imu, by.known.standing)
+            self._forget(imu, by.known.standstill)
             return None
         if until_ns < bank.t_ns + PIECE_NS:
             return None
@@ -187,7 +187,7 @@ class Track:
         return HeadingBank(cells, begin_ns, fixes, self._options.max_reverse_m_s)
 
     def _from_rest(
-        self, by: Basis, imu: ImuBuffer, place: Place, left: Standing, there: Sequence[Aid]
+        self, by: Basis, imu: ImuBuffer, place: Place, left: Standstill, there: Sequence[Aid]
     ) -> list[Cell]:
         """Cells of a vehicle that has stood until `left` ended; fixes `there` tell the place."""
         place = place._replace(fix=None, sd=ANYWHERE_M)
@@ -248,7 +248,7 @@ class Track:
     def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:
         """Position (rad, rad, m) of a moving vehicle at an instant, and one sigma (m): where it was
         at the fix before, as far as it may have driven since, or about `where` it is now."""
-        fixes = [o for a in self._aids for o in a.offers() if isinstance(o, PositionOffer)]
+        fixes = [o for a in self._aids for o in a.candidates() if isinstance(o, PositionCandidate)]
         before = [o for o in fixes if o.t_ns <= t_ns]
         if not before:
             return where, ANYWHERE_M
@@ -268,10 +268,10 @@ class Track:
         ]
         return sorted([*due, *own], key=lambda a: (a.t_ns, a.source))
 
-    def _forget(self, imu: ImuBuffer, standing: Standing | None) -> None:
+    def _forget(self, imu: ImuBuffer, standstill: Standstill | None) -> None:
         """Drop measurements that no bank can use."""
         since = imu.latest_ns - 2 * LATE_NS
-        begin = since if standing is None else min(since, standing.start_ns)
+        begin = since if standstill is None else min(since, standstill.start_ns)
         old = [a for a in self._aids if a.t_ns < since]
         kept = [a for a in old if a.locates and a.t_ns >= begin][-MOST_AT_REST:]
         self._aids = kept + self._aids[len(old) :]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.offers import VelocityOffer
-from fusiond.navigation.felt import integrate_felt
+from fusiond.aiding.candidates import VelocityCandidate
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.preintegration import integrate_sensed
 from fusiond.navigator.alignment.start import velocity_of
 
 Array = NDArray[np.float64]
@@ -76,15 +76,15 @@ class Stretch(NamedTuple):
     t_s: Array
     means: Array
 
-    def felt(self, biases: Array) -> Felt:
+    def sensed(self, biases: Array) -> Sensed:
         """Less biases (6,) of force and rate."""
         k = len(self.counts)
         gained, turned, slopes = np.empty((k, 3)), np.empty((k, 3, 3)), np.empty((k, 3, 6))
-        integrate_felt(self.times, self.samples, biases, self.counts, gained, turned, slopes)
-        return Felt(self, gained, turned, slopes, biases)
+        integrate_sensed(self.times, self.samples, biases, self.counts, gained, turned, slopes)
+        return Sensed(self, gained, turned, slopes, biases)
 
 
-class Felt(NamedTuple):
+class Sensed(NamedTuple):
     """Integrals over a stretch from its first fix to each of k, with biases (6,) of force and rate
     taken off: gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the
     velocity by the biases (k, 3, 6)."""
@@ -115,7 +115,7 @@ def span_since(imu: ImuBuffer, t_ns: int) -> Span:
     return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
 
 
-def measured(fixes: Sequence[VelocityOffer], most: int) -> Measured:
+def measured(fixes: Sequence[VelocityCandidate], most: int) -> Measured:
     """Measurements of some fixes; `most` of them, evenly, where they are more, the last among
     them."""
     every = math.ceil(len(fixes) / most)
@@ -160,9 +160,9 @@ def stretch(past: Past, instants: NDArray[np.int64]) -> Stretch:
     return Stretch(times, past.samples[first:end], counts, t_s, _samples_at(past, instants))
 
 
-def felt(past: Past, instants: NDArray[np.int64], rate: Array) -> Felt:
+def sensed(past: Past, instants: NDArray[np.int64], rate: Array) -> Sensed:
     """Sensed motion from the first of instants (k,) to each, less a rate bias (3,)."""
-    return stretch(past, instants).felt(np.concatenate((np.zeros(3), rate)))
+    return stretch(past, instants).sensed(np.concatenate((np.zeros(3), rate)))
 
 
 def _samples_at(past: Past, instants: NDArray[np.int64]) -> Array:

@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.offers import HeadingOffer, Offer, PositionOffer, VelocityOffer
+from fusiond.aiding.candidates import (
+    Candidate,
+    HeadingCandidate,
+    PositionCandidate,
+    VelocityCandidate,
+)
 from fusiond.aiding.position import wander_of
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
@@ -52,7 +57,7 @@ class Place(NamedTuple):
     """The fix that a position came from, the position (rad, rad, m), one sigma (m) horizontally
     and of its height; a height that is not known is 0."""
 
-    fix: PositionOffer | None
+    fix: PositionCandidate | None
     where: Array
     sd: float
     sd_height: float
@@ -64,14 +69,14 @@ def as_geodetic(metres: Array, lat: float) -> Array:
     return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
 
 
-def velocity_of(offer: VelocityOffer) -> tuple[Array, Array]:
+def velocity_of(candidate: VelocityCandidate) -> tuple[Array, Array]:
     """Velocity NED (3,) and one sigma (3,). NMEA measures no vertical velocity: it is then 0, give
     or take what a road's slope makes of the speed."""
-    if len(offer.v_ned) == 3:
-        return np.array(offer.v_ned), np.full(3, max(offer.sd))
-    sd = max(offer.sd)
-    climb = math.hypot(sd, SLOPE_SD * math.hypot(*offer.v_ned))
-    return np.array([*offer.v_ned, 0.0]), np.array([sd, sd, climb])
+    if len(candidate.v_ned) == 3:
+        return np.array(candidate.v_ned), np.full(3, max(candidate.sd))
+    sd = max(candidate.sd)
+    climb = math.hypot(sd, SLOPE_SD * math.hypot(*candidate.v_ned))
+    return np.array([*candidate.v_ned, 0.0]), np.array([sd, sd, climb])
 
 
 class Levelled(NamedTuple):
@@ -95,7 +100,7 @@ class Fitted(NamedTuple):
 class Moves(NamedTuple):
     """A measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
 
-    offer: VelocityOffer
+    candidate: VelocityCandidate
     rate: Array
     acceleration: Array
 
@@ -118,7 +123,7 @@ class Start:
     how: str
     turns: bool = False
     contradicted: bool = False
-    used: tuple[Offer, ...] = ()
+    used: tuple[Candidate, ...] = ()
     confirmed: bool = True
 
     @property
@@ -148,7 +153,7 @@ def build_start(
     compassed: bool = False,
     unexplained: Array | None = None,
     moves: Moves | None = None,
-    heading: HeadingOffer | None = None,
+    heading: HeadingCandidate | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
@@ -184,7 +189,7 @@ def build_start(
             slot = model.parameters(9 + axis)[0]
             p[slot, slot] += float(unexplained[axis]) ** 2
     if fitted is not None:
-        time = model.slots_of(moves.offer.time) if moves is not None else []
+        time = model.slots_of(moves.candidate.time) if moves is not None else []
         _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2], time)
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
@@ -195,13 +200,13 @@ def build_start(
         _by_fix(model, by, fix, dcm, velocity)
     if moves is not None:
         _by_velocity(model, by, moves, dcm)
-    made_of = fix, moves.offer if moves is not None else None, heading
-    used = tuple(offer for offer in made_of if offer is not None)
+    made_of = fix, moves.candidate if moves is not None else None, heading
+    used = tuple(candidate for candidate in made_of if candidate is not None)
     confirmed = not how.endswith(BACKWARD)
     return Start(t_ns, nav, xi, by @ p @ by.T, how, used=used, confirmed=confirmed)
 
 
-def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
+def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
     """Heading error and what it shares with the device's: an innovation of 0
     (fusiond.aiding.compass) says phi_D = e - d dev; else the next readings would prove dev = 0."""
     shared = [
@@ -215,7 +220,7 @@ def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
         p[PHI + 2, slot] = p[slot, PHI + 2] = -rate * p[slot, slot]
 
 
-def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: Array) -> None:
+def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocity: Array) -> None:
     """Rows of the position in `by` (n, n): an innovation of 0 (fusiond.aiding.position) says
 
         dr = e + s db + w dc + v dtau + C dl - [C l x] phi,   e the fix's noise
@@ -239,11 +244,11 @@ def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
 
     dv = e + a dtau + C [w x] dl - (C (w x l)) x phi
     """
-    across = dcm @ np.cross(moves.rate, moves.offer.lever)
+    across = dcm @ np.cross(moves.rate, moves.candidate.lever)
     by[DV : DV + 3, PHI : PHI + 3] = -skew(across)
-    for slot in model.slots_of(moves.offer.time):
+    for slot in model.slots_of(moves.candidate.time):
         by[DV : DV + 3, slot] = moves.acceleration
-    for axis, slot in enumerate(model.slots_of(moves.offer.rest)):
+    for axis, slot in enumerate(model.slots_of(moves.candidate.rest)):
         by[DV : DV + 3, slot] = (dcm @ skew(moves.rate))[:, axis]
     by[~model.active] = 0.0
 

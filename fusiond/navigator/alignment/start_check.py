@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.witnesses import Witnesses
+from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.navigation.rotation import dcm_elements, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
 from fusiond.navigator.alignment.headings import CLAIMS
@@ -51,7 +51,7 @@ class StartCheck:
         return reason("not_confirmed_by_motion") if self._unproven else ""
 
     def refuted(
-        self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses, doubted: bool
+        self, t_ns: int, nav: Array, covariance: Array, measured: RestEvidence, doubted: bool
     ) -> tuple[str, str] | None:
         """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
         the start was wrong. `doubted`: it has not fitted the aids since."""

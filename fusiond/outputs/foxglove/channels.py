@@ -16,7 +16,7 @@ from math import pi, radians
 from typing import Any
 
 from fusiond.navigation.rotation import quaternion_from_rpy
-from fusiond.outputs.figures import known, usable
+from fusiond.outputs.derived_figures import known, usable
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.nav import NavMessage

@@ -15,8 +15,8 @@ from websockets.http11 import Request
 from websockets.protocol import OPEN
 from websockets.server import ServerProtocol
 
-from fusiond.outputs.asked import NotUnderstoodError, parsed
 from fusiond.outputs.foxglove.channels import CHANNELS, Channel
+from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 from fusiond.outputs.tcp import Client
 
 if TYPE_CHECKING:

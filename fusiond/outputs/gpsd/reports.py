@@ -14,7 +14,7 @@ from math import isfinite
 from typing import Any
 
 from fusiond.navigation.solution import Mode
-from fusiond.outputs.figures import TWO_SIDED_95, horizontal_rms_m, known, motion, usable
+from fusiond.outputs.derived_figures import TWO_SIDED_95, horizontal_rms_m, known, motion, usable
 from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from fusiond.outputs.asked import NotUnderstoodError, parsed
+from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 
 MOST_BYTES = 10240
 """Longest line of the protocol (GPS_JSON_RESPONSE_MAX of gpsd 3.22)."""

@@ -15,7 +15,7 @@ from fusiond.outputs.base import Surroundings
 from fusiond.outputs.gpsd import reports
 from fusiond.outputs.gpsd.reports import Report, encoded
 from fusiond.outputs.gpsd.requests import Malformed, Request, RequestReader
-from fusiond.outputs.latest import Latest
+from fusiond.outputs.latest_value import Latest
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.health import HealthMessage, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from fusiond.outputs.figures import horizontal_rms_m, usable
+from fusiond.outputs.derived_figures import horizontal_rms_m, usable
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
 

@@ -172,8 +172,8 @@ def _spare(car: Scenario, truth: Truth, rng: np.random.Generator) -> Array:
     configuration allows."""
     spare = car.imu.spare
     assert spare is not None
-    askew = np.add(spare.mounting_deg, rng.normal(0.0, spare.mounting_sd_deg, 3))
-    own = {"axes": spare.axes, "mounting_deg": tuple(askew.tolist())}
+    misalignment = np.add(spare.mounting_deg, rng.normal(0.0, spare.mounting_sd_deg, 3))
+    own = {"axes": spare.axes, "mounting_deg": tuple(misalignment.tolist())}
     sits = replace(car, imu=car.imu.model_copy(update=own))
     said = sits.imu_output(truth, rng)
     return np.hstack((said.gyro, said.accel))

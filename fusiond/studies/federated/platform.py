@@ -25,7 +25,7 @@ from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import metres_to_geodetic

@@ -31,7 +31,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.filters import federated
+from fusiond.navigator.assembly import federated
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import imu_output
@@ -39,7 +39,7 @@ from fusiond.simulation.trajectories import drive
 from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
 from fusiond.studies.monte_carlo import on_processes
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
-from fusiond.studies.trusting import Trusting
+from fusiond.studies.undiagnosed_timeline import Trusting
 
 Array = NDArray[np.float64]
 FaultKind = Literal["", "step", "drift", "frozen"]

@@ -36,9 +36,9 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.federated.reset import ResetFilter
-from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.catalogue import make_model
@@ -117,7 +117,7 @@ def filters() -> dict[str, Callable[[Model], Estimator]]:
     """Every filter of the study by its name in the result."""
     return {
         "multiscale": lambda m: MultiscaleEstimator(m, IMU.gap_s, 2),
-        "federated": lambda m: StandingFilter(m, IMU.gap_s, LOCAL_FILTERS, NO_RESET),
+        "federated": lambda m: NoResetFilter(m, IMU.gap_s, LOCAL_FILTERS, NO_RESET),
         "federated_fusion_reset": lambda m: ResetFilter(m, IMU.gap_s, LOCAL_FILTERS, FUSION_RESET),
         "centralised": lambda m: KalmanEstimator(m, IMU.gap_s),
         "multiscale_n1": lambda m: MultiscaleEstimator(m, IMU.gap_s, 1),

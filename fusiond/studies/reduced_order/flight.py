@@ -121,8 +121,8 @@ def model(
 def filters(sar_sd: float = SAR_SD_RAD, sar_tau_s: float = math.inf) -> dict[str, Model]:
     """The filters compared; the first describes the truth.
 
-    `17` has the accelerometer biases as white noise (`fusiond.models.left_out`), `17_bare` takes no
-    notice of them.
+    `17` has the accelerometer biases as white noise (`fusiond.models.missing_states`), `17_bare`
+    takes no notice of them.
     """
     return {
         "23": model("ins23", sar_sd, sar_tau_s),

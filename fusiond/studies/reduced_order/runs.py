@@ -29,7 +29,7 @@ from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
 from fusiond.studies.monte_carlo import on_processes
 from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.reduced_order import flight
-from fusiond.studies.trusting import Trusting
+from fusiond.studies.undiagnosed_timeline import Trusting
 
 Array = NDArray[np.float64]
 

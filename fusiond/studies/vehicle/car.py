@@ -54,8 +54,8 @@ from fusiond.navigation.rotation import (
     rotation_vector_to_quaternion,
     rpy_from_dcm,
 )
-from fusiond.navigator.constraints import GATE
 from fusiond.navigator.intake import Intake
+from fusiond.navigator.motion_constraints import GATE
 from fusiond.simulation.barometer import Barometer, BarometerOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov

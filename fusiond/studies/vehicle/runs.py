@@ -16,8 +16,8 @@ from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.constraints import vehicle_blocks
 from fusiond.navigator.intake import Intake
+from fusiond.navigator.motion_constraints import vehicle_blocks
 from fusiond.simulation.trajectories import Path, Profile, drive
 from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.vehicle.car import RATE_HZ, Car, draw_car
@@ -97,8 +97,8 @@ def _drive(
     config: Config, car: Car, estimator: KalmanEstimator, seconds: float, known: bool
 ) -> Counter[str]:
     times = np.rint(np.arange(1, len(car.samples) + 1) * 1e9 / RATE_HZ).astype(np.int64)
-    askew = config.imu.misalignment_deg * DEG
-    crosstalk = Crosstalk(1.0 / RATE_HZ, askew) if askew and known else None
+    misalignment = config.imu.misalignment_deg * DEG
+    crosstalk = Crosstalk(1.0 / RATE_HZ, misalignment) if misalignment and known else None
     buffer = ImuBuffer(
         RATE_HZ, seconds + 1.0, np.eye(3), 0.0, config.imu.gap_s, crosstalk=crosstalk
     )

@@ -28,12 +28,12 @@ from fusiond.studies.vehicle.runs import Run, run_once
 
 DEFAULT_RUNS = 60
 TAIL = 0.005
-SQUARE, ASKEW = {"misalignment_deg": 0.0}, {"misalignment_deg": 0.2}
+SQUARE, MISALIGNED = {"misalignment_deg": 0.0}, {"misalignment_deg": 0.2}
 CASES: dict[str, tuple[str, dict[str, float], bool]] = {
     "shown": ("shown", SQUARE, True),
     "hidden": ("hidden", SQUARE, True),
-    "askew": ("shown", ASKEW, True),
-    "askew, no noise for it": ("shown", ASKEW, False),
+    "askew": ("shown", MISALIGNED, True),
+    "askew, no noise for it": ("shown", MISALIGNED, False),
 }
 """Path, IMU, and whether the filter has the noise of axes out of square."""
 

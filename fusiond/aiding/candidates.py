@@ -1,0 +1,83 @@
+"""Initialisation candidates of measurements: position, velocity, speed, heading, height.
+
+Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
+from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
+of errors that all measurements of the device share, as of its aids; `bias_share` is what part of a
+state of `bias` there is in each axis, `wander_m` how many metres of `wander` north and east.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+Vector3 = tuple[float, float, float]
+# Sigma (m/s) and time (s) of a speed that does not drift.
+STEADY = (0.0, 1.0)
+
+
+class PositionCandidate(NamedTuple):
+    """Geodetic position (rad, rad, m above the ellipsoid), `sd` (m) north, east, down; without a
+    height where it is None."""
+
+    t_ns: int
+    lat_rad: float
+    lon_rad: float
+    height_m: float | None
+    sd: Vector3
+    lever: Vector3
+    bias: tuple[str, ...] = ()
+    time: str = ""
+    rest: str = ""
+    bias_share: Vector3 = (1.0, 1.0, 1.0)
+    wander: str = ""
+    wander_m: float = 0.0
+
+
+class VelocityCandidate(NamedTuple):
+    """Velocity (m/s) with `sd`: north, east, and down where it was measured."""
+
+    t_ns: int
+    v_ned: tuple[float, ...]
+    sd: tuple[float, ...]
+    lever: Vector3 = (0.0, 0.0, 0.0)
+    time: str = ""
+    rest: str = ""
+
+
+class SpeedCandidate(NamedTuple):
+    """Speed (m/s) along the forward axis, or its amount, as a wheel says it. `rounding_sd_m_s` is
+    the part of `sd_m_s` that is the same as long as the speed is: no mean takes it away. Beside
+    `sd_m_s` it drifts, as a process of first order of that sigma (m/s) and time (s)."""
+
+    t_ns: int
+    speed_m_s: float
+    sd_m_s: float
+    rounding_sd_m_s: float = 0.0
+    drifts: tuple[float, float] = STEADY
+
+
+class HeadingCandidate(NamedTuple):
+    """True heading (rad) of the body's forward axis, as `how` measured it.
+
+    `own_sd_rad` is the part of sigma that is of this measurement alone, `shared` the rest: blocks
+    of the model, with what each of their states turns the heading by."""
+
+    t_ns: int
+    yaw_rad: float
+    sd_rad: float
+    how: str = "dual antenna"
+    own_sd_rad: float = math.nan
+    shared: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+class HeightCandidate(NamedTuple):
+    """Ellipsoidal height (m), for a position of the same measurement that has none."""
+
+    height_m: float
+    sd_m: float
+
+
+Candidate = (
+    PositionCandidate | VelocityCandidate | SpeedCandidate | HeadingCandidate | HeightCandidate
+)

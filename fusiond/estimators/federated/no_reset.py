@@ -1,0 +1,261 @@
+r"""Federated filter whose local filters go on after a fusion: `no_reset` and `rescale`.
+
+Only the published covariance B and the transition matrix Phi are propagated through the samples; at
+an update the local filters, common to which is all the process noise but its share, follow:
+
+    P_i <- Phi (P_i - B / beta_i) Phi^T + B' / beta_i,   x_i <- Phi x_i
+
+Gate and innovation test are the local filter's own in `no_reset`; in `rescale`, where it has given
+most of what it knows away, the master's.
+
+A local filter whose aids do not observe some states grows without bound in them. Beyond `MOST`
+times the best variance it gets `LITTLE` of what all others know, and all others give it up: the sum
+stays. `no_reset` keeps local filters apart but for this part in a million.
+
+A local filter that is taken back gets x_g and P_g / beta_i, and the others give that share up: P_j
+<- P_j / (1 - beta_i).
+
+Source: Carlson, IEEE Trans. AES 26 (1990), 517.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation
+from fusiond.estimators.federated.bank import (
+    carry,
+    cholesky,
+    difference,
+    inverse_of_factor,
+    publish,
+)
+from fusiond.estimators.federated.filter import FederatedFilter
+from fusiond.estimators.federated.isolation import DIFFERENCE, Record
+from fusiond.estimators.federated.options import FederatedOptions
+from fusiond.models.model import Model
+
+Array = NDArray[np.float64]
+
+# 1e-6 of the information changes no digit that counts; sums lose half of a double's digits at 1e8.
+LITTLE = 1e-6
+MOST = 1e8
+
+
+class _Own(NamedTuple):
+    bank: Array
+    dxs: Array
+    before: Array
+    phi: Array
+    factors: Array
+    shares: Array
+    records: tuple[Record, ...]
+
+
+class NoResetFilter(FederatedFilter):
+    """`no_reset` and `rescale` (`fusiond.estimators.base.Estimator`).
+
+    Bank: 0 ... N - 1 the local filters, N the master's own part in `rescale`.
+    """
+
+    carries_transition = True
+
+    def __init__(
+        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
+    ) -> None:
+        self._rescales = options.mode == "rescale"
+        self._bank_shares: Array = np.ones(len(names) + self._rescales)
+        super().__init__(model, gap_s, names, options, len(names) + self._rescales)
+        self._unit: Array = np.eye(model.width)
+        self._before: Array = np.zeros((model.width, model.width))
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        super().initialise(t_ns, sample, nav, xi, covariance)
+        self._bank[:] = self._covs[0] / self._bank_shares[:, None, None]
+        self._bank_dxs[:] = 0.0
+        self._mark()
+
+    def local(self, name: str) -> tuple[Array, Array]:
+        """Error estimate (n,) and covariance (n, n) of a local filter, relative to the navigation
+        state that all share; copies."""
+        n, i = self.model.size, self.names.index(name)
+        bank, dxs = self._bank.copy(), self._bank_dxs.copy()
+        carry(bank, dxs, self._bank_shares, self._phi, self._before, self._covs[0])
+        return dxs[i], bank[i, :n, :n]
+
+    # ------------------------------------------------------------------ the bank in time
+
+    def _settle(self) -> None:
+        """Bring the bank to the present."""
+        carry(
+            self._bank,
+            self._bank_dxs,
+            self._bank_shares,
+            self._phi,
+            self._before,
+            self._covs[0],
+        )
+        self._mark()
+
+    def _mark(self) -> None:
+        """The bank holds at the present."""
+        self._phi[:] = self._unit
+        self._before[:] = self._covs[0]
+
+    def _members(self) -> list[int]:
+        """Filters of the bank that put their information in."""
+        return self._believed() + ([len(self.names)] if self._rescales else [])
+
+    # ------------------------------------------------------------------ update
+
+    def _bring_up(self) -> None:
+        self._settle()
+
+    def _judge(self, local: int | None) -> tuple[Array, Array]:
+        if local is None or self._rescales:
+            return self._covs[0], self._dxs[0]
+        return self._bank[local], self._bank_dxs[local]
+
+    def _kept(self) -> list[tuple[Array, float]]:
+        bank = zip(self._bank, self._bank_shares.tolist(), strict=True)
+        return [(self._covs[0], 1.0), *bank]
+
+    def _fold(self, local: int | None, i: Innovation) -> str:
+        if local is None:
+            for k in self._members():
+                share = float(self._bank_shares[k])
+                self._fuse_into(self._bank[k], self._bank_dxs[k], i, share)
+        else:
+            self._fuse_into(self._bank[local], self._bank_dxs[local], i)
+            self._faults.heard(local, self.t_ns)
+        return self._fuse_all(local)
+
+    def _fuse_all(self, updated: int | None) -> str:
+        """Fuse, compare the local filter that was updated, publish; the outcome's name."""
+        if not self._weigh_and_combine():
+            return "not_positive_definite"
+        if updated is not None and self.options.fault_detection:
+            worst = self._worst(updated)
+            if worst is not None and self._isolate(worst, DIFFERENCE):
+                return "isolated" if worst == updated else "fused"
+        self._take_over(updated)
+        return "fused"
+
+    def _weigh_and_combine(self) -> bool:
+        self._weight[:] = 0.0
+        self._weight[self._members()] = 1.0
+        return self._combine()
+
+    def _worst(self, updated: int) -> int | None:
+        """The local filter that stands out most, if the one just updated stands out at all."""
+        believed = self._believed()
+        own = self._difference(updated)
+        if self._faults.worst(dict.fromkeys(believed, own), self._tested) is None:
+            return None
+        return self._faults.worst({i: self._difference(i) for i in believed}, self._tested)
+
+    def _difference(self, k: int) -> float:
+        return difference(
+            self._bank[k],
+            self._bank_dxs[k],
+            self._order,
+            self._infos,
+            self._vectors,
+            self._scale,
+            k,
+            self._tested,
+        )
+
+    def _take_over(self, updated: int | None) -> None:
+        """Publish what was fused; local filters as the mode says."""
+        publish(self._covs[0], self._dxs[0], self._order, self._fused, self._estimate)
+        if self._rescales and updated is not None:
+            self._hand_over(updated)
+        if self._trace.max() > MOST:
+            for k in np.flatnonzero(self._trace[: len(self.names)] > MOST).tolist():
+                self._bound(k)
+        self._mark()
+        if self.options.adaptive:
+            self._adapt(self._trace[: len(self.names)])
+        self._feed_back_published()
+
+    def _hand_over(self, k: int) -> None:
+        """Filter k gives what it does not retain to the master's own estimate, the last one."""
+        kept = self.options.retained
+        for part in (self._infos, self._vectors):
+            part[-2] += (1.0 - kept) * part[k]
+            part[k] *= kept
+        self._set(len(self.names))
+        self._bank[k] /= kept
+
+    def _bound(self, k: int) -> None:
+        """Give filter k a little of what all others know, and let these give it up."""
+        for part in (self._infos, self._vectors):
+            part[k] += LITTLE * (part[-1] - part[k])
+        self._set(k)
+        for other in self._members():
+            if other != k:
+                self._bank[other] /= 1.0 - LITTLE
+
+    def _set(self, k: int) -> None:
+        """Write filter k of the bank from its scaled information."""
+        factor, p = self._infos[k].copy(), np.empty_like(self._infos[k])
+        if not cholesky(factor):
+            return
+        inverse_of_factor(factor, p)
+        x = p @ self._vectors[k] * self._scale
+        p *= np.outer(self._scale, self._scale)
+        publish(self._bank[k], self._bank_dxs[k], self._order, p, x)
+
+    def _share_out(self, parts: Array) -> None:
+        super()._share_out(parts)
+        self._bank_shares[: len(self.names)] = self._factors
+        if self._rescales:
+            self._bank_shares[:-1] *= 1.0 - self.options.master_share
+            self._bank_shares[-1] = self.options.master_share
+
+    # ------------------------------------------------------------------ faults, feedback, snapshots
+
+    def _leave_out(self, local: int) -> None:
+        if self._weigh_and_combine():
+            self._take_over(None)
+        self._bank[local] = self._covs[0]
+        self._bank_dxs[local] = self._dxs[0]
+
+    def _take_back(self, local: int) -> None:
+        self._share_out(self._nominal)
+        share = float(self._bank_shares[local])
+        for other in self._members():
+            self._bank[other] /= 1.0 - share
+        self._bank[local] = self._covs[0] / share
+        self._bank_dxs[local] = self._dxs[0]
+
+    def _shift(self, x: Array) -> None:
+        self._bank_dxs -= x
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        self._settle()
+        super().release()
+
+    def _own_snapshot(self) -> object:
+        return _Own(
+            self._bank.copy(),
+            self._bank_dxs.copy(),
+            self._before.copy(),
+            self._phi.copy(),
+            self._factors.copy(),
+            self._bank_shares.copy(),
+            tuple(self._faults.records),
+        )
+
+    def _own_restore(self, extra: object) -> None:
+        assert isinstance(extra, _Own)
+        self._bank[:], self._bank_dxs[:] = extra.bank, extra.dxs
+        self._before[:], self._phi[:] = extra.before, extra.phi
+        self._faults.records = list(extra.records)
+        self._factors[:], self._bank_shares[:] = extra.factors, extra.shares

@@ -1,0 +1,228 @@
+r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock or by its own.
+
+A receiver defines the time that others label a solution with. Where a filter estimates by how much
+tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it
+publishes for t is
+
+    p + v tau,   v + a tau,   q (x) exp(w tau)
+    var(p_i) = P_rr - 2 v_i P_rt + v_i^2 P_tt,   var(v_i) = P_vv - 2 a_i P_vt + a_i^2 P_tt
+    cov(phi) = P_pp + u P_tp + P_pt u^T + u u^T P_tt,   u = C_nb w
+
+P_tt is of tau's error, true minus estimate as of all parameters; that of p, v and phi is as
+fusiond.navigation.error_model has it. Fixes measure p and v: there the offset's own sigma cancels.
+Nothing measures the attitude by the receiver's clock, and in a bend w times the sigma of tau can be
+the most of what is unknown of the heading. a is smoothed.
+
+By a receiver whose fixes have shown to be late nobody sets a clock. What is published is then for
+the filter's own t, and tau is by how much that clock, the IMU's, is off: nothing estimates it, so
+it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
+clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
+
+What hypotheses of a fault leave open, as they are weighed, is added to it: variances (9,) that are
+no part of P (fusiond.estimators.fault_odds).
+
+Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
+its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
+over: nothing says how they sit against the nominal ones beyond `axes_sd_rad`, about each axis, and
+cov(phi) grows by its square. The best turn to axes of which each pair of angles is off by m is off
+by m / sqrt(2); what a drive's bends make of the rest is as much.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
+from fusiond.navigation.rotation import rotate_quaternion
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    LON,
+    NAV_SIZE,
+    Q0,
+    STEP_DCM,
+    STEP_RATE_B,
+    STEP_SMOOTH_N,
+    VN,
+)
+
+Array = NDArray[np.float64]
+
+WIDER = 9
+"""Variances of `widen`."""
+ENTRIES, MOVING = 22, 12
+"""Numbers of `entries` and of `moving`."""
+
+
+class Published(NamedTuple):
+    """Axes and clock of publication: the parameter that is the offset of the receiver's clock, or
+    -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what the unit
+    in use is turned by against that of which the attitude is published."""
+
+    time_slot: int
+    clock_sd_s: float = 0.0
+    axes_sd_rad: float = 0.0
+
+
+@compiled("f8(f8[::1], f8[::1], i8)", forceinline=True)
+def _acceleration(nav: Array, step: Array, axis: int) -> float:
+    """Smoothed, m/s^2, along north, east or down."""
+    force: float = step[STEP_SMOOTH_N + axis]
+    return force + gravity(nav[LAT], nav[HEIGHT]) if axis == 2 else force
+
+
+@compiled("f8(f8[::1], i8)", forceinline=True)
+def _turning(step: Array, axis: int) -> float:
+    """Rate of the body, rad/s, about north, east or down."""
+    total = 0.0
+    for j in range(3):
+        total += step[STEP_DCM + 3 * axis + j] * step[STEP_RATE_B + j]
+    return total
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], i8, f8[::1])")
+def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) -> None:
+    """Write `out` (10,): `nav` by the receiver's clock, whose offset is parameter `time_slot` (-1:
+    none)."""
+    for j in range(NAV_SIZE):
+        out[j] = nav[j]
+    if time_slot < 0:
+        return
+    tau = xi[time_slot]
+    lat, height = nav[LAT], nav[HEIGHT]
+    out[LAT] += nav[VN] * tau / (meridian_radius(lat) + height)
+    out[LON] += nav[VN + 1] * tau / ((transverse_radius(lat) + height) * math.cos(lat))
+    out[HEIGHT] -= nav[VN + 2] * tau
+    for j in range(3):
+        out[VN + j] += _acceleration(nav, step, j) * tau
+    rotate_quaternion(
+        out[Q0:],
+        step[STEP_RATE_B] * tau,
+        step[STEP_RATE_B + 1] * tau,
+        step[STEP_RATE_B + 2] * tau,
+        False,
+    )
+
+
+@compiled("void(f8[::1], i8, i8, f8, f8[::1])", forceinline=True)
+def entries(cov: Array, width: int, time_slot: int, clock_sd_s: float, out: Array) -> None:
+    """Write `out` (22,): of P, flat and of `width` rows, what sigmas are made of. Variances of
+    position and velocity (n, e, d), of phi, its covariances (ne, nd, ed), those of position,
+    velocity and phi with the clock of `Published`, and its variance."""
+    for i in range(3):
+        out[i], out[3 + i] = cov[(6 + i) * (width + 1)], cov[(3 + i) * (width + 1)]
+        out[6 + i] = cov[i * (width + 1)]
+        for j in range(3):
+            row = (6, 3, 0)[j] + i
+            out[12 + 3 * j + i] = cov[row * width + time_slot] if time_slot >= 0 else 0.0
+    out[9], out[10], out[11] = cov[1], cov[2], cov[width + 2]
+    out[21] = cov[time_slot * (width + 1)] if time_slot >= 0 else clock_sd_s * clock_sd_s
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1])", forceinline=True)
+def moving(nav: Array, step: Array, out: Array) -> None:
+    """Write `out` (12,): velocity, acceleration and turn (n, e, d) of nav (10,) and its last step
+    (28,), sine of the pitch, cosine and sine of the yaw."""
+    for i in range(3):
+        out[i], out[3 + i], out[6 + i] = nav[VN + i], _acceleration(nav, step, i), _turning(step, i)
+    out[9] = -step[STEP_DCM + 6]
+    cp = math.sqrt(max(1e-12, 1.0 - out[9] * out[9]))
+    out[10], out[11] = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
+
+
+@compiled("void(f8[::1], f8[::1], f8, f8[::1])", forceinline=True)
+def sigmas_of(p: Array, motion: Array, axes_sd_rad: float, out: Array) -> None:
+    """Write one sigma (9,) as `sigmas` does, of `entries` (22,) and of what is `moving` (12,)."""
+    tt = p[21]
+    for i in range(3):
+        v, a = motion[i], motion[3 + i]
+        out[i] = math.sqrt(max(0.0, p[i] + v * (v * tt - 2.0 * p[12 + i])))
+        out[3 + i] = math.sqrt(max(0.0, p[3 + i] + a * (a * tt - 2.0 * p[15 + i])))
+    misalignment = axes_sd_rad * axes_sd_rad
+    u0, u1, u2 = motion[6], motion[7], motion[8]
+    t0, t1, t2 = p[18], p[19], p[20]
+    a = p[6] + misalignment + u0 * (u0 * tt + 2.0 * t0)
+    b = p[7] + misalignment + u1 * (u1 * tt + 2.0 * t1)
+    c = p[8] + misalignment + u2 * (u2 * tt + 2.0 * t2)
+    d = p[9] + u0 * (u1 * tt + t1) + u1 * t0
+    e = p[10] + u0 * (u2 * tt + t2) + u2 * t0
+    f = p[11] + u1 * (u2 * tt + t2) + u2 * t1
+    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
+    # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
+    sp, cy, sy = motion[9], motion[10], motion[11]
+    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
+    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
+    cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
+    tangent = sp / cp
+    out[6] = math.sqrt(max(0.0, along)) / cp
+    out[7] = math.sqrt(max(0.0, cross))
+    out[8] = math.sqrt(max(0.0, tangent * tangent * along + c + 2.0 * tangent * (cy * e + sy * f)))
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])", allocates=True)
+def sigmas(
+    cov: Array,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
+    out: Array,
+) -> None:
+    """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
+
+    By the clock and the axes of `Published`. Roll, pitch and yaw follow from phi by Euler
+    kinematics, with C_nb as `step` (28,) holds it.
+    """
+    p, motion = np.empty(ENTRIES), np.empty(MOVING)
+    entries(cov.reshape(cov.size), cov.shape[1], time_slot, clock_sd_s, p)
+    moving(nav, step, motion)
+    sigmas_of(p, motion, axes_sd_rad, out)
+
+
+@compiled("void(f8[::1], f8[::1])", forceinline=True)
+def widen(wider: Array, out: Array) -> None:
+    """`out` (9,), sigmas as of `sigmas`, with the variances `wider` (9,) added."""
+    for i in range(9):
+        if wider[i] > 0.0:
+            out[i] = math.sqrt(out[i] * out[i] + wider[i])
+
+
+@compiled("f8(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])", allocates=True)
+def speed_sigma(
+    cov: Array,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
+    wider: Array,
+) -> float:
+    """One sigma of the horizontal velocity, of `sigmas` that are `wider`."""
+    out = np.empty(9)
+    sigmas(cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
+    widen(wider, out)
+    return math.hypot(out[3], out[4])
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1])")
+def opened_variances(opened: Array, step: Array, out: Array) -> None:
+    """Write `out` (9,), as `sigmas` squared, of what is open of attitude, velocity and position (9,
+    9), with C_nb as `step` (28,) holds it."""
+    for i in range(3):
+        out[i], out[3 + i] = opened[6 + i, 6 + i], opened[3 + i, 3 + i]
+    sp = -step[STEP_DCM + 6]
+    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
+    cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
+    a, b, d = opened[0, 0], opened[1, 1], opened[0, 1]
+    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
+    tangent = sp / cp
+    out[6] = along / (cp * cp)
+    out[7] = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
+    across = cy * opened[0, 2] + sy * opened[1, 2]
+    out[8] = tangent * tangent * along + opened[2, 2] + 2.0 * tangent * across

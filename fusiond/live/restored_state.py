@@ -1,0 +1,39 @@
+"""Data loaded from earlier runs: a replay starts from the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter
+
+from fusiond.live.chain import Chain
+from fusiond.live.warm_keeper import KeptState
+from fusiond.navigator.saved_calibration import SavedCalibration
+from fusiond.navigator.saved_state import SavedState
+from fusiond.navigator.warm_start import WarmStart
+
+
+@dataclass(frozen=True, slots=True)
+class RestoredState:
+    """None where there was nothing that could be used."""
+
+    saved: SavedState | None = None
+    warm: KeptState | None = None
+    calibration: SavedCalibration | None = None
+    messages: str | None = None
+    """As `fusiond.live.stored_messages` has them in JSON."""
+
+    def offer(self, chain: Chain) -> None:
+        """Let a chain that was made with `saved` go on from the rest. Raises `DamagedStateError`
+        for a state of another model."""
+        chain.navigator.calibration = self.calibration
+        if self.messages is not None:
+            from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
+
+            chain.messaging.resume(KEPT_MESSAGES.validate_json(self.messages))
+        if self.warm is not None:
+            chain.navigator.warm = WarmStart(self.warm.navigation, chain.navigator.model)
+            chain.clock.resume(self.warm.utc)
+
+
+RESTORED_STATE = TypeAdapter(RestoredState)

@@ -1,0 +1,200 @@
+"""The door of the IMU's samples: refuses what cannot be a measurement, and says when it is over.
+
+What is refused leaves a gap, which the filter bridges with noise for what the vehicle may have
+done. A gap that leaves more than a linear filter can bear, and an axis that is dead, end what was
+known: alignment begins anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.velocity import CORNER_RAD_S
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_range
+from fusiond.navigation.distributions import median
+from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
+from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
+from fusiond.navigator.imu_unit_check import other_unit
+from fusiond.navigator.reasons import reason
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+# A yaw error whose sine is wrong by 3 %, so that an error state still means what it says, at the
+# rate of a street corner. The mean of a drive, by which sigma grows, is half of that: a gap of 3 s
+# in a bend left errors of 7.7 sigma. That makes 2.2 s.
+BEARABLE_YAW_RAD = math.radians(25.0)
+BEARABLE_GAP_S = BEARABLE_YAW_RAD / CORNER_RAD_S
+# Good samples that end a trouble: twice what it takes to see that an axis is dead.
+SOUND_NS = 2_000_000_000
+
+TEXTS = {
+    "not_finite": "samples that are no numbers",
+    "out_of_range": "samples beyond any sensor's range",
+    "saturated": "samples at full scale",
+    "repeated": "the same sample again and again",
+    "no_gravity": "no specific force: free fall, or accelerations in another unit",
+    "spike": "samples that no vehicle can follow",
+    "stamp_ahead": "stamps ahead of those that follow",
+    "time": "stamps that go back",
+    "axis_dead": "one axis stands still while the others move",
+}
+
+
+class Run(NamedTuple):
+    """Samples (m,) ns, (m, 6) in order; `ends` says why nothing before them counts any more."""
+
+    times: Stamps
+    samples: Array
+    ends: str = ""
+
+
+@dataclass(slots=True)
+class _Trouble:
+    """Refusals of one name: the first and last stamp (ns), and how many."""
+
+    first_ns: int
+    last_ns: int
+    count: int = 0
+
+
+class ImuScreening:
+    """Admits samples; `on_event(code, text)` hears of each trouble once, and of its end."""
+
+    def __init__(self, config: Imu, keep_s: float, on_event: Callable[[str, str], None]) -> None:
+        self._config, self._event = config, on_event
+        self._check = ImuCheck(config.rate_hz, *imu_range(config))
+        self._most_s = min(BEARABLE_GAP_S, keep_s)
+        self._latest_ns: int | None = None
+        self._newest: Stamps = np.zeros(1, dtype=np.int64)
+        self._troubles: dict[str, _Trouble] = {}
+
+    def silence(self, silent_s: float | None) -> str:
+        """Text on a silent IMU; None: nothing that counts."""
+        last = max(self._troubles.items(), key=lambda t: t[1].last_ns, default=None)
+        why = "" if last is None else f": {TEXTS[last[0]]}"
+        if silent_s is None:
+            return reason("no_imu") + why
+        return reason("imu_silent", seconds=silent_s) + why
+
+    def restarts(self, imu: ImuBuffer) -> bool:
+        """True if stamps went back for good; then the next may have any."""
+        stuck_s = imu.backward_in_a_row / self._config.rate_hz
+        if stuck_s <= self._config.gap_s:
+            return False
+        # A clock set back: nothing would be taken until it is made up.
+        text = f"IMU stamps went back {stuck_s:.1f} s ago: aligning again"
+        self._trouble("time", self._newest, imu.backward_in_a_row, text)
+        self._check.restart()
+        self._latest_ns = None
+        return True
+
+    def change(self) -> None:
+        """Reset for another unit: what was seen of the first says nothing of it."""
+        self._check.restart()
+        self._troubles.clear()
+
+    def admit(
+        self, times: Stamps, samples: Array, imu: ImuBuffer, navigating: bool
+    ) -> Iterator[Run]:
+        """Samples to append to `imu`, in runs between gaps that cannot be borne.
+
+        Refusals are counted in `imu.counters`. Before navigation nothing is known of what the
+        vehicle did in a gap: any beyond `gap_s` ends what the alignment has collected.
+        """
+        if len(times):
+            self._newest = times[-1:]
+        if not all_sound(samples):
+            good = sound(samples)
+            unit = _unit(samples[~good])
+            for name, count in imu.refuse(samples[~good]).items():
+                self._trouble(name, times[~good], count, TEXTS[name] + unit)
+            times, samples = times[good], samples[good]
+        checked = self._check.feed(times, samples, imu.hold_ns)
+        times, samples = checked.times, checked.samples
+        if self._check.refused:
+            ends = self._refuse(checked, imu)
+            taken = checked.codes == TAKEN
+            times, samples = times[taken], samples[taken]
+            if ends:
+                yield Run(times[:0], samples[:0], ends)
+                navigating = False
+        if not len(times):
+            return
+        before = int(times[0]) - 1 if self._latest_ns is None else self._latest_ns
+        most_s = self._most_s if navigating else max(self._config.gap_s, imu.hold_ns * 1e-9)
+        longest, self._latest_ns = longest_step(times, before)
+        if longest * 1e-9 > most_s:
+            yield from self._split_at_gaps(times, samples, before, most_s, imu)
+        else:
+            yield Run(times, samples)
+        if self._troubles:
+            self._recover(self._latest_ns)
+
+    def _split_at_gaps(
+        self, times: Stamps, samples: Array, before: int, most_s: float, imu: ImuBuffer
+    ) -> Iterator[Run]:
+        """Samples with gaps that cannot be borne between them, or before them."""
+        intervals = np.diff(times, prepend=before) * 1e-9
+        breaks = np.flatnonzero(intervals > most_s).tolist()
+        for begin, end in pairwise(sorted({0, *breaks, len(times)})):
+            ends = ""
+            if begin in breaks:
+                ends = reason("imu_was_silent")
+                imu.counters["gap"] += 1
+                silent = reason("imu_silent", seconds=intervals[begin])
+                self._event("imu_gap", f"{silent}: aligning again")
+            yield Run(times[begin:end], samples[begin:end], ends)
+
+    def _refuse(self, checked: Checked, imu: ImuBuffer) -> str:
+        """Count what is not taken; why navigation ends, if it does."""
+        ends = ""
+        for code in np.unique(checked.codes).tolist():
+            if code == TAKEN:
+                continue
+            rows = checked.codes == code
+            name, count = OUTCOMES[code], int(rows.sum())
+            imu.counters[name] += count
+            text = TEXTS[name] + _unit(checked.samples[rows])
+            if self._trouble(name, checked.times[rows], count, text) and code == AXIS_DEAD:
+                ends = reason("imu_axis_dead")
+        return ends
+
+    def _trouble(self, name: str, times: Stamps, count: int, text: str = "") -> bool:
+        """Refusals of a name, at `times`; whether that is news."""
+        known = self._troubles.get(name)
+        news = known is None
+        if known is None:
+            known = self._troubles[name] = _Trouble(int(times[0]), int(times[0]))
+            self._event(f"imu_{name}", text or TEXTS[name])
+        known.last_ns = int(times[-1])
+        known.count += count
+        return news
+
+    def _recover(self, now_ns: int) -> None:
+        for name, trouble in list(self._troubles.items()):
+            if now_ns - trouble.last_ns > SOUND_NS:
+                lasted_s = (trouble.last_ns - trouble.first_ns) * 1e-9
+                counted = f"{trouble.count} refused within {lasted_s:.1f} s"
+                self._event("imu_sound", f"Accepted again, after {TEXTS[name]} ({counted})")
+                del self._troubles[name]
+
+
+def _unit(samples: Array) -> str:
+    """Unit of rejected samples (m, 6) by their magnitude."""
+    magnitude = median(np.linalg.norm(samples[:, 3:], axis=1))
+    unit = other_unit(magnitude)
+    if unit is None:
+        return ""
+    name, factor = unit
+    return (
+        f"; {magnitude:.4g} looks like {name}: multiply the accelerometer's figures by {factor:g}"
+    )

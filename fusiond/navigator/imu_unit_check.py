@@ -1,0 +1,244 @@
+r"""Check of the IMU's units, of a file as of a running vehicle.
+
+Specific force. Its magnitude is that of gravity in the median, whatever the vehicle does; another
+unit shows as its factor. Rates are held against the course of the fixes: between two fixes of a
+vehicle that moves, the yaw rate's integral is the change of course,
+
+    k = sum(dpsi_gyro dpsi_course) / sum(dpsi_course^2),
+
+1 for rad/s and 180 / pi for deg/s.
+
+Where there are positions alone, the way between them is asked (fusiond.navigator.rate_unit_check).
+
+Until the way has turned nobody can tell. What can be seen of rates in deg/s is their bias, which is
+57 times what it is, too: while it is none that the data sheet allows, nothing is vouched for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from drivers.measurements import PositionFix
+from fusiond.aiding.base import Aid
+from fusiond.aiding.candidates import PositionCandidate
+from fusiond.estimators.base import Estimator
+from fusiond.models.model import Model
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
+from fusiond.navigation.imu_buffer import ImuBuffer, squares
+from fusiond.navigator.rate_unit_check import PROOF, WayTurns
+from fusiond.navigator.reasons import reason
+
+# In a loop of 2 g for half of the time nobody flies, and half of gravity for as long nobody falls.
+FORCE_RANGE = (0.5, 2.0)
+FORCE_UNITS = {"g": STANDARD_GRAVITY_M_S2, "milli-g": 1e-3 * STANDARD_GRAVITY_M_S2, "cm/s^2": 1e-2}
+# RMS over a file, or over ten seconds, that no vehicle turns with: a turn a second, all the time.
+MOST_RATE_RAD_S = 2.0 * math.pi
+RMS_S = 10.0
+# A course is one from the speed at which alignment takes it for the heading by default. Over a
+# second a bend changes it by more than its noise; changes of 30 deg in all show the factor of 57.
+COURSE_SPEED_M_S = 3.0
+COURSE_STEP_NS = (900_000_000, 2_100_000_000)
+NEVER_NS = -(1 << 62)
+LEAST_TURN_RAD = math.radians(30.0)
+DEGREES_RANGE = (10.0, 300.0)
+# Rates that fit the course: what its noise and a bias of some deg/s make of a factor of one.
+FITS_RANGE = (0.5, 2.0)
+# A bias so many sigmas of its data sheet off is none of that sheet: chance does that on one axis of
+# 16,000. Of rates in deg/s all three axes stay below it on one vehicle in 6,000.
+SHEET_SIGMAS = 4.0
+
+
+def force_unit(magnitude: float) -> str | None:
+    """Text on forces of this magnitude in the median; None where they can be m/s^2."""
+    if FORCE_RANGE[0] <= magnitude / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
+        return None
+    unit = other_unit(magnitude)
+    if unit is None:
+        return reason("force_unknown", size=magnitude)
+    name, factor = unit
+    return reason("force_unit", size=magnitude, unit=name, factor=factor)
+
+
+def other_unit(magnitude: float) -> tuple[str, float] | None:
+    """The unit in which forces of this magnitude are gravity's, and its size in m/s^2."""
+    for name, factor in FORCE_UNITS.items():
+        if FORCE_RANGE[0] <= magnitude * factor / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
+            return name, factor
+    return None
+
+
+def rms_unit(rms_rad_s: float) -> str | None:
+    """Text on rates of this RMS; None where a vehicle can turn with them."""
+    if rms_rad_s <= MOST_RATE_RAD_S:
+        return None
+    return reason("rate_size", size=rms_rad_s)
+
+
+class CourseTurns:
+    """Turns by the gyro against those by a receiver's course: k of the module's docstring."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float] | None = None
+        self.next_ns = NEVER_NS
+        """Before then no velocity says more."""
+        self._product = self._square = self._turn = 0.0
+
+    def fix(self, t_ns: int, v_ned: tuple[float, ...], turned: Callable[[int, int], float]) -> None:
+        """A velocity (m/s) at an instant, in order; `turned(a, b)` (rad) is the gyro's between two
+        instants, NaN where it is not known."""
+        last = self._last
+        if t_ns < self.next_ns:
+            return
+        if not COURSE_SPEED_M_S <= math.hypot(*v_ned[:2]) < math.inf:
+            return
+        course = math.atan2(v_ned[1], v_ned[0])
+        self._last, self.next_ns = (t_ns, course), t_ns + COURSE_STEP_NS[0]
+        if last is None:
+            return
+        last_ns, before = last
+        gyro = turned(last_ns, t_ns)
+        if t_ns - last_ns > COURSE_STEP_NS[1] or not math.isfinite(gyro):
+            return
+        change = math.remainder(course - before, 2.0 * math.pi)
+        self._product += gyro * change
+        self._square += change**2
+        self._turn += abs(change)
+
+    @property
+    def decided(self) -> bool:
+        """True if the course has turned enough to tell."""
+        return self._turn >= LEAST_TURN_RAD
+
+    @property
+    def fits(self) -> bool:
+        """True if the rates are known to be in rad/s."""
+        return self.decided and FITS_RANGE[0] <= self._factor <= FITS_RANGE[1]
+
+    @property
+    def _factor(self) -> float:
+        return abs(self._product / self._square)
+
+    def said(self) -> str | None:
+        """Text on the rates; None where they fit, or nobody can tell."""
+        if not self.decided or not DEGREES_RANGE[0] <= (factor := self._factor) <= DEGREES_RANGE[1]:
+            return None
+        return reason("rate_turns", factor=factor)
+
+    def begin_anew(self) -> None:
+        """Forget the turns so far."""
+        self._product = self._square = self._turn = 0.0
+
+
+class RateUnits:
+    """Watches the rates of a running vehicle. `wrong` is the sentence while they are in another
+    unit, by the last turns of 30 deg, the last way or the last ten seconds that could tell.
+
+    `bias_sd` (rad/s) is one sigma of the data sheet's. `on_event(code, text)` hears of `imu_units`
+    and `imu_units_well`.
+    """
+
+    def __init__(self, bias_sd: float, on_event: Callable[[str, str], None]) -> None:
+        self._bias_sd, self._event = bias_sd, on_event
+        self._first: tuple[Model, list[tuple[int, int]]] | None = None
+        """Columns and slots of the first bias of each gyro and accelerometer, of the filter's
+        model."""
+        self.change()
+
+    def change(self) -> None:
+        """The samples from now on are another sensor's."""
+        self.wrong: str | None = None
+        self._fit = False
+        self._turns: dict[str, CourseTurns] = {}
+        self._ways: dict[str, WayTurns] = {}
+        self._squares, self._count, self._since_ns = 0.0, 0, 0
+
+    def unproven(self, estimator: Estimator) -> str | None:
+        """Reason why a solution with these biases is not vouched for before the course has turned:
+        one that the data sheet does not allow; None where they are like it."""
+        if self._fit:
+            return None
+        model = estimator.model
+        if self._first is None or self._first[0] is not model:
+            columns = [*range(RATE_ERROR, RATE_ERROR + 3), *range(FORCE_ERROR, FORCE_ERROR + 3)]
+            slots = [(c, s) for c in columns for s in model.parameters(c)[:1]]
+            self._first = model, slots
+        worst, told, xi = SHEET_SIGMAS, None, estimator.xi
+        for column, slot in self._first[1]:
+            bias = abs(xi.item(slot))
+            sigmas = bias / model.initial.item(slot)
+            if sigmas > worst:
+                gyro, worst = column < FORCE_ERROR, sigmas
+                size, unit = (math.degrees(bias), "deg/s") if gyro else (bias, "m/s^2")
+                sensor = "Gyro" if gyro else "Accelerometer"
+                told = reason("bias_size", sensor=sensor, size=size, unit=unit, sigmas=sigmas)
+        return told
+
+    def samples(self, imu: ImuBuffer, new: int) -> None:
+        """The samples from row `new` on have come."""
+        count = imu.end - new
+        if not count:
+            return
+        if not self._count:
+            self._since_ns = int(imu.times[new])
+        for way in () if self._fit else self._ways.values():
+            if way.samples(imu.times[new : imu.end], imu.samples[new : imu.end, 2]):
+                self._weigh(way)
+        self._squares += squares(imu.samples, new, imu.end)
+        self._count += count
+        if imu.latest_ns - self._since_ns >= RMS_S * 1e9:
+            self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
+            self._squares, self._count = 0.0, 0
+
+    def fix(self, m: object, t_ns: int, imu: ImuBuffer, aids: Sequence[Aid]) -> None:
+        """A measurement, valid at `t_ns`, as the aids it stands for: velocities count, and
+        positions of a source that gives none."""
+        if not isinstance(m, PositionFix) or m.v_ned_m_s is None:
+            for aid in () if self._fit else aids:
+                for candidate in aid.candidates():
+                    if isinstance(candidate, PositionCandidate):
+                        way = self._ways.setdefault(aid.source, WayTurns(self._bias_sd))
+                        way.fix(candidate._replace(t_ns=t_ns))
+            return
+        turns = self._turns.get(m.source)
+        if turns is None:
+            turns = self._turns[m.source] = CourseTurns()
+        if t_ns < turns.next_ns:
+            return
+        turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
+        if turns.decided:
+            self._tell(turns.said())
+            self._fit = self.wrong is None and (self._fit or turns.fits)
+            turns.begin_anew()
+
+    def _weigh(self, way: WayTurns) -> None:
+        """A way has gone on: what it tells of the unit."""
+        evidence = way.told()
+        if abs(evidence) <= PROOF:
+            return
+        well = evidence > 0.0
+        self._tell(None if well else reason("rate_path"))
+        self._fit = well
+        way.begin_anew()
+
+    def _tell(self, wrong: str | None) -> None:
+        if wrong is not None and self.wrong is None:
+            self._event("imu_units", wrong)
+        elif wrong is None and self.wrong is not None:
+            self._event("imu_units_well", "Rates fit the turns of the course again")
+        self.wrong = wrong
+
+
+def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:
+    """Yaw (rad) by the gyro between two instants; NaN where samples are not there any more, or not
+    yet."""
+    if not imu.end or begin_ns < imu.oldest_ns or end_ns > imu.latest_ns:
+        return math.nan
+    rows = slice(imu.index_after(begin_ns), imu.index_after(end_ns))
+    if rows.start == rows.stop:
+        return math.nan
+    mean = float(np.add.reduce(imu.samples[rows, 2])) / (rows.stop - rows.start)
+    return mean * (end_ns - begin_ns) * 1e-9

@@ -1,0 +1,103 @@
+"""Measurements from the IMU alone: the vehicle stands, or at least does not slide."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.rest_evidence import RestEvidence
+from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
+from fusiond.configuration.schema import Constraints, NonHolonomic
+from fusiond.configuration.settings import DEG, quiet_limits
+from fusiond.models.blocks import Block, ImuNoise
+from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
+
+GATE = 0.9999
+"""Gate probability, as the measured aids' default."""
+
+
+class Sensed(NamedTuple):
+    """The windows that have ended, and the aids that hold."""
+
+    windows: list[Window]
+    aids: list[Aid]
+
+
+def vehicle_blocks(options: NonHolonomic) -> list[Block]:
+    """Parameters of a vehicle that does not slide: mounting of the IMU, axle, side drift."""
+    if not options.enabled:
+        return []
+    found = []
+    if options.mounting_sd_deg:
+        found.append(mounting(options.mounting_sd_deg * DEG))
+    if options.lever_arm_sd_m:
+        found.append(axle_lever(options.lever_arm_sd_m))
+    if options.drift_sd_m_s:
+        found.append(drift(SIDE_DRIFT, options.drift_sd_m_s, options.drift_s))
+    return found
+
+
+class ConstraintMaker:
+    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
+
+    `noise` is the IMU's; `rest_evidence` hears of what is measured.
+    """
+
+    def __init__(self, options: Constraints, noise: ImuNoise) -> None:
+        self._options, self._rate_noise = options, noise.rate_noise
+        self.rest_evidence = RestEvidence()
+        self._detector = StandstillDetector(quiet_limits(options.zero_velocity, noise))
+        self._last_cell = -1
+
+    def feed(self, imu: ImuBuffer, new: int) -> Sensed:
+        """The samples from row `new` on have come."""
+        windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
+        aids: list[Aid] = []
+        if self._options.zero_velocity.enabled:
+            for window in windows:
+                if window.quiet:
+                    aids += self._standstill(window)
+        if self._options.non_holonomic.enabled:
+            aids += self._no_sliding(imu, new)
+        return Sensed(windows, aids)
+
+    def _standstill(self, w: Window) -> list[Aid]:
+        z = self._options.zero_velocity
+        rest = Rest(
+            w,
+            self.rest_evidence,
+            z.max_speed_m_s,
+            z.velocity_sd_m_s,
+            z.rate_sd_deg_s * DEG,
+            self._rate_noise / math.sqrt(z.window_s),
+            z.window_s,
+        )
+        rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
+        return [
+            ZeroVelocityAid("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, rest),
+            ZeroRateAid("zero_rate", w.end_ns, GATE, rate, rest.rate_sd_rad_s, rest),
+        ]
+
+    def _no_sliding(self, imu: ImuBuffer, new: int) -> list[Aid]:
+        """One at the first sample of each interval."""
+        o = self._options.non_holonomic
+        width, rows, row = round(o.interval_s * 1e9), [], new
+        while (row := next_cell(imu.times, row, imu.end, width, self._last_cell)) >= 0:
+            self._last_cell = int(imu.times[row]) // width
+            rows.append(row)
+        return [
+            NonHolonomicAid(
+                "non_holonomic",
+                int(imu.times[row]),
+                GATE,
+                o.sd_m_s,
+                o.sd_down_m_s,
+                o.min_speed_m_s,
+                o.lever_arm_m,
+            )
+            for row in rows
+        ]

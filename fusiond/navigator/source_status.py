@@ -1,0 +1,83 @@
+"""Faults that are not over, and the service of each source, as people are told.
+
+A fault of a source lasts from its finding until every series that it spoils is nominal again: while
+one of them is out of service or on probation, and has been since that finding or before. A fault
+that was corrected is over at once; it is told for `CORRECTED_TOLD_NS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from fusiond.estimators.federated.options import local_of
+from fusiond.integrity.fault_finding import Finding
+from fusiond.integrity.service import Series, Service
+from fusiond.navigator.timeline import Timeline
+
+CORRECTED_TOLD_NS = 60_000_000_000
+"""The longest usual interval of those who ask: Prometheus scrapes each minute by default."""
+WORST_FIRST = (Service.OUT, Service.PROBATION, Service.SUSPECTED, Service.NOMINAL)
+
+
+class Fault(NamedTuple):
+    """A finding that is not over, and the series that are out or on probation by it."""
+
+    finding: Finding
+    series: tuple[str, ...]
+
+
+class SourceService:
+    """Looks at what timeline and estimator leave out, and changes nothing of it.
+
+    `names`: the estimator's own sources, of which a name may stand for several series.
+    """
+
+    def __init__(self, timeline: Timeline, names: tuple[str, ...]) -> None:
+        self._timeline, self._names = timeline, names
+
+    def faults(self, t_ns: int) -> list[Fault]:
+        """Those that are not over at `t_ns`, the latest at the end."""
+        diagnosis, found = self._timeline.diagnosis, []
+        for finding in diagnosis.findings:
+            if finding.kind.corrected:
+                if t_ns - finding.t_ns <= CORRECTED_TOLD_NS:
+                    found.append(Fault(finding, ()))
+                continue
+            spoiled = [name for name, s in diagnosis.series.items() if _suffers(finding, s)]
+            if spoiled:
+                found.append(Fault(finding, tuple(spoiled)))
+        return sorted(found, key=lambda fault: fault.finding.t_ns)
+
+    def states(self, source: str) -> dict[str, Service]:
+        """State of each series of a source: of a device all that it sends, else the one of that
+        name. A filter that isolates by itself knows two states of each of its own sources."""
+        if (local := self._local(source)) is not None:
+            out = self._names[local] in self._timeline.estimator.isolated
+            return {source: Service.OUT if out else Service.NOMINAL}
+        series = self._timeline.diagnosis.series
+        return {name: s.state for name, s in series.items() if source in (name, s.device)}
+
+    def reason(self, source: str) -> str | None:
+        """Reason why a source of aids is left out; None if it is not."""
+        if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
+            return reason
+        local = self._local(source)
+        return None if local is None else self._timeline.estimator.isolated.get(self._names[local])
+
+    def _local(self, source: str) -> int | None:
+        return local_of(source, self._names) if self._timeline.estimator.isolates else None
+
+
+def worst(states: Iterable[Service]) -> Service | None:
+    """The worst of some states; None of none."""
+    found = set(states)
+    return next((state for state in WORST_FIRST if state in found), None)
+
+
+def _suffers(finding: Finding, one: Series) -> bool:
+    """True if a series is out or on probation, and was out when that was found."""
+    if one.state not in (Service.OUT, Service.PROBATION):
+        return False
+    spoils = finding.kind.spoils(one.device, one.locates, one.moves)
+    return spoils and one.out_ns <= finding.t_ns

@@ -1,0 +1,142 @@
+"""Reasons why a run over files failed, in one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from drivers.immutable import immutable
+from drivers.measurements import MonotonicStamp, PositionFix
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import sensor_to_body
+from fusiond.files.csv_tables import Rejection, counts
+from fusiond.files.tables import ImuTable
+from fusiond.navigation.distributions import median
+from fusiond.navigation.imu_buffer import magnitudes, squares
+from fusiond.navigator.imu_unit_check import CourseTurns, force_unit, rms_unit
+from fusiond.offline.aid_files import Arrival
+
+_TIMES = {"time_backwards", "time_ahead"}
+
+
+@immutable()
+class FileRead:
+    """A file's rows as they were read: s of its own time from the first to the last that is used
+    (None: none is), how many are, and those that are not. Frames of a bus are no aid by
+    themselves."""
+
+    span_s: tuple[float, float] | None
+    used: int
+    rejected: Sequence[Rejection]
+    is_aid: bool = True
+
+    @property
+    def refused(self) -> int:
+        """Rows that are not used."""
+        return sum(counts(self.rejected).values())
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return self.used + self.refused
+
+
+def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
+    """The sentence, where forces or rates are not in the units that the columns' names say."""
+    if not len(imu.t_s):
+        return None
+    return force_unit(median(magnitudes(imu.samples))) or _rate_unit(imu, section, arrivals)
+
+
+def _rate_unit(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
+    rms = math.sqrt(squares(imu.samples, 0, len(imu.samples)) / len(imu.samples))
+    return rms_unit(rms) or _course_turns(imu, section, arrivals).said()
+
+
+def _course_turns(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> CourseTurns:
+    yaw_rate = imu.gyro @ sensor_to_body(section)[2]
+    yaw = np.concatenate(([0.0], np.cumsum(yaw_rate[1:] * np.diff(imu.t_s))))
+    velocities = sorted(
+        (m.stamp.t_ns, m.v_ned_m_s[:2])
+        for m in (arrival.measurement for arrival in arrivals)
+        if isinstance(m, PositionFix)
+        and isinstance(m.stamp, MonotonicStamp)
+        and m.v_ned_m_s is not None
+    )
+    instants = [t_ns for t_ns, _ in velocities]
+    times = imu.t_s + section.time_offset_s
+    faced = np.interp(np.array(instants, dtype=np.float64) * 1e-9, times, yaw, np.nan, np.nan)
+    yaw_at = dict(zip(instants, faced.tolist(), strict=True))
+    turns = CourseTurns()
+    for t_ns, velocity in velocities:
+        turns.fix(t_ns, velocity, lambda begin_ns, end_ns: yaw_at[end_ns] - yaw_at[begin_ns])
+    return turns
+
+
+def nothing_navigated(
+    files: Mapping[str, FileRead], refused: Mapping[str, Mapping[str, int]], reason: str
+) -> str:
+    """The sentence for a run without a solution.
+
+    `files` by name, the first is the IMU's; `refused` outcomes by source; `reason` is the
+    alignment's.
+    """
+    for name, file in files.items():
+        if file.refused > file.used:
+            return _refused_rows(name, file)
+    imu_name, imu, aids = _aids(files)
+    if not aids:
+        return f"No measurements: give --aid KIND=FILE ({reason})"
+    others = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
+    if len(others) == len(aids):
+        ranges = " and ".join(others)
+        return f"No time in common: {imu_name} from {_span(imu)}, {ranges}"
+    kept = [f"{n} of {source} {name}" for source, o in refused.items() for name, n in o.items()]
+    return f"{reason} ({', '.join(kept)})" if kept else reason
+
+
+def apart(files: Mapping[str, FileRead]) -> list[str]:
+    """A line for each aid whose times have nothing in common with the IMU's, which come first."""
+    if not files:
+        return []
+    imu_name, imu, aids = _aids(files)
+    return [
+        f"{name} from {_span(file)}: no time in common with {imu_name}, from {_span(imu)}"
+        for name, file in aids
+        if not _overlap(imu, file)
+    ]
+
+
+def _aids(
+    files: Mapping[str, FileRead],
+) -> tuple[str, FileRead, list[tuple[str, FileRead]]]:
+    """The IMU's file, which comes first, and those of aids."""
+    (imu_name, imu), *others = files.items()
+    return imu_name, imu, [(name, file) for name, file in others if file.is_aid]
+
+
+def _refused_rows(name: str, file: FileRead) -> str:
+    by_reason = Counter(counts(file.rejected))
+    times = sum(by_reason[reason] for reason in _TIMES)
+    if times > file.refused / 2:
+        return f"{name}: its times run backwards in {times} of {file.rows} rows"
+    if len(by_reason) > 1:
+        del by_reason["unpaired"]  # frames, of which several make a row
+    most, number = by_reason.most_common(1)[0]
+    said = f"{name}: {number} of {file.rows} rows are refused as {most}"
+    return f"{said}: {file.rejected[0]}" if file.rejected[0].line else said
+
+
+def _overlap(a: FileRead, b: FileRead) -> bool:
+    if a.span_s is None or b.span_s is None:
+        return False
+    return a.span_s[0] <= b.span_s[1] and b.span_s[0] <= a.span_s[1]
+
+
+def _span(file: FileRead) -> str:
+    if file.span_s is None:
+        return "no row"
+    return f"{file.span_s[0]:.3f} to {file.span_s[1]:.3f} s"

@@ -1,0 +1,139 @@
+"""Input of a run: samples and aids of files or of a recorded bus, in order of arrival."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.measurements import ImuSample, Measurement, MonotonicStamp
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
+from fusiond.configuration.aiding import RawAiding
+from fusiond.configuration.schema import Config
+from fusiond.files.csv_tables import Rejection, TableError, counts
+from fusiond.files.tables import ImuTable, read_imu
+from fusiond.offline.aid_files import OF_A_RECEIVER, READERS, Arrival, read_nmea_by, source_of
+from fusiond.offline.failure_reasons import FileRead
+from fusiond.offline.nmea_file import receiver_of
+from fusiond.offline.outages import Outage, named, withheld
+
+
+@dataclass(slots=True)
+class Recorded:
+    """Input read, and its files; `withheld` measurements by source."""
+
+    config: Config
+    imu: ImuTable
+    arrivals: list[Arrival]
+    files: dict[str, FileRead]
+    events: list[dict[str, str]]
+    withheld: Counter[str]
+    units: list[tuple[int, ImuSample]]
+    """Samples of all inertial units as they came, where one of them is a spare; else none."""
+
+
+def read_recorded(
+    config: Config,
+    imu_path: Path | None,
+    aids: list[tuple[str, Path]],
+    outages: Sequence[Outage],
+    systems: tuple[System, ...] | None,
+    can_log: Path | None,
+) -> Recorded:
+    """Read it, less what the outages withhold. Raises as `fusiond.offline.process.process` does."""
+    if any(kind == "raw" for kind, _ in aids):
+        config = _with_raw(config, systems)
+    events: list[dict[str, str]] = []
+    arrivals: list[Arrival] = []
+    files: dict[str, FileRead] = {}
+    units: list[tuple[int, ImuSample]] = []
+    if can_log is not None:
+        # python-can and the DBC files' reader come only where there is a bus to be read.
+        from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
+
+        log = read_can_log(can_log, config)
+        imu, arrivals, units = log.imu, log.arrivals, log.units
+        events += [{"code": code, "text": text} for code, text in log.events]
+        files["imu"] = _imu_read(imu)
+        for name, rejected in log.rejected.items():
+            rows = [row for row in arrivals if row.measurement.source == name]
+            used = log.frames - sum(counts(rejected).values()) if name == "can" else len(rows)
+            if used or rejected:
+                files[name] = FileRead(_span_s(rows), max(0, used), rejected, name != "can")
+    else:
+        assert imu_path is not None
+        imu = read_imu(imu_path)
+        files["imu"] = _imu_read(imu)
+    for kind, path in aids:
+        rows, rejected = _read_aid(kind, path, imu, config)
+        name = kind if kind not in files else f"{kind}:{path.name}"
+        files[name] = FileRead(_span_s(rows), len(rows), rejected)
+        arrivals += rows
+    held = Counter[str]()
+    if outages:
+        there = {row.measurement.source for row in arrivals}
+        unknown = sorted(named(outages) - there - set(config.sources))
+        if unknown:
+            known = ", ".join(sorted(there))
+            raise TableError(f"outage of {unknown[0]}: no aid comes from it; there are {known}")
+        kept = [row for row in arrivals if not _withheld(row.measurement, outages)]
+        held += Counter(row.measurement.source for row in arrivals)
+        held -= Counter(row.measurement.source for row in kept)
+        arrivals = kept
+    arrivals.sort(key=lambda a: a.t_arrival_ns)
+    return Recorded(config, imu, arrivals, files, events, held, units)
+
+
+def _read_aid(
+    kind: str, path: Path, imu: ImuTable, config: Config
+) -> tuple[list[Arrival], list[Rejection]]:
+    source = source_of(kind, config)
+    if kind == "nmea":
+        return read_nmea_by(path, imu, receiver_of(source, config))
+    if kind in OF_A_RECEIVER:  # their decoders come only where there is such a file
+        from fusiond.offline.receiver_logs import decoding_of, read_solutions  # noqa: PLC0415
+
+        return read_solutions(kind, path, imu, source, decoding_of(source, config))
+    return READERS[kind](path, imu, source)
+
+
+BROADCAST = Ephemeris, Klobuchar, Bdgim
+"""Navigation messages are valid at no instant. (A union would be made anew at each question.)"""
+
+
+def valid_ns(m: Measurement | RawGnssEpoch) -> int:
+    """The instant of the IMU's clock that a recorded measurement is valid at."""
+    stamp = getattr(m, "stamp", None)
+    assert isinstance(stamp, MonotonicStamp)
+    return stamp.t_ns
+
+
+def _imu_read(imu: ImuTable) -> FileRead:
+    span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
+    return FileRead(span_s, len(imu.t_s), imu.rejected)
+
+
+def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
+    """The configuration with a section for the raw data of a file, and the systems asked for."""
+    name = source_of("raw", config)
+    section = config.aiding.get(name)
+    raw = section if isinstance(section, RawAiding) else RawAiding()
+    if systems is not None:
+        raw = raw.model_copy(update={"systems": systems})
+    return config.model_copy(update={"aiding": {**config.aiding, name: raw}})
+
+
+def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
+    """Of the measurements' instants; what a satellite broadcasts has none, so that a file of
+    nothing else has those of its arrivals."""
+    instants = [
+        valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
+    ] or [row.t_arrival_ns for row in rows]
+    return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
+
+
+def _withheld(m: Measurement | RawEvent, outages: Sequence[Outage]) -> bool:
+    if isinstance(m, BROADCAST):
+        return False
+    return withheld(m.source, valid_ns(m) * 1e-9, outages)

@@ -1,0 +1,77 @@
+"""Publications of others, counted before anything is made of it.
+
+A broker hands on whatever anybody publishes, as fast as it comes, on the connection that our own
+messages are confirmed on: behind a hundred thousand commands a confirmation comes seconds late, and
+what is sent meanwhile may be lost unseen, so it is not sent. Reading faster is no answer, and more
+slowly makes it worse. So who is flooded stops listening: the broker is told (UNSUBSCRIBE), what it
+has sent already is read and dropped, and some time later it is listened to again.
+
+What is on its way at that moment is little, as the kernel holds `HELD_BYTES` for us, not the
+megabytes that it would take otherwise.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from typing import Any
+
+import aiomqtt
+
+from drivers.base import Backoff
+from fusiond.outputs.rate_limits import Bucket, Rate
+
+MESSAGES = Rate(100.0, 500.0)
+"""Five commands a second are carried out, twenty at once (`command_intake`). A message costs 0.1 ms
+until its row is refused: so many a second are a hundredth of a core."""
+BYTES = Rate(65_536.0, 131_072.0)
+"""Sixteen of the longest commands a second, thirty-two at once (`MAX_PAYLOAD_BYTES`)."""
+QUIET_S, LONGEST_QUIET_S = 10.0, 60.0
+"""Nobody is listened to after a flood, doubling with each that follows."""
+PEACE_S = 60.0
+"""Without a flood for so long the next one is the first again."""
+
+
+class Incoming:
+    """Of one connection. `counters["mqtt_flooded"]` are messages that were dropped unread."""
+
+    def __init__(self, client: aiomqtt.Client, counters: Counter[str], quiet: Backoff) -> None:
+        self._counters = counters
+        self._quiet = quiet
+        self._flooded = asyncio.Event()
+        self._begin_anew()
+        paho = client._client  # aiomqtt has no place to look at a message before it is queued
+        self._hear: Any = paho.on_message
+        paho.on_message = self._count
+
+    def _count(self, paho: Any, userdata: Any, message: Any) -> None:
+        now_ns = time.perf_counter_ns()
+        self._messages.spend(1.0, now_ns)
+        self._bytes.spend(len(message.payload), now_ns)
+        if self._messages.empty(now_ns) or self._bytes.empty(now_ns) or self._flooded.is_set():
+            self._counters["mqtt_flooded"] += 1
+            self._flooded.set()
+        else:
+            self._hear(paho, userdata, message)
+
+    async def flood(self) -> float:
+        """Wait for one; how long to listen to nobody, s."""
+        await self._flooded.wait()
+        if time.monotonic() - self._since_s > PEACE_S:
+            self._quiet.reset()
+        return self._quiet.next()
+
+    def over(self) -> None:
+        """It is listened again."""
+        self._flooded.clear()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._since_s, now_ns = time.monotonic(), time.perf_counter_ns()
+        self._messages, self._bytes = Bucket(MESSAGES, now_ns), Bucket(BYTES, now_ns)
+
+
+def quiet() -> Backoff:
+    """Pauses after floods."""
+    return Backoff(first_s=QUIET_S, longest_s=LONGEST_QUIET_S)
