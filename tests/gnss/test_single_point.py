@@ -129,8 +129,7 @@ def test_covariance_is_what_noise_does() -> None:
     """500 epochs with noise as stated: NEES of position within its 99.9 % interval."""
     rng = np.random.default_rng(5)
     model = _model()
-    picked = model.pick(EPOCH)
-    rows = model.evaluate(picked, HERE)
+    rows = model.rows(EPOCH, HERE)
     nees = []
     for _ in range(500):
         error = np.sqrt(rows.variance) * rng.standard_normal(len(rows.satellites))
