@@ -63,7 +63,7 @@ AT_FIRST, FIRST_STEPS = 0.75, 4.0
 each axis one, it is worth. A filter that has once been too sure of its place stays so; one that was
 not is as sure as it may be with the next fix that counts as white."""
 FOR_SECONDS = 0.5
-"""What part of what is shared is taken to be over in seconds, worth one lag: a choice."""
+"""Part of the shared error that is over in seconds, worth one lag: a choice."""
 LEAST_WHITE = 0.01
 """Share of the variance that is white at least: a tenth of sigma. A receiver that smooths its fixes
 repeats its error; how it follows a turn is in no share."""

@@ -1,4 +1,4 @@
-"""Which signals of an epoch serve, as long as the same ones come and no ephemeris changes.
+"""Plan of an epoch: the signals that serve, as long as the same ones come and no ephemeris changes.
 
 One signal of each satellite serves as range and carrier, a second one for its slant delay
 (`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
@@ -115,7 +115,7 @@ class RangeOptions:
 
 
 class Plan(NamedTuple):
-    """Which signals serve, as long as the same ones come and no ephemeris changes."""
+    """Plan of the signals that serve, as long as the same ones come and no ephemeris changes."""
 
     keys: list[tuple[System, int, str]]
     version: int
