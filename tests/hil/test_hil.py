@@ -34,7 +34,7 @@ def test_hardware_in_the_loop(
     logs = tmp_path / "logs"
     monkeypatch.setenv(HANDED_OVER, str(logs))
     # What numba compiles is shared with the guests, where it takes three times as long.
-    filters = ("federated.standing", "multiscale.filter", "unscented.filter")
+    filters = ("federated.no_reset", "multiscale.filter", "unscented.filter")
     modules = ["fusiond.live.daemon", *(f"fusiond.estimators.{name}" for name in filters)]
     subprocess.run(
         [sys.executable, "-c", f"import {', '.join(modules)}"], check=True, timeout=TIMEOUT_S
