@@ -9,7 +9,8 @@ transition over H seconds is to the first order that of the means,
 and the second order (velocity from a gyro, position from a tilt) comes of the three steps in which
 an interval is crossed. What that leaves out is how rate and force change within H times what they
 do within H, a fraction of what one crossing adds, with either sign: over a drive with bends and
-stops the largest difference of a sigma is 1e-4 of it or less (tests/estimators/test_block_covariance.py).
+stops the largest difference of a sigma is 1e-4 of it or less
+(tests/estimators/test_block_covariance.py).
 
 Covariances are brought to an instant where the time, in whole multiples of `GRID_NS`, goes past one
 of them: at the first sample that ends there, whatever the calls are that it takes to get there;
