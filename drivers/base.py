@@ -58,7 +58,8 @@ class DriverStatus:
 def state_event(source: str, t_ns: int, port: str, status: DriverStatus) -> DeviceEvent:
     """`device_absent`, `device_silent` or `device_running`: what a driver on a serial line says
     when its state has changed."""
-    text = f"{port}: {status.detail or status.state}"
+    said = status.detail or status.state
+    text = said if port in said else f"{port}: {said}"
     return DeviceEvent(source, t_ns, f"device_{status.state}", text)
 
 

@@ -63,16 +63,16 @@ def open_serial(path: str, baud: int, counters: Counter[str]) -> Port:
 
 _WHY = {
     errno.ENOENT: "does not exist",
-    errno.EACCES: "no permission",
-    errno.EBUSY: "in use by another program (busy)",
-    errno.EAGAIN: "in use by another program (locked)",
+    errno.EACCES: "may not be opened (no permission)",
+    errno.EBUSY: "is in use by another program (busy)",
+    errno.EAGAIN: "is in use by another program (locked)",
 }
 
 
 def why_not_open(error: Exception) -> str:
-    """Reason for a port that did not open, without what its name already says."""
+    """Reason why a port did not open, to stand behind its name."""
     code = getattr(error, "errno", None)
-    return _WHY.get(code, str(error)) if code is not None else str(error)
+    return _WHY.get(code, f"did not open: {error}")
 
 
 class SerialPort:

@@ -76,7 +76,7 @@ class SerialLine:
                 port = await self._open()
             except OPEN_ERRORS as error:
                 self.counters["open_failed"] += 1
-                self.detail = f"{why_not_open(error)}; retrying"
+                self.detail = f"{self.port} {why_not_open(error)}; retrying"
                 await asyncio.sleep(self._backoff.next())
                 continue
             self.counters["opened"] += 1
