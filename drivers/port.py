@@ -72,7 +72,7 @@ _WHY = {
 def why_not_open(error: Exception) -> str:
     """Reason why a port did not open, to stand behind its name."""
     code = getattr(error, "errno", None)
-    return _WHY.get(code, f"did not open: {error}")
+    return f"did not open: {error}" if code is None else _WHY.get(code, f"did not open: {error}")
 
 
 class SerialPort:
