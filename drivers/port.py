@@ -70,9 +70,9 @@ _WHY = {
 
 
 def why_not_open(error: Exception) -> str:
-    """Reason why a port did not open, to stand behind its name."""
+    """Reason why a port did not open: to stand behind its name, or with it."""
     code = getattr(error, "errno", None)
-    return f"did not open: {error}" if code is None else _WHY.get(code, f"did not open: {error}")
+    return str(error) if code is None else _WHY.get(code, str(error))
 
 
 class SerialPort:

@@ -76,7 +76,9 @@ class SerialLine:
                 port = await self._open()
             except OPEN_ERRORS as error:
                 self.counters["open_failed"] += 1
-                self.detail = f"{self.port} {why_not_open(error)}; retrying"
+                why = why_not_open(error)
+                why = why if self.port in why else f"{self.port} {why}"
+                self.detail = f"{why}; retrying"
                 await asyncio.sleep(self._backoff.next())
                 continue
             self.counters["opened"] += 1

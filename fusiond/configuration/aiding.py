@@ -22,6 +22,8 @@ Place = tuple[
 """Latitude, longitude (deg), ellipsoidal height (m) of a place on land."""
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
+UNKNOWN_BIAS_SD_M = 1.0
+"""What fixes share of which nothing is said: half of a data sheet's 1.5 to 2 m is noise."""
 UNKNOWN_LEVER_SD_M = 1.0
 """One sigma, each axis, of where the antenna of a car or a van is, of which nothing is said: some
 0.5 to 3 m from the IMU."""
@@ -80,16 +82,21 @@ class GnssAiding(Aiding):
     """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; 0:
     it is as measured. Without it 1 m for the only receiver, if its `lever_arm_m` is not given, else
     0."""
-    bias_sd_m: NonNegativeFloat = 1.0
+    bias_sd_m: NonNegativeFloat | None = None
     """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east, beside
     what they state; fixes by carrier phase have half of what they state. Unless it is given, what
-    the receiver shows by its velocities counts; 1 m is of one without any: data sheets state 1.5 to
-    2 m for half of all fixes, noise included. 0: none is estimated, nor one that lasts for seconds,
-    and sigma shrinks as if errors were white."""
+    the receiver shows by its velocities counts, and 1 m of one without any: data sheets state 1.5
+    to 2 m for half of all fixes, noise included. 0: none is estimated, nor one that lasts for
+    seconds, and sigma shrinks as if errors were white."""
     bias_down_sd_m: PositiveFloat = 3.0
     """The same downwards, where most of the ionosphere goes."""
     bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that error."""
+
+    @property
+    def shared_sd_m(self) -> float:
+        """`bias_sd_m`, or what it is where it is not given."""
+        return UNKNOWN_BIAS_SD_M if self.bias_sd_m is None else self.bias_sd_m
 
 
 class RawAiding(Aiding):

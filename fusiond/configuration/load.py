@@ -102,9 +102,19 @@ def _default_aiding(source: Source) -> AnyAiding:
     return _DEFAULT_AIDING[source.driver]()
 
 
+def dumped(config: Config) -> dict[str, Any]:
+    """The configuration as JSON has it, whole, but for keys whose absence says something: a
+    lever arm that is not given is estimated."""
+    data = config.model_dump(mode="json")
+    for name, section in config.aiding.items():
+        if isinstance(section, GnssAiding) and "lever_arm_m" not in section.model_fields_set:
+            del data["aiding"][name]["lever_arm_m"]
+    return data
+
+
 def config_digest(config: Config) -> str:
     """Twelve hexadecimal digits that change with any value of the configuration."""
-    text = json.dumps(config.model_dump(mode="json"), sort_keys=True)
+    text = json.dumps(dumped(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

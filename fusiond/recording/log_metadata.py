@@ -11,7 +11,7 @@ from pathlib import Path
 
 from drivers.base import PermanentDriverError
 from drivers.can.dbc import find_dbc
-from fusiond.configuration.load import config_digest
+from fusiond.configuration.load import config_digest, dumped
 from fusiond.configuration.schema import Config
 from fusiond.recording.log_file import FORMAT, About, Attachment
 
@@ -39,7 +39,7 @@ def about_run(config: Config, run: str, epoch_ns: int, sources: Iterable[str]) -
         "boot_id": _read(BOOT_ID).strip(),
         **_versions(),
     }
-    text = json.dumps(config.model_dump(mode="json"), indent=1)
+    text = json.dumps(dumped(config), indent=1)
     return About(metadata, (Attachment(CONFIG, "application/json", text.encode()), *_dbcs(config)))
 
 

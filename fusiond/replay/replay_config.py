@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from fusiond.configuration.load import ConfigError, load_config
+from fusiond.configuration.load import ConfigError, dumped, load_config
 from fusiond.configuration.schema import Config
 from fusiond.recording.log_metadata import CONFIG, dbc_name
 from fusiond.recording.reader import About
@@ -24,7 +24,7 @@ def config_of(
     The log's DBC files are laid into `folder`, which must outlast the use. Raises `ConfigError`.
     """
     if other is not None:
-        data = load_config(other).model_dump(mode="json")
+        data = dumped(load_config(other))
     else:
         try:
             data = json.loads(about.attachments[CONFIG])

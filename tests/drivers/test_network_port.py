@@ -97,7 +97,7 @@ async def test_a_refused_connection_is_an_absent_device_until_the_server_is_ther
     server = SerialServer()
     async with running(server.address) as receiver:
         await until(lambda: receiver.state == "absent")
-        assert receiver.detail == f"{server.address}: Connection refused"
+        assert receiver.detail == f"{server.address}: Connection refused; retrying"
         (advice,) = open_findings("gnss", receiver.driver, receiver.options, 5.0)
         assert "start what serves it" in advice
         async with server.up():
@@ -235,7 +235,7 @@ async def test_a_port_that_is_taken_is_waited_for() -> None:
         address = f"udp://127.0.0.1:{taken.getsockname()[1]}"
         async with running(address) as receiver:
             await until(lambda: receiver.state == "absent")
-            assert receiver.detail == f"{address}: Address already in use"
+            assert receiver.detail == f"{address}: Address already in use; retrying"
             taken.close()
             await until(lambda: receiver.driver.counters["opened"] == 1)
 

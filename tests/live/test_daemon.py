@@ -76,7 +76,7 @@ async def test_it_aligns_navigates_and_says_how_each_device_is(bench: Bench) -> 
     assert abs(east) < 5.0 * sd[1]
     # What all fixes share (1 m by default) stays, whatever their number, and so does, until their
     # velocities have shown better, half of their variance (0.8 m stated); noise averages out.
-    shared = GnssAiding().bias_sd_m
+    shared = GnssAiding().shared_sd_m
     assert shared < min(sd[:2])
     assert max(sd[:2]) < 1.1 * math.hypot(shared, 0.8 * math.sqrt(0.5))
     assert {"imu", "gnss", "rdss", "zero_velocity"} <= health.keys()

@@ -55,7 +55,7 @@ def test_a_drive_is_either_a_recording_or_files(tmp_path: Path) -> None:
     for arguments in ([], [str(DEMO), "--imu", "imu.csv"], [str(DEMO), "--aid", "gnss=gnss.csv"]):
         done = _called(tmp_path, *arguments)
         assert done.exit_code == 2
-        assert "the drive is a recording" in " ".join(done.stderr.split())
+        assert "Give LOG.mcap alone" in " ".join(done.stderr.split())
 
 
 def test_what_is_no_recording_is_told(tmp_path: Path) -> None:

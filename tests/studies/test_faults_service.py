@@ -84,7 +84,7 @@ def test_fixes_state_what_they_have_of_their_own_where_the_rest_is_told() -> Non
     assert {fix.sd_ned_m for fix in fixes(told.recording)} == {(0.8, 0.8, 1.6)}
     by_class = scene(Vehicle("mems", SHARING, told="class"), "looked", 0, 30.0)
     assert all(fix.sd_ned_m == pytest.approx((1.7, 1.7, 3.4)) for fix in fixes(by_class.recording))
-    assert by_class.config.aiding["gnss"].model_dump()["bias_sd_m"] == 1.0
+    assert by_class.config.aiding["gnss"].model_dump()["bias_sd_m"] is None
 
 
 def test_a_lever_arm_that_is_not_given_is_there() -> None:

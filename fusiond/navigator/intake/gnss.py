@@ -85,7 +85,7 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
     time, velocity_time, lever = names
     bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
     holds = bool(bias) and any(section is o for section in sections.aiding.values())
-    told = "bias_sd_m" in o.model_fields_set
+    told = o.bias_sd_m is not None
     return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds, told)
 
 
@@ -205,10 +205,10 @@ def _velocity(m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssA
 
 def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
     """Share of the code error in one by carrier phase."""
-    if o.bias_sd_m == 0.0:
+    if o.shared_sd_m == 0.0:
         return (1.0, 1.0, 1.0)
     (north, east, down), part = sd, math.sqrt(PHASE_SHARE)
-    level, vertical = o.bias_sd_m, o.bias_down_sd_m
+    level, vertical = o.shared_sd_m, o.bias_down_sd_m
     return part * north / level, part * east / level, part * down / vertical
 
 
@@ -220,7 +220,7 @@ def _with_geoid(share: Vector3, geoid_sd_m: float, o: GnssAiding) -> Vector3:
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:
     """The blocks of the error that a receiver's fixes share; none where it is not estimated."""
-    if section.bias_sd_m == 0.0:
+    if section.shared_sd_m == 0.0:
         return ()
     level = sections.own(FIX_BIAS, source, section)
     return level, f"{level}_down"
@@ -228,7 +228,7 @@ def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str
 
 def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
     """The block of the error that fixes share for seconds; "" where none is estimated."""
-    return sections.own(FIX_WANDER, source, section) if section.bias_sd_m else ""
+    return sections.own(FIX_WANDER, source, section) if section.shared_sd_m else ""
 
 
 def _level(sd: Vector3) -> float:
@@ -264,7 +264,7 @@ def _lasting(sd: Vector3, shares: Shares, o: GnssAiding) -> Vector3:
     horizontal is taken to be so of the height. Its own error counts as stated all the same: how a
     receiver that smooths its fixes follows a turn is in no share."""
     north, east, down = sd
-    level, vertical = (math.sqrt(shares.lasts) / s for s in (o.bias_sd_m, o.bias_down_sd_m))
+    level, vertical = (math.sqrt(shares.lasts) / s for s in (o.shared_sd_m, o.bias_down_sd_m))
     return level * north, level * east, vertical * down
 
 
@@ -287,7 +287,7 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
     if names:
         level, down = names
         lasts_s = section.bias_correlation_s
-        found.append(position_bias(level, section.bias_sd_m, lasts_s))
+        found.append(position_bias(level, section.shared_sd_m, lasts_s))
         found.append(position_bias(down, section.bias_down_sd_m, lasts_s, "d"))
         found.append(fix_wander(_wander(source, section, sections), LASTS_S))
     return found
