@@ -58,7 +58,6 @@ from fusiond.gnss.carriers import (
     CNO as CNO_A,
 )
 from fusiond.gnss.carriers import (
-    FIRST_COLUMNS,
     MOVED,
     MOVED_VARIANCE,
     P_A,
@@ -100,8 +99,7 @@ _NEPERS = 0.1 * math.log(10.0)
 SIGNAL_COLUMNS = 6
 GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(SIGNAL_COLUMNS)
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
-# What the receiver says of each row; NaN where it does not.
-MEASURED_COLUMNS = FIRST_COLUMNS
+# Columns of `first` as the receiver says them; NaN where it does not.
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
 # Results; the first seventeen are what an aid takes (fusiond.aiding.pseudorange).
 ROW_COLUMNS = 27
