@@ -23,7 +23,7 @@ Place = tuple[
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 UNKNOWN_BIAS_SD_M = 1.0
-"""What fixes share of which nothing is said: half of a data sheet's 1.5 to 2 m is noise."""
+"""Error shared by fixes of which nothing is said: half of a data sheet's 1.5 to 2 m is noise."""
 UNKNOWN_LEVER_SD_M = 1.0
 """One sigma, each axis, of where the antenna of a car or a van is, of which nothing is said: some
 0.5 to 3 m from the IMU."""
