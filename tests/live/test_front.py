@@ -67,7 +67,7 @@ async def test_it_answers_while_kernels_compile_and_goes_on_by_the_same_connecti
             await asyncio.wait_for(waiting, PATIENCE_S)
             made = Daemon(config, front=front)
             async with running(made):
-                await listener.until(lambda heard: _whys(heard, "waiting for IMU data"))
+                await listener.until(lambda heard: _whys(heard, "Waiting for IMU data"))
                 await client.publish("fusiond/test/cmd/reset_filter", '{"id": "b"}', qos=1)
                 await listener.until(lambda heard: len(heard.payloads("fusiond/test/reply")) > 1)
                 assert listener.payloads("fusiond/test/online") == [b"online"]
