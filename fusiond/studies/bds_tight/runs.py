@@ -81,7 +81,7 @@ tilt and heading (deg) as of a levelling and a compass."""
 RAW = RawAiding(systems=("C",), lever_arm_m=LEVER)
 LOOSE = GnssAiding(lever_arm_m=LEVER, bias_sd_m=RAW.bias_sd_m, bias_down_sd_m=RAW.bias_down_sd_m)
 ORBIT_ERRORS_M = (0.6, 0.3, 0.0)
-"""Of orbits and clocks: BeiDou-3's as published (fusiond.gnss.plan), of which the study's cases are;
+"""Of orbits and clocks: BeiDou-3's as published (fusiond.gnss.plan), which the study's cases have;
 and half of it and none, which show what makes NEES."""
 OPTIONS = GnssRawOptions(
     rate_hz=1.0,
