@@ -152,6 +152,12 @@ class Aid:
         return ()
 
     @property
+    def remembers(self) -> bool:
+        """True if its innovation needs what an earlier one left, which another state than the
+        filter's own has not."""
+        return False
+
+    @property
     def feedback(self) -> Feedback:
         """Choice of when the estimate is fed back."""
         return "at_once"
@@ -215,6 +221,8 @@ class Linearised(Protocol):
     def constraint(self) -> bool: ...
     @property
     def no_slip(self) -> bool: ...
+    @property
+    def remembers(self) -> bool: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
 

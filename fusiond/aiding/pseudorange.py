@@ -25,16 +25,25 @@ each range, S:
     rho^ += S n^,    z_rho -= S dn;    without these blocks S S^T goes to the noise, by row
 
 The carrier of a satellite, from epoch to epoch, gives its mean rate over the last dt, which takes
-the Doppler's place. With q = s' - v~, v~ the antenna's mean velocity over dt, and its own clock m
-(block `CARRIER_CLOCK`: phases walk by more than the drift's mean, the same for all satellites)
+the Doppler's place. With q = s' - v~, v~ the antenna's mean velocity over dt, and m what the clock
+has moved by more than its drift (phases walk), the same for all satellites
 
-    rate^ = u . q - (dt / 2) (u . s'' + (|q|^2 - (u . q)^2) / rho) + d^ + m^,
-    z = -u . dv + (y x u) . phi + (dt / 2) (C^T u) . f + .. - dd - dm + v
-    v~ = v - w + (m - m') / dt + (a - a') / dt,     y = v~ - v + (0, 0, g dt / 2)
+    rate^ = u . q - (dt / 2) (u . s'' + (|q|^2 - (u . q)^2) / rho) + d^ + m,
+    z = -u . dv + (y x u) . phi + (dt / 2) (C^T u) . f + .. - dd - m + v
+    v~ = v - w + (p - p') / dt + (a - a') / dt,     y = v~ - v + (0, 0, g dt / 2)
 
-w is how much the IMU alone has changed the velocity since the start, m its integral, primes those
+w is how much the IMU alone has changed the velocity since the start, p its integral, primes those
 at the epoch before: so feedback in between, which moves v, leaves the difference alone. y is what
 of v~ - v turns with the attitude, f the force error of the accelerometers, even over dt.
+
+Of m the Dopplers of the same satellites know: each z less that of its Doppler is -m, with the
+Doppler's noise, and says nothing else that the carriers do not say better. With their weights w_k
+
+    m^ = -sum w_k (z_k - z_Doppler,k) / W,     W = sum w_k + 1 / (1 m/s)^2,     z += m^
+
+what is left of m has the variance 1 / W in all carriers of the epoch (block `CARRIER_CLOCK`, of
+unit variance), so that the drift is known as well as Dopplers have it, whatever the number of
+carriers. H less its weighted mean beyond the Dopplers' goes with it.
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
@@ -154,6 +163,10 @@ class PseudorangeAid(Aid):
         object.__setattr__(self, "_r", r[: ranges + rates])
         object.__setattr__(self, "_ranges", ranges)
         object.__setattr__(self, "_clocks", clocks)
+
+    @property
+    def remembers(self) -> bool:
+        return self.before.item(0) > 0.0 and bool((self.values[SPAN] > 0.0).any())
 
     @property
     def position(self) -> Array:

@@ -30,6 +30,9 @@ DISPLACED_BY = 8.0
 """Satellites, of which a displacement is as large as its block says."""
 UNUSED_VARIANCE = 1e6
 """(m/s)^2, of a rate that only a carrier gives and nothing is known of the epoch before."""
+CARRIER_CLOCK_M_S = 1.0
+"""One sigma of what a clock's phase adds to the mean drift between two epochs, where no Doppler
+tells: 0.1 m by the root of a second are 0.45 m/s over 50 ms."""
 SAME_SPAN_S = 1e-3
 """The IMU's time since the epoch before is that between the epochs, or it is of another start. A
 microsecond's rounding is less, an IMU's sample more."""
@@ -117,6 +120,10 @@ def range_rows(
     for i in range(clock.shape[0]):
         there += math.isfinite(values[RANGE, i])
     several = math.sqrt(DISPLACED_BY / max(there, 1))
+    # Of the carriers' clock: its weight, and weighted what carriers say more than their Dopplers.
+    weight_m, more_z = 1.0 / (CARRIER_CLOCK_M_S * CARRIER_CLOCK_M_S), 0.0
+    t0 = t1 = t2 = f0 = f1 = f2 = 0.0
+    first_rate = rate_row
 
     range_row = 0
     for i in range(clock.shape[0]):
@@ -154,9 +161,10 @@ def range_rows(
         if math.isfinite(values[RATE, i]) or span > 0.0:
             g = h[rate_row]
             e0, e1, e2 = values[VX, i], values[VX + 1, i], values[VX + 2, i]
-            q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
-            q1 = -so * e0 + co * e1 - v1
-            q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
+            e0n = -sl * co * e0 - sl * so * e1 + cl * e2
+            e1n = -so * e0 + co * e1
+            e2n = -cl * co * e0 - cl * so * e1 - sl * e2
+            q0, q1, q2 = e0n - v0, e1n - v1, e2n - v2
             d0, d1, d2 = b0, b1, b2
             known = carrier.shape[0] == 1 and span > 0.0 and abs(gone - span) < SAME_SPAN_S
             if known:
@@ -170,9 +178,8 @@ def range_rows(
             if known:
                 bend = values[PULL, i] + (q0 * q0 + q1 * q1 + q2 * q2 - along * along) / distance
                 innovation = along - 0.5 * span * bend - values[CARRIER_RATE, i]
-                innovation += xi[carrier[0]]
-                g[carrier[0]] = -1.0
                 r[rate_row] = values[CARRIER_VARIANCE, i]
+                g[carrier[0]] = -1.0
             elif math.isfinite(values[RATE, i]):
                 innovation = along - values[RATE, i]
                 r[rate_row] = values[RATE_VARIANCE, i]
@@ -204,16 +211,41 @@ def range_rows(
                 elif axis == 2:
                     g[slot] = n0 * l1 - n1 * l0
             if known:
+                half = 0.5 * span
                 for slot in range(CORE_SIZE, column_of.shape[0]):
                     axis = column_of[slot] - FORCE_ERROR
                     if 0 <= axis < 3:
-                        g[slot] = 0.5 * span * (n0 if axis == 0 else n1 if axis == 1 else n2)
+                        g[slot] = half * (n0 if axis == 0 else n1 if axis == 1 else n2)
+                if math.isfinite(values[RATE, i]):
+                    now = u0 * (e0n - v0) + u1 * (e1n - v1) + u2 * (e2n - v2) - values[RATE, i]
+                    w = 1.0 / (values[RATE_VARIANCE, i] + values[CARRIER_VARIANCE, i])
+                    weight_m += w
+                    more_z += w * (innovation - now)
+                    d0, d1, d2 = d0 - b0, d1 - b1, d2 - b2
+                    t0 += w * (d1 * u2 - d2 * u1)
+                    t1 += w * (d2 * u0 - d0 * u2)
+                    t2 += w * (d0 * u1 - d1 * u0)
+                    f0, f1, f2 = f0 + w * half * n0, f1 + w * half * n1, f2 + w * half * n2
             if clock[i] >= 0:
                 innovation += xi[drifts[0]]
                 g[drifts[0]] = -1.0
             _hold(active, g)
             z[rate_row] = innovation
             rate_row += 1
+    if carrier.shape[0] == 1:
+        for row in range(first_rate, rate_row):
+            g = h[row]
+            if g[carrier[0]] == 0.0:
+                continue
+            g[carrier[0]] = -1.0 / math.sqrt(weight_m)
+            z[row] -= more_z / weight_m + g[carrier[0]] * xi[carrier[0]]
+            for j in range(3):
+                if active[j]:
+                    g[j] -= (t0 if j == 0 else t1 if j == 1 else t2) / weight_m
+            for slot in range(CORE_SIZE, column_of.shape[0]):
+                axis = column_of[slot] - FORCE_ERROR
+                if 0 <= axis < 3:
+                    g[slot] -= (f0 if axis == 0 else f1 if axis == 1 else f2) / weight_m
 
 
 # What is wrong with the values of an epoch.

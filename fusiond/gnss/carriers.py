@@ -104,8 +104,8 @@ SLIP_RATE_M_S = 0.5
 """Between the mean of two Dopplers and the carrier's rate, or a wavelength over dt where that is
 more. A hand that swings with 3 m/s^2 twice a second leaves 0.2 m/s over 0.25 s."""
 JUMP_M_S = 3.0
-"""Common part of all satellites beyond their Dopplers: three sigma of the filter's `carrier_clock`
-(fusiond.navigator.intake.raw). A clock set by a millisecond within 2 s gives 150,000."""
+"""Common part of all satellites beyond their Dopplers: three sigma of the filter's clock of
+the carriers (fusiond.aiding.range_rows). A clock set by a millisecond within 2 s gives 150,000."""
 
 
 @compiled("f8(f8[:, ::1])")

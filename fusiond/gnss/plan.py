@@ -51,7 +51,9 @@ PREFERRED: dict[System, tuple[str, ...]] = {
 SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.6, "E": 0.3, "C": 0.6}
 """Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, Advances in Space Research 61
 (2018), 3020-3038: Galileo 0.2 m, GPS 0.6, BeiDou-2 1.0, all of 2017. Galileo's group delays are in
-the 0.3 m; BeiDou-3, not whole then, is taken for GPS."""
+the 0.3 m. BeiDou-3, not whole then, has 0.5 m, mostly clocks: Initial assessment of BDS-3
+preliminary system signal-in-space range error, GPS Solutions 24 (2020), doi
+10.1007/s10291-019-0928-x."""
 BEIDOU_2_IN_SPACE_M = 1.0
 LAST_BEIDOU_2_PRN = 18
 """BDS-SIS-ICD-B1I-3.0 table 4-1: BeiDou-3 begins with 19 but for its GEO, from 59."""

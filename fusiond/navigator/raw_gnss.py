@@ -27,7 +27,6 @@ from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.range_kernel import (
     AID_ROWS,
-    CARRIER_SPAN,
     CARRIER_VARIANCE,
     RATE_VARIANCE,
     VARIANCE,
@@ -46,9 +45,6 @@ from fusiond.gnss.store import EphemerisStore
 
 Array = NDArray[np.float64]
 
-FEWEST_CARRIERS = 5
-"""Carriers measure three velocities and a clock of their own: fewer leave the receiver's drift, of
-which Dopplers know, to nobody."""
 REMEMBERED_NS = 12_000_000_000
 """Epochs older than that are too old for the timeline, which goes back by ten seconds."""
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
@@ -241,9 +237,6 @@ class RawGnss:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
-        if np.count_nonzero(values[CARRIER_SPAN]) < FEWEST_CARRIERS:
-            values = values.copy()
-            values[CARRIER_SPAN] = 0.0
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale

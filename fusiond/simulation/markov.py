@@ -2,6 +2,10 @@ r"""First-order Gauss-Markov processes: what of the errors of sensors and aids l
 
     x' = -x / T + w,   x_k = x_(k-1) exp(-dt / T) + w_k,   var(w_k) = sigma^2 (1 - exp(-2 dt / T))
 
+and what follows one of sqrt(2) sigma, of which not the rate but its change is noise:
+
+    s' = (x - s) / T,   var(s) = cov(s, x) = var(x) / 2
+
 Source: Groves, 2nd ed., section 4.4; Brown and Hwang, 4th ed., eq. 3.4.
 """
 
@@ -43,5 +47,25 @@ def gauss_markov(
     decay = math.exp(-step_s / correlation_s) if correlation_s > 0.0 else 0.0
     process: Array = rng.standard_normal((n, columns)) * (sigma * math.sqrt(1.0 - decay * decay))
     process[0] = rng.standard_normal(columns) * sigma
+    _decaying(process, decay)
+    return process
+
+
+def smooth_markov(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    *,
+    step_s: float,
+    correlation_s: float,
+    sigma: float,
+) -> Array:
+    """Processes (n, columns) in steady state that follow first-order ones."""
+    wide = math.sqrt(2.0) * sigma
+    rough = gauss_markov(rng, shape, step_s=step_s, correlation_s=correlation_s, sigma=wide)
+    decay = math.exp(-step_s / correlation_s)
+    process = (1.0 - decay) * rough
+    # Drawn apart: whatever else is drawn from `rng` stays what it was.
+    own = rng.spawn(1)[0].standard_normal(shape[1])
+    process[0] = 0.5 * rough[0] + 0.5 * wide * own
     _decaying(process, decay)
     return process

@@ -228,18 +228,25 @@ def _moved(error: Array, rate_b: Array, force_b: Array) -> tuple[Array, Array, A
 
 def _model_with_carriers() -> Model:
     shared = [shared_error(name, "", 1.0, math.inf) for name in RANGE_SHARED]
-    clock = shared_error(CARRIER_CLOCK, "m/s", 1.0, 0.01)
+    clock = shared_error(CARRIER_CLOCK, "", 1.0, 0.01)
     return make_model("ins15", imu_noise(Imu()), *clock_blocks(("C", "G")), *shared, clock)
 
 
 def _by_carrier(
-    model: Model, ends: tuple[Array, Array, Array, Array], rates: Array, s: Array, s_dot: Array
+    model: Model,
+    ends: tuple[Array, Array, Array, Array],
+    rates: Array,
+    s: Array,
+    s_dot: Array,
+    dopplers: Array | None = None,
 ) -> Innovation:
     """Rows of an epoch whose rates are the carriers', with what the epoch before left."""
     nav_0, step_0, nav_1, step_1 = ends
     n = len(s)
     values = epoch_values(s, s_dot, np.full(n, np.nan), np.full(n, np.nan), np.ones(n), np.ones(n))
     values[13], values[14], values[15] = SPAN_S, rates, 1e-4
+    if dopplers is not None:
+        values[7] = dopplers
     clock, names = np.zeros(n, np.int64), tuple(f"G{k:02d}" for k in range(n))
     first = PseudorangeAid("raw", 0, 0.999, names, values, clock, LEVER)
     first.innovation(State(nav_0, np.zeros(model.size), step_0, model))
@@ -263,14 +270,16 @@ def test_rate_of_a_carrier_is_the_way_between_the_epochs() -> None:
     assert (r == 1e-4).all()
 
 
-def test_jacobian_of_a_carrier() -> None:
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside Dopplers"])
+def test_jacobian_of_a_carrier(beside: bool) -> None:
     """Errors of the state at the epoch's end, and of accelerometers, made by errors half a second
     before that the IMU has carried along."""
     model = _model_with_carriers()
     true = _moved(np.zeros(9), RATE_SENSED, np.array(FORCE))
     s, s_dot = _satellites(true[2])
     rates = np.zeros(len(s))
-    _, h, _ = _by_carrier(model, true, rates, s, s_dot)
+    dopplers = np.full(len(s), 3.0) if beside else None
+    _, h, _ = _by_carrier(model, true, rates, s, s_dot, dopplers)
     for k in range(9):
         size = 10.0 if k >= 6 else 1e-3
         changes, states = [], []
@@ -278,7 +287,7 @@ def test_jacobian_of_a_carrier() -> None:
             error = np.zeros(9)
             error[k] = sign * size
             ends = _moved(error, RATE_SENSED, np.array(FORCE))
-            changes.append(_by_carrier(model, ends, rates, s, s_dot).z)
+            changes.append(_by_carrier(model, ends, rates, s, s_dot, dopplers).z)
             states.append(runs.nav_error(ends[2], true[2]))
         numeric = (changes[0] - changes[1]) / (2.0 * size)
         expected = h[:, :9] @ (states[0] - states[1]) / (2.0 * size)
@@ -286,18 +295,34 @@ def test_jacobian_of_a_carrier() -> None:
     # A force error stays where it is while the vehicle turns: here it does not.
     slow = np.zeros(3)
     true = _moved(np.zeros(9), slow, np.array(FORCE))
-    _, h, _ = _by_carrier(model, true, rates, s, s_dot)
+    _, h, _ = _by_carrier(model, true, rates, s, s_dot, dopplers)
     for axis, slot in enumerate(s for j in range(3) for s in model.parameters(12 + j)[:1]):
         changes, states = [], []
         for sign in (1.0, -1.0):
             force = np.array(FORCE)
             force[axis] += sign * 1e-2
             ends = _moved(np.zeros(9), slow, force)
-            changes.append(_by_carrier(model, ends, rates, s, s_dot).z)
+            changes.append(_by_carrier(model, ends, rates, s, s_dot, dopplers).z)
             states.append(runs.nav_error(ends[2], true[2]))
         numeric = (changes[0] - changes[1]) / 2e-2
         expected = h[:, :9] @ (states[0] - states[1]) / 2e-2 + h[:, slot]
         assert numeric == pytest.approx(expected, abs=2e-3), axis
+
+
+def test_dopplers_tell_what_the_clock_moved_beyond_its_drift() -> None:
+    """Carriers that a clock's phase moved by 0.4 m/s more than Dopplers say: that is taken off, and
+    what is left of it has the Dopplers' sigma, for three satellites as for many."""
+    model = _model_with_carriers()
+    ends = _moved(np.zeros(9), RATE_SENSED, np.array(FORCE))
+    s, _ = _satellites(ends[2])
+    s, none = s[:3], np.zeros((3, 3))
+    before, _ = _truth(ends[0], RATE_SENSED, s, none)
+    now, dopplers = _truth(ends[2], RATE_SENSED, s, none)
+    found = _by_carrier(model, ends, (now - before) / SPAN_S + 0.4, s, none, dopplers)
+    weight = 3.0 / (1.0 + 1e-4)  # the Dopplers here have 1 m/s, as has the clock beforehand
+    assert found.z == pytest.approx(np.full(3, -0.4 / (1.0 + weight)), abs=1e-3)
+    slot = model.slots_of_all((CARRIER_CLOCK,))
+    assert found.h[:, slot] == pytest.approx(np.full((3, 1), -1.0 / math.sqrt(1.0 + weight)))
 
 
 def test_a_carrier_without_the_epoch_before_says_nothing() -> None:

@@ -99,8 +99,11 @@ def test_three_satellites_help_the_tight_filter_alone() -> None:
     tight, loose, coasting = (
         three[row]["stretch"]["horizontal_rms_m"] for row in ("tight_ekf", "loose", "coasting")
     )
-    assert tight < 0.5 * loose
-    assert loose == pytest.approx(coasting, rel=0.1)
+    assert tight < 0.5 * coasting
+    # Without a fix loose coasts: how many satellites there are is the same to it, to the bit. It is
+    # no better than tight that coasts, whose carriers have measured the IMU better before.
+    assert result()["cases"]["canyon2"]["loose"] == three["loose"]
+    assert coasting < 1.1 * loose
     assert three["tight_ekf"]["availability"] > three["loose"]["availability"]
     ratios = result()["three_satellites"]["ratio"]
     assert ratios["200"] < bds_tight.CLAIM

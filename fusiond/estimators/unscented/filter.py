@@ -4,7 +4,8 @@ Measurements: the transform is taken over the states that the aid depends on (th
 that are not zero), each point through the aid's own innovation at the true state that its error
 would mean. What comes of it is linear in the error state again
 (fusiond.estimators.unscented.sigma_points), so gate, update and feedback are those of the extended
-filter. All other states follow through their correlation, as in a full transform.
+filter. All other states follow through their correlation, as in a full transform. A sigma point has
+no past: an aid that `remembers` goes by its Jacobian.
 
 Propagation: the extended filter's covariance, or with `propagation` sigma points through the
 strapdown equations and a covariance that turns with a large correction of the attitude
@@ -69,6 +70,8 @@ class UnscentedEstimator(KalmanEstimator):
 
         Where the aid does not hold at a point, its pair goes by the Jacobian at the centre.
         """
+        if aid.remembers:
+            return super()._linearise(aid)
         state = self.state
         central = aid.innovation(state)
         if isinstance(central, NotApplicable):

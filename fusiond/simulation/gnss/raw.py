@@ -13,7 +13,8 @@ group delay; all lengths m. What is drawn, one sigma in `GnssRawOptions`:
     b    receiver clock, b' = drift + w_b:  drift a constant and a first-order Gauss-Markov part
          (paper 003 has the latter); a clock half a millisecond off is set by a whole one
     isb  offset of BeiDou against GPS in the receiver, constant
-    s    error of the broadcast orbit and clock, Gauss-Markov for each satellite
+    s    error of the broadcast orbit and clock of each satellite, as smooth as orbits: what follows
+         a Gauss-Markov process u, s' = (u - s) / T
     T    Saastamoinen's zenith delays with the wet one off by a constant, mapped by Niell
     I    Klobuchar's GPS model; GPS broadcasts other coefficients, BeiDou its own model's
     mp   multipath, Gauss-Markov for each signal: sigma_mp (0.13 + 0.53 exp(-E / 10 deg))
@@ -58,7 +59,7 @@ from fusiond.navigation.gps_time import GPS_EPOCH_POSIX_S
 from fusiond.simulation.gnss.masks import Mask, View
 from fusiond.simulation.gnss.nav_fields import quantised
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.markov import gauss_markov
+from fusiond.simulation.markov import gauss_markov, smooth_markov
 
 Array = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ class GnssRaw:
         self._multipath = gauss_markov(
             rng, (n, cells), step_s=step, correlation_s=o.multipath_correlation_s, sigma=1.0
         )
-        self._in_space = gauss_markov(
+        self._in_space = smooth_markov(
             rng,
             (n, len(self._slots)),
             step_s=step,
