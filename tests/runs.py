@@ -142,7 +142,7 @@ def level_nav(rpy: tuple[float, float, float], v: tuple[float, float, float]) ->
 def rest(
     max_speed_m_s: float = 0.5,
     mean_rate: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    evidence: RestEvidence | None = None,
+    rest_evidence: RestEvidence | None = None,
     end_s: float = 10.0,
     run: int = 1,
     scatter: Array | None = None,
@@ -152,4 +152,4 @@ def rest(
     force, scatters = np.array([0.0, 0.0, -9.8]), np.zeros(3) if scatter is None else scatter
     window = Window(round(end_s * 1e9), 100, rate, force, True, run, rate, scatters)
     sd_rate = math.radians(0.1)
-    return Rest(window, evidence or RestEvidence(), max_speed_m_s, 0.05, sd_rate, 0.0)
+    return Rest(window, rest_evidence or RestEvidence(), max_speed_m_s, 0.05, sd_rate, 0.0)

@@ -234,10 +234,10 @@ class Navigator:
     # ------------------------------------------------------------------ running
 
     def tick(self, t_ns: int) -> None:
-        """It is `t_ns`: navigate by what there is where no inertial unit says anything, then
-        `advance`."""
-        self.without_imu.tick(t_ns, self.imu, self.started is not None)
+        """It is `t_ns`: `advance`, and navigate by what there is where no inertial unit says
+        anything."""
         self.advance()
+        self.without_imu.tick(t_ns, self.imu, self.started is not None)
 
     def advance(self, record: bool = False) -> None:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""

@@ -99,7 +99,7 @@ async def test_a_refused_connection_is_an_absent_device_until_the_server_is_ther
         await until(lambda: receiver.state == "absent")
         assert receiver.detail == f"{server.address}: Connection refused; retrying"
         (advice,) = open_findings("gnss", receiver.driver, receiver.options, 5.0)
-        assert "start what serves it" in advice
+        assert "start its server" in advice
         async with server.up():
             await until(lambda: bool(server.clients))
             server.send(gga(29) + rmc(29))

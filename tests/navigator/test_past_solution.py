@@ -77,7 +77,7 @@ def test_before_the_history_nothing_is_known() -> None:
         solution = navigator.solution(t_ns)
         assert solution.mode is Mode.INVALID
         assert np.isnan(solution.lat_rad)
-        assert solution.reason == "before the history that is kept"
+        assert solution.reason == "Before the stored history"
 
 
 def test_before_the_start_the_mode_says_what_is_missing() -> None:

@@ -209,6 +209,11 @@ CHANGED: dict[str, dict[str, Any]] = {
         "estimator.federated.fault_detection": False,
         "aiding": {name: BASE["aiding"][name] for name in ("gnss", "rdss")},
     },
+    "federated, correlated": {
+        "estimator.filter": "federated",
+        "estimator.federated.fusion": "correlated",
+        "aiding": {name: BASE["aiding"][name] for name in ("gnss", "rdss")},
+    },
     "federated with detection": {
         "estimator.filter": "federated",
         "estimator.federated.mode": "rescale",
