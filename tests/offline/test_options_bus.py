@@ -83,7 +83,11 @@ def by_daemon(config: Config, messages: Iterable[can.Message]) -> Told:
     chain = Chain(config, clock, Events(clock))
     inputs = chain.sources.inputs
     taken = 0
-    for k in range(stamps[0] // tick_ns, stamps[-1] // tick_ns + 2):
+    # Behind the inertial unit's end the daemon goes on by fixes alone; a file ends there.
+    last = stamps[-1]
+    if config.imu.spare is None:
+        last = stamps[0] + round((FAILS_S + 1.0) * 1e9)
+    for k in range(stamps[0] // tick_ns, last // tick_ns + 2):
         while taken < len(stamps) and stamps[taken] <= k * tick_ns:
             m, host.mono = ordered[taken], stamps[taken]
             frame = CanFrame(m.arbitration_id, False, bytes(m.data), host.mono, host.mono)

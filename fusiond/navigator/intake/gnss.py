@@ -76,6 +76,8 @@ class _Receiver(NamedTuple):
     """True if the model has states for what its fixes share: its section is configured."""
     told: bool
     """True if the section says what fixes share, beside what they state."""
+    shared_m: tuple[float, float]
+    """One sigma of the states of that, horizontal and down."""
 
 
 def _receiver(source: str, sections: Sections) -> _Receiver:
@@ -85,8 +87,9 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
     time, velocity_time, lever = names
     bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
     holds = bool(bias) and any(section is o for section in sections.aiding.values())
-    told = o.bias_sd_m is not None
-    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds, told)
+    shared = o.bias_sd_m is not None, (o.shared_sd_m, o.bias_down_sd_m)
+    own = o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds
+    return _Receiver(*own, *shared)
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -126,7 +129,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     if shares is not None:
         wander_m = math.sqrt(shares.wanders) * _level(sd)
         if receiver.holds and not receiver.told:
-            share = _lasting(sd, shares, o)
+            share = _lasting(sd, shares, receiver.shared_m)
     height = m.height_m
     if receiver.holds:
         if m.geoid_sd_m:
@@ -259,12 +262,12 @@ def _shares(
     return known.shares(when.t_ns)
 
 
-def _lasting(sd: Vector3, shares: Shares, o: GnssAiding) -> Vector3:
+def _lasting(sd: Vector3, shares: Shares, shared_m: tuple[float, float]) -> Vector3:
     """Share of the common error of fixes in one of that sigma; what is seen of the
     horizontal is taken to be so of the height. Its own error counts as stated all the same: how a
     receiver that smooths its fixes follows a turn is in no share."""
     north, east, down = sd
-    level, vertical = (math.sqrt(shares.lasts) / s for s in (o.shared_sd_m, o.bias_down_sd_m))
+    level, vertical = (math.sqrt(shares.lasts) / s for s in shared_m)
     return level * north, level * east, vertical * down
 
 
