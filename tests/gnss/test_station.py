@@ -159,7 +159,15 @@ def placed_by_rtklib(obs: Any, nav: Any, system: System) -> Positions:
 
 @pytest.mark.parametrize(
     ("system", "each_m", "mean_m", "error_m"),
-    [("G", 4.0, 0.9, 2.5), ("E", 1.0, 0.4, 1.0), ("C", 2.4, 0.9, 1.1)],
+    [
+        ("G", 4.0, 0.9, 2.5),
+        ("E", 1.0, 0.4, 1.0),
+        ("C", 2.4, 0.9, 1.1),
+        pytest.param(
+            *("C", 0.8, 0.3, 1.1),
+            marks=pytest.mark.xfail(strict=True, reason="BeiDou-2 has an offset here, not there"),
+        ),
+    ],
 )
 def test_position_by_position_against_rtklib(
     epochs: list[RawGnssEpoch],

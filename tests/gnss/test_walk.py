@@ -66,9 +66,19 @@ def _errors(
     return np.array(errors), np.array(rates), found
 
 
+OF_ONE_FREQUENCY = pytest.mark.xfail(strict=True, reason="satellites go over to other signals")
+"""Bounds that held with one frequency."""
+
+
 @pytest.mark.parametrize(
     ("systems", "epochs", "scatter_m"),
-    [(("G", "E", "C"), 400, 1.5), (("C",), 350, 3.2), (("E",), 300, 1.8), (("G",), 60, 1.0)],
+    [
+        (("G", "E", "C"), 400, 1.5),
+        (("C",), 350, 3.2),
+        pytest.param(("C",), 350, 1.5, marks=OF_ONE_FREQUENCY),
+        (("E",), 300, 1.8),
+        (("G",), 60, 1.0),
+    ],
 )
 def test_scatter_about_the_mean(
     events: list[RawEvent], systems: tuple[System, ...], epochs: int, scatter_m: float
@@ -81,15 +91,25 @@ def test_scatter_about_the_mean(
     assert np.hypot(*late.std(axis=0)[:2]) < scatter_m
 
 
-def test_systems_agree_with_each_other(events: list[RawEvent]) -> None:
+@pytest.mark.parametrize(
+    ("left_out", "level_m", "height_m"),
+    [
+        (Bdgim, 5.0, 4.0),
+        (Klobuchar, 5.0, 4.0),
+        pytest.param(Bdgim, 3.0, 4.0, marks=OF_ONE_FREQUENCY),
+        pytest.param(Klobuchar, 3.6, 2.0, marks=OF_ONE_FREQUENCY),
+    ],
+)
+def test_systems_agree_with_each_other(
+    events: list[RawEvent], left_out: type, level_m: float, height_m: float
+) -> None:
     """With one ionosphere for all, and with what two carriers measure so far: within a minute or so
     that is little, and noisy (north by 4.3 m, east by 3.1 with Klobuchar's)."""
-    for left_out, level_m, height_m in ((Bdgim, 5.0, 4.0), (Klobuchar, 5.0, 4.0)):
-        of_one = [e for e in events if not isinstance(e, left_out)]
-        means = [_errors(of_one, (s,))[0][-250:].mean(axis=0) for s in ("G", "E", "C")]
-        apart = np.ptp(means, axis=0)
-        assert apart[:2].max() < level_m
-        assert apart[2] < height_m
+    of_one = [e for e in events if not isinstance(e, left_out)]
+    means = [_errors(of_one, (s,))[0][-250:].mean(axis=0) for s in ("G", "E", "C")]
+    apart = np.ptp(means, axis=0)
+    assert apart[:2].max() < level_m
+    assert apart[2] < height_m
 
 
 def _alone(events: list[RawEvent], signal: str, messages: tuple[str, ...]) -> dict[float, Any]:
