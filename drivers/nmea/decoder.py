@@ -158,6 +158,8 @@ class NmeaDecoder:
             self.counters["other_talker"] += 1
             if sentence.formatter in POSITIONS:
                 note(self.heard.talkers, sentence.talker)
+            else:
+                note(self.heard.unused, sentence.formatter)
             return
         try:
             self._group(sentence, t_seen_ns, found)

@@ -32,6 +32,7 @@ TALKERS_NOT_READ = {
 FULLER = frozenset({"GGA", "GNS", "RMC"})
 """Sentences that say all that GLL does."""
 POSITIONS = FULLER | {"GLL"}
+OF_A_COMPASS = ("HDM", "HDG", "HDT", "THS")
 OWN_SENTENCES = {
     "PUBX": "u-blox",
     "PTNL": "Trimble",
@@ -135,6 +136,12 @@ def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
         return CHECKSUMS
     if counters["bad_field"] and not POSITIONS & set(heard.used):
         return "the positions that arrive have fields that cannot be true (bad_field)"
+    heading = next((name for name in OF_A_COMPASS if name in heard.unused), "")
+    if heading and not POSITIONS & set(heard.used):
+        return (
+            f"headings of a compass arrive ({heading}), and no position: a source with "
+            'driver = "compass" reads them'
+        )
     names = [*heard.used, *heard.unused]
     which = f" ({', '.join(names[:MOST_NAMES])})" if names else ""
     if not counters["epochs"]:

@@ -198,6 +198,8 @@ def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
         ([changed(RMC, "GN", "XY")], "talker XY arrive"),
         ([made("GPTXT,01,01,02,u-blox"), made("GPGSV,1,1,00")], "(TXT, GSV), but none that counts"),
         ([made("GPGSV,1,1,00")], "switch on GGA and RMC"),
+        ([made("HEHDT,30.0,T"), made("HEROT,0.1,A")], 'compass arrive (HDT), and no position: a s'),
+        ([made("APXDR,A,3.8,D,ROLL"), made("APHDM,218.6,M")], 'driver = "compass" reads them'),
         ([made("PUBX,00,021429.00,3958.1,N,11619.5,E,45.3,G3,2.1,2.0")], "($PUBX: u-blox)"),
         ([made("PTNL,GGK,021429.00,061925,3958.1,N,11619.5,E,3,12,1,EHT45,M")], "($PTNL: Trimble)"),
         ([made("PSTI,030,021429.0,A,3958.1,N,11619.5,E,45.3")], "($PSTI: SkyTraq)"),
