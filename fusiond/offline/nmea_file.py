@@ -1,8 +1,9 @@
 """A file of NMEA as it came off the wire, through the decoders of the daemon: `--aid nmea=FILE`.
 
 The receiver's decoder has the options of its source in the configuration, so the file is read as
-the daemon reads the line: fixes, headings and attitudes of its antennas. HDG and HDM are a
-compass', and are heard where the configuration has one; so is HDT in a file without a receiver.
+the daemon reads the line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of a
+talker that is no receiver are a compass', and are heard where the configuration has one; so is any
+HDT in a file without a receiver.
 
 A file says no arrivals, so a measurement arrives when it is valid. What has no time of its own is
 of the epoch before it in the file, and what comes several times an epoch is spread evenly over it:
@@ -32,6 +33,7 @@ from drivers.measurements import (
 from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS
+from drivers.nmea.epochs import TALKERS
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
@@ -42,7 +44,10 @@ from fusiond.offline.week_rollover import rollover_of
 
 # A recording may be old; before selective availability ended there was no receiver worth replaying.
 EARLIEST_DATE = date(2000, 5, 1)
-_COMPASS = re.compile(rb"\$[A-Z]{2}HD[GM],")
+_COMPASS = re.compile(
+    rb"\$(?:[A-Z]{2}HD[GM]|(?!(?:%s)HDT)[A-Z]{2}HDT)," % "|".join(sorted(TALKERS)).encode()
+)
+"""HDT of another talker than a receiver's is a gyrocompass' (HE)."""
 _POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC|GLL),")
 _TIMED = re.compile(rb"\$[A-Z]{2}(?:(?:GGA|GNS|RMC|ZDA),|GLL,(?:[^,]*,){4})(?P<time>\d{6}[\d.]*),")
 _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
@@ -133,7 +138,9 @@ def read_nmea(
     of_week = imu_s is None
     in_order = sorted(found, key=lambda each: each[0])
     heard = [_heard(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
-    notes = [Rejection(0, *note, 0) for note in (*decoder.cautions.items(), *said)]
+    cautions = decoder.cautions
+    cautions.pop("compass_left_out", None)  # it is heard here, or counted
+    notes = [Rejection(0, *note, 0) for note in (*cautions.items(), *said)]
     return heard, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
 
 
