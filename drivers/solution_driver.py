@@ -76,8 +76,8 @@ class SolutionDriver(ReceiverDriver):
                 )
         if self.kind == "ubx" and counters["ubx_damaged"] >= MANY:
             return (
-                "UBX frames arrive with wrong checksums: check ground, cable length and that nobody "
-                "else reads this port"
+                "UBX frames arrive with wrong checksums: check ground, cable length and that "
+                "nobody else reads this port"
             )
         found = named(bytes(self._foreign))
         return "" if f'driver = "{self.kind}"' in found else found

@@ -192,6 +192,6 @@ def _text(data: bytes) -> str:
         return ""
     shown = max(lines[1:-1], key=len)[:SHOWN].decode("ascii", "replace")
     return (
-        f"text arrives that is no NMEA, such as {shown!r}: a console or a modem is on this port, or "
-        "the receiver is set to another output"
+        f"text arrives that is no NMEA, such as {shown!r}: a console or a modem is on this "
+        "port, or the receiver is set to another output"
     )

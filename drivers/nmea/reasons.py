@@ -118,8 +118,8 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
         return "RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
     if counters["ubx_damaged"] >= MANY:
         return (
-            f"{counters['ubx_damaged']} UBX frames arrive with wrong checksums: check ground, cable "
-            "length and that nobody else reads this port"
+            f"{counters['ubx_damaged']} UBX frames arrive with wrong checksums: check ground, "
+            "cable length and that nobody else reads this port"
         )
     return named(unread)
 

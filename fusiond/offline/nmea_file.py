@@ -38,6 +38,7 @@ from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.week_rollover import rollover_of
@@ -133,7 +134,7 @@ def read_nmea(
     found += epochs.spread(untimed)
     refused["untimed"] += 0 if epochs.times else len(untimed)
     if not found:
-        raise TableError(f"{path}: {_why_nothing(decoder, refused)}")
+        raise TableError(f"{path}: {_why_nothing(decoder, refused, kind_of(log.data))}")
     add_ns, said = rollover_of([utc_ns for utc_ns, _ in found], imu_s)
     of_week = imu_s is None
     in_order = sorted(found, key=lambda each: each[0])
@@ -207,13 +208,13 @@ def _is_refusal(name: str) -> bool:
     return name in REFUSALS or name in known or name.endswith(_LEFT_OUT)
 
 
-def _why_nothing(decoder: NmeaDecoder, refused: Counter[str]) -> str:
-    """In words, what stands in the way of a measurement."""
+def _why_nothing(decoder: NmeaDecoder, refused: Counter[str], kind: str) -> str:
+    """In words, what stands in the way of a measurement; `kind` is what the file may be else."""
     if refused["undated"] or refused["untimed"]:
         missing = "no measurement with a date (RMC or ZDA missing)"
         return decoder.cautions.get("implausible_date", missing)
     if not decoder.counters["sentences"]:
-        return decoder.cause or "no NMEA sentence whose checksum is right"
+        return kind or decoder.cause or "no NMEA sentence whose checksum is right"
     name = max(REFUSALS, key=lambda each: refused[each])
     if refused[name]:
         return REFUSALS[name]
