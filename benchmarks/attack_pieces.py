@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +36,26 @@ from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 
 PIECES = {"sent": "_send_one", "heard": "_hear_one", "turn": "_turn", "look": "_look"}
+_OF_QUEUES = ("sent", "heard")
 
 
-class TimedGuests(Guests):
-    """Remembers how long each kind of its work took at most."""
+class Longest(defaultdict[str, int]):
+    """How long each kind of work took at most, ns."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.longest_ns: dict[str, int] = defaultdict(int)
-        for title, name in PIECES.items():
-            setattr(self, name, self._timed(title, getattr(self, name)))
+        super().__init__(int)
+
+    def watch(self, worker: Any, titles: Iterable[str]) -> None:
+        """Time the pieces of one who works."""
+        for title in titles:
+            setattr(worker, PIECES[title], self._timed(title, getattr(worker, PIECES[title])))
 
     def _timed(self, title: str, work: Callable[[], Any]) -> Callable[[], Any]:
         def timed() -> Any:
             begun_ns = time.thread_time_ns()
             done = work()
             took_ns = time.thread_time_ns() - begun_ns
-            self.longest_ns[title] = max(self.longest_ns[title], took_ns)
+            self[title] = max(self[title], took_ns)
             return done
 
         return timed
@@ -71,15 +74,18 @@ async def _feed(outputs: Sequence[Output]) -> None:
 
 
 async def main(seconds: str) -> None:
-    guests = TimedGuests()
+    guests, longest_ns = Guests(), Longest()
+    longest_ns.watch(guests, PIECES.keys() - _OF_QUEUES)
     around = Surroundings("load", lambda code, text: None, guests=guests)
     ports = Ports(*(free_port() for _ in Ports._fields))
-    outputs: list[Output] = [
+    outputs = (
         GpsdServer(Gpsd(port=ports.gpsd), around),
         NmeaServer(NmeaServed(port=ports.nmea), around),
         PrometheusEndpoint(Prometheus(port=ports.prometheus), around),
         FoxgloveServer(Foxglove(port=ports.foxglove), around),
-    ]
+    )
+    for output in outputs:
+        longest_ns.watch(output.server.queue, _OF_QUEUES)
     tasks = [asyncio.create_task(output.run()) for output in outputs]
     tasks.append(asyncio.create_task(_feed(outputs)))
     await asyncio.sleep(1.0)
@@ -88,14 +94,14 @@ async def main(seconds: str) -> None:
     gc.disable()
     print("".join(title.rjust(18 if title == "attack" else 8) for title in ("attack", *PIECES)))
     for name in (name for name in ATTACKS if name not in OVER_THE_BROKER):
-        guests.longest_ns.clear()
+        longest_ns.clear()
         attack = await asyncio.create_subprocess_exec(
             *(sys.executable, str(Path(__file__).with_name("attackers.py"))),
             *map(str, (name, seconds, *ports)),
             stdout=subprocess.DEVNULL,
         )
         await attack.wait()
-        row = (f"{guests.longest_ns[title] * 1e-6:.2f}".rjust(8) for title in PIECES)
+        row = (f"{longest_ns[title] * 1e-6:.2f}".rjust(8) for title in PIECES)
         print(name.rjust(18) + "".join(row), flush=True)
     for task in tasks:
         task.cancel()

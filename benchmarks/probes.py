@@ -49,8 +49,9 @@ def gap_ms(times_s: list[float]) -> float:
 
 
 def _told(topic: str) -> re.Pattern[bytes]:
-    """A publication's instant; topic and payload are neighbours with QoS 0."""
-    return re.compile(re.escape(topic.encode()) + rb'\{.{0,60}?"t_ms":(\d+)', re.DOTALL)
+    """A publication's instant; between topic and payload MQTT 5 has its properties (QoS 0)."""
+    payload = rb'[^{]{0,16}\{.{0,60}?"t_ms":(\d+)'
+    return re.compile(re.escape(topic.encode()) + payload, re.DOTALL)
 
 
 def _text(data: bytes) -> bytes:

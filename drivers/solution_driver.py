@@ -11,6 +11,7 @@ from drivers.base import Emit, Now, monotonic_ns
 from drivers.decoding import SolutionDecoding
 from drivers.nmea.framing import StreamSplitter
 from drivers.nmea.protocols import named
+from drivers.nmea.reasons import MANY
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 from drivers.solution import REFUSALS
 
@@ -73,6 +74,11 @@ class SolutionDriver(ReceiverDriver):
                     f"{what} arrives, but no {self.wanted}: {self.switch_on}, or have {what} "
                     f'read: driver = "{driver}"'
                 )
+        if self.kind == "ubx" and counters["ubx_damaged"] >= MANY:
+            return (
+                "UBX frames arrive with wrong checksums: check ground, cable length and that "
+                "nobody else reads this port"
+            )
         found = named(bytes(self._foreign))
         return "" if f'driver = "{self.kind}"' in found else found
 

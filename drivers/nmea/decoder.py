@@ -60,7 +60,7 @@ class NmeaDecoder:
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
     `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `gga_awaited`,
-    `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`.
+    `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`.
     """
 
     def __init__(
@@ -153,11 +153,15 @@ class NmeaDecoder:
             self.counters["unused_sentence"] += 1
             own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
             note(self.heard.unused, sentence.address if own else sentence.formatter)
+            if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ
+                note(self.heard.talkers, sentence.address[:2])
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
             if sentence.formatter in POSITIONS:
                 note(self.heard.talkers, sentence.talker)
+            else:
+                note(self.heard.unused, sentence.formatter)
             return
         try:
             self._group(sentence, t_seen_ns, found)

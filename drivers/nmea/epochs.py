@@ -95,6 +95,8 @@ class Epoch:
     raws: set[bytes] = field(default_factory=set)
     """The sentences themselves, which may be said twice."""
     day: date | None = None
+    no_date: str = ""
+    """A date that is printed and is none."""
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
     unknown_status: str = ""
@@ -302,6 +304,10 @@ def _take_gns(epoch: Epoch, fields: Fields) -> None:
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
 
 
+_DATE_AT = 8
+"""Of RMC's fields, printed."""
+
+
 def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     speed, course = _number(fields, "spd", 0.0), _angle(fields, "cog")
     status, mode = _letter(fields, "status"), _letter(fields, "posMode")
@@ -316,7 +322,9 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
         epoch.unknown_status = status
     epoch.modes |= set(mode)
     day = fields.get("date", "")
-    if isinstance(day, date):
+    if not isinstance(day, date):
+        epoch.no_date = "".join(fields["printed"][_DATE_AT : _DATE_AT + 1]).strip()
+    else:
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
     if speed is not None and epoch.rmc_valid:
         epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course

@@ -63,6 +63,9 @@ class EpochJudge:
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
             note(self._heard.statuses, epoch.unknown_status)
+        if epoch.no_date:
+            self.counters["bad_date"] += 1
+            self._heard.no_date = epoch.no_date
         if epoch.quality is None and epoch.plain_valid is not None:
             self._without_gga += 1
             if self._without_gga >= PLAIN_AFTER:

@@ -19,9 +19,19 @@ FEWEST = 2
 MOST_TRIES = 100
 """Beginnings that are looked at: each may ask for a sum of all bytes."""
 
+MOSTLY = 0.98
+"""Share of letters that are printed: at another rate, and in other protocols, a third."""
+SHOWN = 40
+"""Letters of a line that are told."""
+
+_LINE_ENDS = re.compile(rb"[\r\n]+")
+_PRINTED = re.compile(rb"[\t\x20-\x7e]")
 _NOVATEL_TEXT = re.compile(rb"#[A-Z][A-Z0-9]{3,15},[^\r\n#$]{20,600}\*[0-9a-fA-F]{8}\r?\n?")
+_AIS = re.compile(rb"![A-Z]{2}VD[MO],[\x20-\x7e]{5,90}\*[0-9A-F]{2}")
+_ACTISENSE = re.compile(rb"\x10\x02[\x93-\x95\xa0\xd0](?:[^\x10]|\x10\x10){5,250}\x10\x03")
 _TSIP = re.compile(rb"(?<!\x10)\x10[^\x03\x10](?:[^\x10]|\x10\x10){1,250}\x10\x03")
 _GPSD = re.compile(rb'\{"class":"[A-Z]+"')
+_SENTENCE = re.compile(rb"\$([A-Z]{4,5},[\x20-\x7e]{0,100}?)\*([0-9A-F]{2})")
 _BARE = re.compile(rb"(?:^|[\r\n])[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG),[^\r\n$]*[\r\n]")
 
 
@@ -113,6 +123,15 @@ def _oncore(d: bytes, at: int) -> int:
 
 
 _SWITCH = "switch on NMEA (GGA, RMC, GST) at the receiver"
+
+
+def _with_parity(data: bytes) -> int:
+    """Sentences that verify without the eighth bit, which a line of seven data bits has for its
+    parity."""
+    found = _SENTENCE.findall(bytes(byte & 0x7F for byte in data))
+    return sum(reduce(xor, said) == int(check, 16) for said, check in found)
+
+
 _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
     ("Septentrio's SBF", _framed(b"$@", _sbf), f'{_SWITCH}, or have it read: driver = "sbf"'),
     ("binary logs of NovAtel or Unicore", _framed(b"\xaa\x44", _novatel), _SWITCH),
@@ -128,11 +147,26 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
     ("MTK's binary protocol", _framed(b"\x04\x24", _mtk), _SWITCH),
     ("Zodiac's binary protocol", _framed(b"\xff\x81", _zodiac), _SWITCH),
     ("Motorola's OnCore protocol", _framed(b"@@", _oncore), _SWITCH),
+    (
+        "AIS (!AIVDM)",
+        lambda d: len(_AIS.findall(d)),
+        "it tells where others are: take the receiver's own output",
+    ),
+    (
+        "NMEA 2000 by an Actisense gateway",
+        lambda d: len(_ACTISENSE.findall(d)),
+        "set the gateway to NMEA 0183",
+    ),
     ("Trimble's TSIP or Garmin's binary protocol", lambda d: len(_TSIP.findall(d)), _SWITCH),
     (
         "gpsd's JSON",
         lambda d: len(_GPSD.findall(d)),
         "set port to gpsd://HOST, which asks gpsd for what the receiver says",
+    ),
+    (
+        "NMEA with a parity bit",
+        _with_parity,
+        "set the receiver's port to eight data bits without parity (8N1)",
     ),
     (
         "NMEA without its $",
@@ -147,4 +181,17 @@ def named(data: bytes) -> str:
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
             return f"{name} arrives, which is not read here: {remedy}"
-    return ""
+    return _text(data)
+
+
+def _text(data: bytes) -> str:
+    """Of lines that a person could read: none is so at another rate."""
+    lines = [line for line in _LINE_ENDS.split(data) if line.strip()]
+    letters = sum(len(_PRINTED.findall(line)) for line in lines)
+    if len(lines) < FEWEST + 1 or letters < MOSTLY * sum(map(len, lines)):
+        return ""
+    shown = max(lines[1:-1], key=len)[:SHOWN].decode("ascii", "replace")
+    return (
+        f"text arrives that is no NMEA, such as {shown!r}: a console or a modem is on this "
+        "port, or the receiver is set to another output"
+    )

@@ -32,6 +32,7 @@ TALKERS_NOT_READ = {
 FULLER = frozenset({"GGA", "GNS", "RMC"})
 """Sentences that say all that GLL does."""
 POSITIONS = FULLER | {"GLL"}
+OF_A_COMPASS = ("HDM", "HDG", "HDT", "THS")
 OWN_SENTENCES = {
     "PUBX": "u-blox",
     "PTNL": "Trimble",
@@ -77,6 +78,8 @@ class Heard:
     statuses: Counter[str] = field(default_factory=Counter)
     """Of RMC, that are no letter of the standard."""
     implausible_date: date | None = None
+    no_date: str = ""
+    """A date of RMC that is printed and is none."""
 
 
 def note(names: Counter[str], name: str) -> None:
@@ -101,6 +104,11 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
     """Reason why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
     if wrong := wrong_checksums(counters):
         return wrong
+    if counters["address_bad"] >= MANY:
+        return (
+            "sentences arrive whose names are none of NMEA (small letters?), and are not read: "
+            "take them as the receiver sends them, or set it to GGA and RMC"
+        )
     if counters["ubx_frames"]:
         return (
             "UBX frames arrive, but no NMEA: switch on NMEA output on this port, or have UBX read: "
@@ -108,6 +116,11 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
         )
     if counters["rtcm_frames"]:
         return "RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
+    if counters["ubx_damaged"] >= MANY:
+        return (
+            f"{counters['ubx_damaged']} UBX frames arrive with wrong checksums: check ground, "
+            "cable length and that nobody else reads this port"
+        )
     return named(unread)
 
 
@@ -133,13 +146,26 @@ def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
         )
     if counters["checksum_missing"] >= MANY:
         return CHECKSUMS
+    if counters["untimed_epoch"] and POSITIONS & set(heard.used):
+        return "positions arrive without a time of day, and are not used: give the antenna more sky"
     if counters["bad_field"] and not POSITIONS & set(heard.used):
         return "the positions that arrive have fields that cannot be true (bad_field)"
+    heading = _heading(heard)
+    if heading and not POSITIONS & set(heard.used):
+        return (
+            f"headings of a compass arrive ({heading}), and no position: a source with "
+            'driver = "compass" reads them'
+        )
     names = [*heard.used, *heard.unused]
     which = f" ({', '.join(names[:MOST_NAMES])})" if names else ""
     if not counters["epochs"]:
         return f"sentences arrive{which}, but none that counts: switch on GGA and RMC"
     return f"epochs arrive{which}, but none has a position: switch on GGA"
+
+
+def _heading(heard: Heard) -> str:
+    """A sentence of a compass that has been left out; "" where none has."""
+    return next((name for name in OF_A_COMPASS if name in heard.unused), "")
 
 
 def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, str]:
@@ -148,6 +174,11 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
     day = heard.implausible_date
     if day is not None:
         found["implausible_date"] = implausible_date(day, earliest)
+    if counters["bad_date"] >= MANY:
+        found["bad_date"] = (
+            f"RMC has {heard.no_date[:8]!r} for a date, which is none: its times of day are used, "
+            "and the date is another source's"
+        )
     if counters["checksum_missing"] >= MANY and counters["sentences"]:
         found["checksum_missing"] = CHECKSUMS
     if counters["height_above_sea"] > counters["fixes"] // 2:
@@ -163,14 +194,23 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
     if counters["height_missing"] > counters["fixes"] // 2:
         found["height_missing"] = "the altitude in GGA is empty: fixes are used without a height"
     if counters["rmc_alone"]:
+        refused = " (other sentences have fields that cannot be true)" * (
+            counters["bad_field"] >= MANY
+        )
         found["rmc_alone"] = (
-            "only RMC has a position: it is used without height and with the sigma of a poor sky; "
-            "switch on GGA and GST"
+            f"only RMC has a position{refused}: it is used without height and with the sigma of a "
+            "poor sky; switch on GGA and GST"
         )
     if counters["gll_alone"]:
         found["gll_alone"] = (
             "only GLL has a position: it is used without height and with the sigma of a poor sky; "
             "switch on GGA, RMC and GST"
+        )
+    heading = _heading(heard)
+    if heading and counters["fixes"]:
+        found["compass_left_out"] = (
+            f"headings of a compass arrive ({heading}), which a receiver's source does not use: a "
+            'source with driver = "compass" reads them'
         )
     if counters["integrated"]:
         found["integrated"] = (

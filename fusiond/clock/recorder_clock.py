@@ -89,6 +89,11 @@ class RecorderClock:
         own_ns = self._of_channel.get(of[0], stamp_ns)
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
+    def leaps(self, change_ns: int) -> bool:
+        """True if stamps that advance by so much say that the clock was set, or paused."""
+        spacing_ns = max(self._spacings, default=0)
+        return change_ns < -AHEAD_NS or change_ns >= max(LEAP_NS, ORDINARY * spacing_ns)
+
     def next(self, stamp_ns: int, of: Of) -> None:
         """The stamp of a frame, which is not odd."""
         if stamp_ns >= self.stamp_ns:
@@ -122,7 +127,7 @@ class RecorderClock:
             return "taken"
         if change > AHEAD_NS and self._is_ahead(stamp_ns, following):
             return "time_ahead"
-        if change >= max(LEAP_NS, ORDINARY * max(self._spacings, default=0)):
+        if self.leaps(change):
             set_ns = set_by_utc()
             if set_ns is not None and abs(set_ns) >= LEAP_NS // 2 and change - set_ns > -AHEAD_NS:
                 self._step(stamp_ns, set_ns, of)
@@ -180,6 +185,20 @@ class RecorderClock:
         """Of a stamp that leapt: whether most of what follows has not."""
         behind = [f for f in following if self.stamp_ns - AHEAD_NS < f < stamp_ns - AHEAD_NS]
         return 2 * len(behind) > len(following)
+
+
+def own_share(total_ns: int, own_ns: int, others_ns: int) -> int | None:
+    """Of several leaps that together were set by `total_ns`: by how much the first, of `own_ns`,
+    was. All of them were set, or the first alone, or none but the others; else None."""
+    for expected_ns, share_ns in (
+        (own_ns + others_ns, own_ns),
+        (own_ns, own_ns),
+        (0, 0),
+        (others_ns, 0),
+    ):
+        if abs(total_ns - expected_ns) < LEAP_NS:
+            return share_ns
+    return None
 
 
 def set_by(before: Sequence[int], after: Sequence[int]) -> int | None:

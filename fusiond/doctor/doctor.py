@@ -43,6 +43,9 @@ DAMAGED_SHARE = 0.001
 """A sound line damages less than one item in a thousand."""
 SYSTEM_CLOCK_S = 1.0
 """System clock against GNSS: beyond it logs and file dates mislead."""
+ROLLOVER_S = 1024 * 604_800.0
+"""Of the GPS week's ten bits."""
+DAY_S = 86_400.0
 OLD_FIX_S = 1.0
 """Receivers send within 0.3 s of the epoch; older means a line too slow for its sentences."""
 _BROKER_S = 5.0
@@ -269,7 +272,10 @@ def _clock(clock: Clock, config: Config) -> Report:
     if status.system_error_s is not None:
         error = status.system_error_s
         report.facts.append(f"system clock minus GNSS: {error:+.3f} s")
-        if abs(error) > SYSTEM_CLOCK_S:
+        rollovers = round(error / ROLLOVER_S)
+        if rollovers and abs(error - rollovers * ROLLOVER_S) < DAY_S:
+            report.findings.append(finding("week_rollover", weeks=-rollovers * 1024))
+        elif abs(error) > SYSTEM_CLOCK_S:
             report.findings.append(finding("system_clock", error=error))
     elif status.utc_source == "none":
         report.findings.append(finding("no_utc"))

@@ -90,6 +90,10 @@ FINDINGS: Mapping[str, str] = {
         "Fixes are up to {age:.1f} s old on arrival: raise the baud rate or switch off sentences "
         "that are not needed (GSV)"
     ),
+    "week_rollover": (
+        "The receiver's date is {weeks:+d} weeks off the system clock's: its GPS week has rolled "
+        "over (1024 weeks); update the receiver, whose dates cannot be used"
+    ),
     "system_clock": (
         "The system clock is {error:+.1f} s off GNSS: timedatectl set-ntp true, or chrony with "
         "gpsd; navigation does not need it, logs and other programs do"

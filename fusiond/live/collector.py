@@ -19,6 +19,9 @@ _FORCED_NS = (100 * _MS, 1_000 * _MS, 20_000 * _MS)
 """Cycles hold memory, and each collection takes longer: done now if no slack was long enough."""
 _DEAR_NS = 4 * _MS
 """The oldest generation was full of garbage: then it is looked through more often, by as much."""
+_MOST_PATIENCE = 32
+"""Where it had none at all its wait doubles, up to five minutes: what lives costs 4 to 11 ms there
+each time, a whole tick after a long one."""
 _SLACK_MARGIN_NS = 500_000
 
 
@@ -29,6 +32,8 @@ class Collector:
         self._now = now
         self._cost_ns = [0, 0, 0]
         self._last_ns = [0, 0, 0]
+        self._patience = 1
+        """Of the oldest generation: by so much its times are longer."""
         self._was_enabled = gc.isenabled()
         self.collections = 0
         self.forced = 0
@@ -48,19 +53,25 @@ class Collector:
             gc.enable()
 
     def use_slack(self, slack_ns: int) -> None:
-        """Collect the oldest generation that is due, if twice its last cost fits the slack."""
+        """Collect the oldest generation that is due, if its last cost and half of it fit the
+        slack."""
         start_ns = self._now()
         for generation in (2, 1, 0):
             cost_ns = self._cost_ns[generation]
-            since_ns = (start_ns - self._last_ns[generation]) * max(1, cost_ns // _DEAR_NS)
+            since_ns = start_ns - self._last_ns[generation]
+            if generation == 2:
+                dear = max(1, cost_ns // _DEAR_NS) if self._patience == 1 else 1
+                since_ns = since_ns * dear // self._patience
             if since_ns < _DUE_NS[generation]:
                 continue
-            fits = 2 * cost_ns + _SLACK_MARGIN_NS < slack_ns
+            fits = 3 * cost_ns // 2 + _SLACK_MARGIN_NS < slack_ns
             if fits or since_ns >= _FORCED_NS[generation]:
-                gc.collect(generation)
+                found = gc.collect(generation)
                 cost_ns = self._now() - start_ns
                 self._cost_ns[generation] = cost_ns
                 self._last_ns[: generation + 1] = [start_ns] * (generation + 1)
+                if generation == 2:
+                    self._patience = 1 if found else min(2 * self._patience, _MOST_PATIENCE)
                 self.max_ns = max(self.max_ns, cost_ns)
                 self.collections += 1
                 self.forced += not fits

@@ -37,6 +37,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
 from fusiond.files.tables import (
     ImuTable,
@@ -288,7 +289,8 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
             now = event.stamp.utc_ns
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
     if not epochs:
-        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)")
+        nothing = "no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)"
+        raise TableError(f"{path}: {kind_of(log.data) or nothing}")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     return [*(Arrival(first_ns, event) for event in broadcast), *epochs], [*log.notes, *refused]

@@ -36,12 +36,11 @@ from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
 from fusiond.clock.recorder_clock import (
-    AHEAD_NS,
     ENOUGH_REPORTS,
     FOLLOWING,
-    LEAP_NS,
     REPORTS,
     RecorderClock,
+    own_share,
     set_by,
 )
 from fusiond.configuration.load import driver_entry_points
@@ -160,7 +159,9 @@ class _Replay:
                 if verdict != "taken":
                     refused[verdict] += 1
                     continue
-                if len(recorder.steps) == steps and self._arrivals:
+                if len(recorder.steps) > steps:
+                    self._follow(recorder.steps[-1].set_ns)
+                elif self._arrivals:
                     self._tell_pause(stamp_ns - before_ns)
             else:
                 recorder.next(stamp_ns, of)
@@ -229,14 +230,20 @@ class _Replay:
             how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
             self._told("recorder_clock_off", f"the recorder's clock is off {how}")
 
+    def _follow(self, set_ns: int) -> None:
+        """Reports of UTC before a step as the clock would have stamped them that was set."""
+        for reports in self._reports.values():
+            for k, ahead_ns in enumerate(reports):
+                reports[k] = ahead_ns + set_ns
+
     def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
         """By how much the recorder's clock was set before this frame, by the reports of UTC of the
-        sources that have told it before and go on to tell it."""
+        sources that have told it before and go on to tell it: behind further leaps, too."""
         known = {name for name, reports in self._reports.items() if reports}
         if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None
         after: dict[str, list[int]] = {name: [] for name in known}
-        stamp_ns = first_ns
+        stamp_ns, passed_ns, others_ns = first_ns, 0, list[int]()
 
         def emit(item: Emitted) -> None:
             if isinstance(item, TimeReport) and item.trusted and item.source in known:
@@ -247,18 +254,26 @@ class _Replay:
         for driver in buses.get(first.channel, ()):
             driver.feed(_frame(first, first_ns, first_ns))
         for message, ns in frames.ahead():
-            leaps = not stamp_ns - AHEAD_NS < ns < stamp_ns + AHEAD_NS + LEAP_NS
-            if leaps or ns > first_ns + REPORTS_WITHIN_NS:
+            change_ns = ns - stamp_ns
+            if self._recorder.leaps(change_ns):
+                others_ns.append(change_ns)
+                stamp_ns = ns
+            elif change_ns > 0:
+                passed_ns += change_ns
+                stamp_ns = ns
+            if passed_ns > REPORTS_WITHIN_NS:
                 break
-            stamp_ns = max(stamp_ns, ns)
             for driver in buses.get(message.channel, ()):
                 driver.feed(_frame(message, stamp_ns, stamp_ns))
             if any(len(reports) >= ENOUGH_REPORTS for reports in after.values()):
                 break
         if not any(after.values()):
             self._silent_ns = first_ns, stamp_ns
-        found = (set_by(self._reports[name], reports) for name, reports in after.items())
-        return next((ns for ns in found if ns is not None), None)
+        sets = (set_by(self._reports[name], reports) for name, reports in after.items())
+        found = next((ns for ns in sets if ns is not None), None)
+        if found is None or not others_ns:
+            return found
+        return own_share(found, first_ns - self._recorder.stamp_ns, sum(others_ns))
 
     def _scouted(self, scouts: dict[str, CanDriver[Any]]) -> dict[Any, list[CanDriver[Any]]]:
         """The scouts in the places of the drivers."""

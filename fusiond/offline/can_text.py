@@ -7,6 +7,7 @@ python-can reads is said in its words:
     candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
     stamps as differences      candump -t d, ASC "timestamps relative": summed
     stamps before the trigger  ASC -0.5: without the sign, which `before_trigger_s` remembers
+    decimal commas             ASC 0,5 of a German or French Windows
     CANFD without a channel    ASC "CANFD   Start of measurement" and the like: no frame
 
 Sources: can-utils, candump.c and lib.c (`snprintf_long_canframe`); Vector, ASC format description.
@@ -231,13 +232,13 @@ def _fall_or_stand(stamps: list[float]) -> bool:
 
 # --------------------------------------------------------------------------- Vector's ASC
 
-_STAMPED = re.compile(r"\s*(-?)(\d+)\.(\d+)(?=\s)")
+_STAMPED = re.compile(r"\s*(-?)(\d+)([.,])(\d+)(?=\s)")
 _RELATIVE = re.compile(r"\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
 _HEADER = re.compile(
     r"\s*(date\s+\w+\s|base\s|//|(no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE
 )
 _HEADER_OVER = re.compile(r"\s*((no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE)
-_FD_EVENT = re.compile(r"\s*-?\d+\.\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
+_FD_EVENT = re.compile(r"\s*-?\d+[.,]\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
 HEADER_ENDS = "internal events logged"
 """A line after which python-can's reader of ASC looks for frames."""
 
@@ -265,10 +266,10 @@ class Asc:
             return None if not self._relative else self._counted(found, "")
         if self._relative:
             return self._counted(found, line[found.end() :])
+        stamp = f"{found[2]}.{found[4]}"
         if found[1]:
-            self.before_trigger_s = float(f"{found[2]}.{found[3]}")
-            return f"{found[2]}.{found[3]}{line[found.end() :]}"
-        return line
+            self.before_trigger_s = float(stamp)
+        return f"{stamp}{line[found.end() :]}" if found[1] or found[3] == "," else line
 
     def _of_header(self, line: str) -> str | None:
         """A line before the first frame. The reader ends the header at one that it does not know, a
@@ -279,7 +280,7 @@ class Asc:
 
     def _counted(self, found: re.Match[str], rest: str) -> str | None:
         """A difference to the event before, of whatever kind that was: summed."""
-        ns = int(found[2]) * 10**9 + int(found[3][:9].ljust(9, "0"))
+        ns = int(found[2]) * 10**9 + int(found[4][:9].ljust(9, "0"))
         self._sum_ns += -ns if found[1] else ns
         seconds, fraction = divmod(max(0, self._sum_ns), 10**9)
         return f"{seconds}.{fraction:09d}{rest}" if rest else None

@@ -1,8 +1,9 @@
 """A file of NMEA as it came off the wire, through the decoders of the daemon: `--aid nmea=FILE`.
 
 The receiver's decoder has the options of its source in the configuration, so the file is read as
-the daemon reads the line: fixes, headings and attitudes of its antennas. HDG and HDM are a
-compass', and are heard where the configuration has one; so is HDT in a file without a receiver.
+the daemon reads the line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of a
+talker that is no receiver are a compass', and are heard where the configuration has one; so is any
+HDT in a file without a receiver.
 
 A file says no arrivals, so a measurement arrives when it is valid. What has no time of its own is
 of the epoch before it in the file, and what comes several times an epoch is spread evenly over it:
@@ -32,17 +33,22 @@ from drivers.measurements import (
 from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS
+from drivers.nmea.epochs import TALKERS
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.week_rollover import rollover_of
 
 # A recording may be old; before selective availability ended there was no receiver worth replaying.
 EARLIEST_DATE = date(2000, 5, 1)
-_COMPASS = re.compile(rb"\$[A-Z]{2}HD[GM],")
+_COMPASS = re.compile(
+    rb"\$(?:[A-Z]{2}HD[GM]|(?!(?:%s)HDT)[A-Z]{2}HDT)," % "|".join(sorted(TALKERS)).encode()
+)
+"""HDT of another talker than a receiver's is a gyrocompass' (HE)."""
 _POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC|GLL),")
 _TIMED = re.compile(rb"\$[A-Z]{2}(?:(?:GGA|GNS|RMC|ZDA),|GLL,(?:[^,]*,){4})(?P<time>\d{6}[\d.]*),")
 _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
@@ -128,12 +134,14 @@ def read_nmea(
     found += epochs.spread(untimed)
     refused["untimed"] += 0 if epochs.times else len(untimed)
     if not found:
-        raise TableError(f"{path}: {_why_nothing(decoder, refused)}")
+        raise TableError(f"{path}: {_why_nothing(decoder, refused, kind_of(log.data))}")
     add_ns, said = rollover_of([utc_ns for utc_ns, _ in found], imu_s)
     of_week = imu_s is None
     in_order = sorted(found, key=lambda each: each[0])
     heard = [_heard(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
-    notes = [Rejection(0, *note, 0) for note in (*decoder.cautions.items(), *said)]
+    cautions = decoder.cautions
+    cautions.pop("compass_left_out", None)  # it is heard here, or counted
+    notes = [Rejection(0, *note, 0) for note in (*cautions.items(), *said)]
     return heard, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
 
 
@@ -200,13 +208,13 @@ def _is_refusal(name: str) -> bool:
     return name in REFUSALS or name in known or name.endswith(_LEFT_OUT)
 
 
-def _why_nothing(decoder: NmeaDecoder, refused: Counter[str]) -> str:
-    """In words, what stands in the way of a measurement."""
+def _why_nothing(decoder: NmeaDecoder, refused: Counter[str], kind: str) -> str:
+    """In words, what stands in the way of a measurement; `kind` is what the file may be else."""
     if refused["undated"] or refused["untimed"]:
         missing = "no measurement with a date (RMC or ZDA missing)"
         return decoder.cautions.get("implausible_date", missing)
     if not decoder.counters["sentences"]:
-        return decoder.cause or "no NMEA sentence whose checksum is right"
+        return kind or decoder.cause or "no NMEA sentence whose checksum is right"
     name = max(REFUSALS, key=lambda each: refused[each])
     if refused[name]:
         return REFUSALS[name]

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from drivers.bestpos.decoder import BestposDecoder
 from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
+from drivers.nmea.protocols import named
 from drivers.raw.messages import Bdgim, Ephemeris, NavigationMessage, RawGnssEpoch
 from drivers.raw.rinex import (
     COMPRESSED_LABEL,
@@ -30,6 +31,7 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
 from fusiond.files.extras import install
+from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
@@ -105,8 +107,9 @@ def read_solutions(
         valid = replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))
         rows.append(Arrival(t_ns, valid, utc_ns=utc_ns))
     if not rows:
-        why = REFUSALS.get(decoder.refusal)
-        raise TableError(f"{path}: no fix: {why}" if why else f"{path}: no {_NAMES[kind]}")
+        if why := REFUSALS.get(decoder.refusal):
+            raise TableError(f"{path}: no fix: {why}")
+        raise TableError(f"{path}: {kind_of(log.data) or named(log.data) or f'no {_NAMES[kind]}'}")
     refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
     return rows, [*log.notes, *counted({**refused, "undated": undated})]
 

@@ -1,14 +1,18 @@
 """The door for guests: sockets of all servers, served in turns that cost a tick little.
 
 All listeners and connections are in one epoll set, of which the event loop sees a single
-descriptor. When something is there the loop gives a turn: pieces of work, sending and receiving by
-turns, until none is left or the budget of the window is spent; what is left waits for the next
-window. A piece of work is one `accept`, one `recv` with what it holds, or what one guest is sent.
+descriptor. When something is there the loop gives a turn: pieces of work, of each server one to
+send and one to receive, until none is left or the budget of the window is spent; what is left
+waits for the next window. A piece of work is one `accept`, one `recv` with what it holds, or what
+one guest is sent.
 
     spent in any window of 10 ms <= 1 ms + one piece of work
 
-Whoever has been served goes to the end of the queue (epoll does so with level-triggered
-descriptors): with n guests at the door each has a turn once in n.
+Servers take turns, and so do the guests of each: whoever has been served goes to the end of his
+server's queue (epoll does so with level-triggered descriptors). With n guests at one of m servers
+each has a turn once in m n, and a guest of another waits for none of them.
+
+Source: fair queueing, round robin by flow (Nagle, RFC 970).
 """
 
 from __future__ import annotations
@@ -61,10 +65,10 @@ class Guests:
         """Places of all servers that listen."""
         self.postponed = 0
         self._open: set[Guest] = set()
-        self._handlers: dict[int, Handler] = {}
-        self._events: deque[tuple[int, int, Handler]] = deque()
-        self._work: deque[Work] = deque()
+        self._queues: deque[ServerQueue] = deque()
+        """Those that watch something, the next in turn first."""
         self._epoll: select.epoll | None = None
+        """Of the queues' own."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._window_ns = self._left_ns = 0
         self._paused: asyncio.TimerHandle | None = None
@@ -88,32 +92,26 @@ class Guests:
     def left(self, guest: Guest) -> None:
         self._open.discard(guest)
 
-    # ------------------------------------------------------------------ what is to be done
+    # ------------------------------------------------------------------ for the queues
 
-    def watch(self, fd: int, events: int, handler: Handler) -> None:
-        """Call `handler(events)` in a turn while `events` hold for `fd`."""
+    def begin(self, queue: ServerQueue, fd: int) -> None:
+        """`queue` watches something from now on; `fd` is readable while that is so."""
         if self._epoll is None:
             self._begin()
         assert self._epoll is not None
-        self._epoll.register(fd, events)
-        self._handlers[fd] = handler
+        self._epoll.register(fd, select.EPOLLIN)
+        self._queues.append(queue)
 
-    def change(self, fd: int, events: int) -> None:
-        """Wait for other events of an `fd` that is watched."""
+    def end(self, queue: ServerQueue, fd: int) -> None:
+        """`queue` watches nothing more."""
+        self._queues.remove(queue)
         if self._epoll is not None:
-            self._epoll.modify(fd, events)
+            self._epoll.unregister(fd)
+            if not self._queues:
+                self._end()
 
-    def forget(self, fd: int) -> None:
-        """Before it is closed."""
-        if self._handlers.pop(fd, None) is None or self._epoll is None:
-            return
-        self._epoll.unregister(fd)
-        if not self._handlers:
-            self._end()
-
-    def do(self, work: Work) -> None:
-        """Call `work` in a turn."""
-        self._work.append(work)
+    def due(self) -> None:
+        """There is work that no descriptor tells of."""
         if self._paused is None and self._due is None:
             self._due = asyncio.get_running_loop().call_soon(self._turn)
 
@@ -135,8 +133,6 @@ class Guests:
         self._loop.remove_reader(self._epoll.fileno())
         self._epoll.close()
         self._epoll = self._loop = None
-        self._events.clear()
-        self._work.clear()
 
     def _turn(self) -> None:
         self._due = None
@@ -146,31 +142,15 @@ class Guests:
         if start_ns >= self._window_ns:
             self._window_ns, self._left_ns = start_ns + WINDOW_NS, BUDGET_NS
         end_ns = start_ns + self._left_ns
-        more = True
-        while more and now_ns < end_ns:
-            more = self._send_one() | self._hear_one()
+        idle = 0
+        while idle < len(self._queues) and now_ns < end_ns:
+            queue = self._queues[0]
+            self._queues.rotate(-1)
+            idle = 0 if queue.serve() else idle + 1
             now_ns = time.perf_counter_ns()
         self._left_ns -= now_ns - start_ns
-        if more and self._epoll is not None:
+        if idle < len(self._queues):
             self._pause(now_ns)
-
-    def _send_one(self) -> bool:
-        if not self._work:
-            return False
-        self._work.popleft()()
-        return True
-
-    def _hear_one(self) -> bool:
-        if not self._events and self._epoll is not None:
-            for fd, events in self._epoll.poll(0, _AT_ONCE):
-                self._events.append((fd, events, self._handlers[fd]))
-        if not self._events:
-            return False
-        fd, events, handler = self._events.popleft()
-        # It may have gone meanwhile, and its number may be another's.
-        if self._handlers.get(fd) is handler:
-            handler(events)
-        return True
 
     def _pause(self, now_ns: int) -> None:
         """The budget is spent: the door opens again with the next window."""
@@ -194,3 +174,66 @@ class Guests:
             guest.look(now_ns)
         if self._loop is not None:
             self._looking = self._loop.call_later(LOOK_S, self._look)
+
+
+class ServerQueue:
+    """What one server has to do: descriptors of its own, and pieces of work."""
+
+    def __init__(self, guests: Guests) -> None:
+        self._guests = guests
+        self._handlers: dict[int, Handler] = {}
+        self._events: deque[tuple[int, int, Handler]] = deque()
+        self._work: deque[Work] = deque()
+        self._epoll: select.epoll | None = None
+
+    def watch(self, fd: int, events: int, handler: Handler) -> None:
+        """Call `handler(events)` in a turn while `events` hold for `fd`."""
+        if self._epoll is None:
+            self._epoll = select.epoll()
+            self._guests.begin(self, self._epoll.fileno())
+        self._epoll.register(fd, events)
+        self._handlers[fd] = handler
+
+    def change(self, fd: int, events: int) -> None:
+        """Wait for other events of an `fd` that is watched."""
+        if self._epoll is not None:
+            self._epoll.modify(fd, events)
+
+    def forget(self, fd: int) -> None:
+        """Before it is closed."""
+        if self._handlers.pop(fd, None) is None or self._epoll is None:
+            return
+        self._epoll.unregister(fd)
+        if not self._handlers:
+            self._guests.end(self, self._epoll.fileno())
+            self._epoll.close()
+            self._epoll = None
+            self._events.clear()
+            self._work.clear()
+
+    def do(self, work: Work) -> None:
+        """Call `work` in a turn."""
+        self._work.append(work)
+        self._guests.due()
+
+    def serve(self) -> bool:
+        """One piece to send and one to receive; False where there was neither."""
+        return self._send_one() | self._hear_one()
+
+    def _send_one(self) -> bool:
+        if not self._work:
+            return False
+        self._work.popleft()()
+        return True
+
+    def _hear_one(self) -> bool:
+        if not self._events and self._epoll is not None:
+            for fd, events in self._epoll.poll(0, _AT_ONCE):
+                self._events.append((fd, events, self._handlers[fd]))
+        if not self._events:
+            return False
+        fd, events, handler = self._events.popleft()
+        # It may have gone meanwhile, and its number may be another's.
+        if self._handlers.get(fd) is handler:
+            handler(events)
+        return True

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from fusiond.outputs.activation import activated
 from fusiond.outputs.client_slots import gives_way, host_of
-from fusiond.outputs.client_sockets import Guests
+from fusiond.outputs.client_sockets import Guests, ServerQueue
 from fusiond.outputs.port import Port
 from fusiond.outputs.rate_limits import Allowance
 from fusiond.outputs.sockets import LINGER_NOT, bound, tune
@@ -81,6 +81,7 @@ class Client:
         self._socket = sock
         self._server = server
         self._guests = server.guests
+        self._queue = server.queue
         self._fd = sock.fileno()
         self._counters = server.counters
         self._out: deque[bytes | memoryview] = deque()
@@ -97,7 +98,7 @@ class Client:
         self.on_room: Callable[[], None] | None = None
         """Called when all that was sent is out."""
         self._wanted = select.EPOLLIN
-        self._guests.watch(self._fd, self._wanted, self._ready)
+        self._queue.watch(self._fd, self._wanted, self._ready)
         self._guests.came(self)
 
     # ------------------------------------------------------------------ for the server
@@ -150,7 +151,7 @@ class Client:
         if self.closed:
             return
         self.closed = True
-        self._guests.forget(self._fd)
+        self._queue.forget(self._fd)
         self._guests.left(self)
         self._socket.close()
         self._out.clear()
@@ -223,7 +224,7 @@ class Client:
         self._counters["sent"] += 1
         if not self._flushing:
             self._flushing = True
-            self._guests.do(self._flush)
+            self._queue.do(self._flush)
 
     def _flush(self) -> None:
         self._flushing = False
@@ -255,7 +256,7 @@ class Client:
     def _wait_for(self, events: int) -> None:
         if events != self._wanted and not self.closed:
             self._wanted = events
-            self._guests.change(self._fd, events)
+            self._queue.change(self._fd, events)
 
 
 class _Listener:
@@ -285,6 +286,7 @@ class TcpServer:
     ) -> None:
         self.name = name
         self.guests = guests
+        self.queue = ServerQueue(guests)
         self.port = port
         self._greet = greet
         self._most = most
@@ -303,7 +305,7 @@ class TcpServer:
         finally:
             self.guests.wanted -= self._most
             for sock in listener.sockets:
-                self.guests.forget(sock.fileno())
+                self.queue.forget(sock.fileno())
                 sock.close()
             for client in tuple(self.clients):
                 client.close()
@@ -334,7 +336,7 @@ class TcpServer:
 
     def _watch(self, listening: socket.socket) -> None:
         if listening.fileno() >= 0:  # else it was closed during a pause
-            self.guests.watch(listening.fileno(), select.EPOLLIN, lambda _: self._accept(listening))
+            self.queue.watch(listening.fileno(), select.EPOLLIN, lambda _: self._accept(listening))
 
     def _accept(self, listening: socket.socket) -> None:
         try:
@@ -379,5 +381,5 @@ class TcpServer:
         if told_ns is None or now_ns - told_ns > SHORT_TOLD_S * _SECOND_NS:
             self._short_told_ns = now_ns
             self.port.report("clients_refused", f"none for now: {error.strerror}")
-        self.guests.forget(listening.fileno())
+        self.queue.forget(listening.fileno())
         asyncio.get_running_loop().call_later(PAUSE_S, self._watch, listening)

@@ -347,19 +347,28 @@ async def test_broker_that_wants_a_password(tmp_path: Path) -> None:
     assert "FUSIOND_MQTT_PASSWORD" in text
 
 
-async def test_system_clock_that_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("behind_s", "words"),
+    [
+        (3600, "The system clock is -3600.0 s off GNSS"),
+        (1024 * 604_800, "The receiver's date is +1024 weeks off the system clock's: its GPS week"),
+    ],
+)
+async def test_system_clock_that_is_off(
+    behind_s: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Late(SystemTime):
-        """The system clock an hour behind."""
+        """The system clock, so far behind."""
 
         @staticmethod
         def realtime_ns() -> int:
-            return time.time_ns() - 3_600_000_000_000
+            return time.time_ns() - behind_s * 1_000_000_000
 
     monkeypatch.setattr("fusiond.doctor.doctor.Clock", lambda options: Clock(options, Late()))
     async with vehicle(tmp_path):
         code, text = await report(without(config(tmp_path), "imu", "rdss"))
     assert code == 1
-    assert "The system clock is -3600.0 s off GNSS" in text
+    assert words in text
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,6 +49,8 @@ PARSERS = {
         tuple(f"fusiond.offline.{m}" for m in ("can_blf", "can_frames", "can_text")), 400
     ),
     "dbc": Parser(("drivers.can.dbc_flaws",), 400),
-    "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
+    "csv": Parser(
+        tuple(f"fusiond.files.{m}" for m in ("csv_tables", "csv_dialect", "tables")), 160
+    ),
 }
 """By target."""

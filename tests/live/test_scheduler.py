@@ -198,11 +198,12 @@ def test_the_oldest_generation_is_looked_through_by_its_cost(
     """Full of garbage it is dear, and is emptied more often; never later than twice as long."""
     now_ns, old = 0, list[int]()
 
-    def collect(generation: int) -> None:
+    def collect(generation: int) -> int:
         nonlocal now_ns
         if generation == 2:
             old.append(now_ns)
             now_ns += cost_ms * MS
+        return 1
 
     collector = Collector(lambda: now_ns)
     with patch.object(gc, "collect", collect):
@@ -213,6 +214,27 @@ def test_the_oldest_generation_is_looked_through_by_its_cost(
     assert min(seconds) - 0.1 <= min(between_s)
     assert max(between_s) <= max(seconds) + 0.2
     assert collector.max_ns == cost_ms * MS
+
+
+def test_where_there_is_no_garbage_it_is_looked_for_seldom() -> None:
+    """What lives costs as much to look through; with the first garbage it is as it was."""
+    now_ns, old = 0, list[int]()
+
+    def collect(generation: int) -> int:
+        nonlocal now_ns
+        if generation == 2:
+            old.append(now_ns)
+            now_ns += 5 * MS
+        return 3 if len(old) == 10 else 0
+
+    collector = Collector(lambda: now_ns)
+    with patch.object(gc, "collect", collect):
+        for _ in range(200_000):
+            now_ns += 10 * MS
+            collector.use_slack(9 * MS)
+    between_s = [round((b - a) / S) for a, b in itertools.pairwise(old)]
+    assert between_s[:10] == [20, 40, 80, 160, 320, 320, 320, 320, 320, 10]
+    assert collector.forced == 0
 
 
 async def test_collection_is_forced_when_there_is_never_slack() -> None:

@@ -101,6 +101,27 @@ def test_asc_before_the_trigger_and_by_differences(
     )
 
 
+@pytest.mark.parametrize("stamps", ["absolute", "relative"])
+def test_decimal_commas(stamps: str, tmp_path: Path, zone: Callable[[str], None]) -> None:
+    """Of a Windows whose numbers have them, with an event that has no channel."""
+    zone("UTC")
+    last = [0.0]
+
+    def commas(text: str) -> str:
+        def moved(m: re.Match[str]) -> str:
+            now, before = float(m[1]), last[0]
+            last[0] = now
+            shown = now - before if stamps == "relative" else now
+            return f"\n   {shown:.6f} ".replace(".", ",")
+
+        return "   0,000000 CANFD   Start\n" + re.sub(r"\n\s*([\d.]+) ", moved, "\n" + text)[1:]
+
+    header = f"date Thu Oct 9 08:53:20.000 2025\nbase hex  timestamps {stamps}\n"
+    found, refused, _ = read(asc(tmp_path / "c.asc", header=header, change=commas))
+    assert refused.all() == []
+    same(found, FRAMES, within_s=1e-3)
+
+
 @pytest.mark.parametrize("day", ["lun. juil. 25", "Mon Foo 25"])
 def test_a_date_that_nobody_knows(day: str, tmp_path: Path) -> None:
     """What stands behind it is read: here that numbers are decimal."""

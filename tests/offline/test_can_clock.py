@@ -133,3 +133,46 @@ def test_a_step_while_the_receiver_is_silent(even: CanLog, tmp_path: Path) -> No
     log = read(tmp_path, lines)
     assert np.abs(log.imu.t_s - 5.0 - even.imu.t_s).max() < 5e-3
     assert len(fixes(log)) > len(fixes(even)) - 20
+
+
+@pytest.mark.parametrize("each", [1.0, 7.0, -90.0])
+def test_set_several_times_while_the_receiver_is_silent(
+    each: float, even: CanLog, tmp_path: Path
+) -> None:
+    """What tells UTC after the last of them tells all of them apart from pauses."""
+
+    def outside(m: can.Message) -> bool:
+        return m.arbitration_id == 9 or not 20.0 < m.timestamp - BEGIN_S < 44.0
+
+    def ahead(t_s: float) -> float:
+        return each * sum(t_s >= at_s for at_s in (26.0, 31.0, 36.0, 41.0))
+
+    log = read(tmp_path, candump(filter(outside, bus(SECONDS)), ahead))
+    by = 4.0 * each
+    assert np.abs(log.imu.t_s - by - even.imu.t_s).max() < 2e-2
+    assert off_s(valid_s(log)[-10:] - by, valid_s(even)) < 0.02
+    assert [code for code, _ in log.events].count("system_clock_stepped") == 4
+
+
+@pytest.mark.parametrize("back", [-5.0, 2.0])
+def test_set_again_before_five_reports(back: float, even: CanLog, tmp_path: Path) -> None:
+    def ahead(t_s: float) -> float:
+        return 5.0 * (t_s >= AT_S) + back * (t_s >= AT_S + 3.0)
+
+    log = read(tmp_path, candump(bus(SECONDS), ahead))
+    by = 5.0 + back
+    assert np.abs(log.imu.t_s - by - even.imu.t_s).max() < 2e-2
+    assert off_s(valid_s(log) - by, valid_s(even)) < 0.05
+
+
+def test_a_pause_among_steps_is_none(even: CanLog, tmp_path: Path) -> None:
+    """Of two leaps in a silence the second was a pause, which UTC shows by what is left."""
+
+    def outside(m: can.Message) -> bool:
+        since_s = m.timestamp - BEGIN_S
+        return (m.arbitration_id == 9 or not 20.0 < since_s < 44.0) and not 35.0 <= since_s < 37.0
+
+    log = read(tmp_path, candump(filter(outside, bus(SECONDS)), lambda t_s: 9.0 * (t_s >= 27.0)))
+    span_s = log.imu.t_s[-1] - log.imu.t_s[0]
+    assert span_s == pytest.approx(even.imu.t_s[-1] - even.imu.t_s[0], abs=2e-2)
+    assert [code for code, _ in log.events].count("system_clock_stepped") == 1

@@ -121,8 +121,17 @@ def test_a_compass_in_the_receivers_file(rate: int, told: str, tmp_path: Path) -
     assert found.files["nmea"].refused == 0
 
 
-def test_a_compass_that_is_not_configured_is_named(tmp_path: Path) -> None:
-    hdm = sentence("HCHDM,30.0,M")
+def test_a_gyrocompass_in_the_receivers_file(tmp_path: Path) -> None:
+    """Its HDT has a talker of its own: it is true north, and no antenna's."""
+    lines = [gga(k) + rmc(k) + sentence("HEHDT,30.0,T") for k in range(SECONDS)]
+    _, arrivals = read(tmp_path, lines, COMPASS)
+    assert {m.source for m in of(arrivals, Heading)} == {"compass"}
+    assert len(of(arrivals, Heading)) == SECONDS
+
+
+@pytest.mark.parametrize("told", ["HCHDM,30.0,M", "HEHDT,30.0,T"])
+def test_a_compass_that_is_not_configured_is_named(told: str, tmp_path: Path) -> None:
+    hdm = sentence(told)
     found, arrivals = read(tmp_path, [gga(k) + rmc(k) + hdm for k in range(SECONDS)])
     assert not of(arrivals, MagneticHeading)
     (rejected,) = found.files["nmea"].rejected

@@ -70,7 +70,7 @@ def test_fixes_stand_at_gps_second_of_week_or_posix(tmp_path: Path) -> None:
         (log().replace("4712", "4713"), "wrong checksums against 0 sound"),
         (log(rmc=False, gga=False) + sentence("GPGSV,1,1,00"), "switch on GGA"),
         ("\xb5b\x05\x01" * 4, "no NMEA sentence whose checksum is right"),
-        ("", "no NMEA sentence whose checksum is right"),
+        ("", "the file is empty"),
     ],
 )
 def test_a_file_without_fixes_says_why(tmp_path: Path, text: str, words: str) -> None:

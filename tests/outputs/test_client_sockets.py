@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fusiond.configuration.outputs import NmeaServed
 from fusiond.outputs import client_sockets as door
 from fusiond.outputs import tcp
-from fusiond.outputs.client_sockets import BUDGET_NS, WINDOW_NS, Guests
+from fusiond.outputs.client_sockets import BUDGET_NS, WINDOW_NS, Guests, ServerQueue
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.nmea import NmeaServer
 from fusiond.outputs.rate_limits import BYTES, MESSAGES, Bucket, Rate
@@ -38,6 +38,7 @@ async def test_what_is_to_be_done_waits_for_the_next_window(
     now_ns = 0
     monkeypatch.setattr(door.time, "perf_counter_ns", lambda: now_ns)
     guests, done = Guests(), 0
+    queue = ServerQueue(guests)
 
     def work() -> None:
         nonlocal now_ns, done
@@ -46,16 +47,42 @@ async def test_what_is_to_be_done_waits_for_the_next_window(
 
     one, other = socket.socketpair()
     with one, other:
-        guests.watch(one.fileno(), 1, lambda _: None)
+        queue.watch(one.fileno(), 1, lambda _: None)
         for _ in range(100):
-            guests.do(work)
+            queue.do(work)
         for count in range(3, 33, 3):
             await until(lambda count=count: done >= count)  # type: ignore[misc]
             await asyncio.sleep(2e-9 * WINDOW_NS)
             assert done == count, "in the same window nothing more is done"
             now_ns += WINDOW_NS
         assert guests.postponed >= 10
-        guests.forget(one.fileno())
+        queue.forget(one.fileno())
+
+
+async def test_a_server_waits_for_no_guest_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand pieces at one server, and one at another, which is done as the second of all."""
+    now_ns = 0
+    monkeypatch.setattr(door.time, "perf_counter_ns", lambda: now_ns)
+    guests = Guests()
+    crowded, other = ServerQueue(guests), ServerQueue(guests)
+    done: list[str] = []
+
+    def work(name: str) -> None:
+        nonlocal now_ns
+        now_ns += BUDGET_NS // 3 + 1
+        done.append(name)
+
+    one, two = socket.socketpair()
+    with one, two:
+        crowded.watch(one.fileno(), 1, lambda _: None)
+        other.watch(two.fileno(), 1, lambda _: None)
+        for _ in range(1000):
+            crowded.do(lambda: work("crowded"))
+        other.do(lambda: work("other"))
+        await until(lambda: len(done) >= 3)
+        assert done == ["crowded", "other", "crowded"]
+        crowded.forget(one.fileno())
+        other.forget(two.fileno())
 
 
 async def test_who_is_loud_does_not_silence_the_others() -> None:

@@ -98,6 +98,12 @@ RECEIVERS: Mapping[str, Entry] = {
         "Only GLL has a position: no height, large sigma.",
         "Switch on GGA, RMC and GST.",
     ),
+    "compass_left_out": Entry(
+        "info",
+        "Headings of a compass arrive on a receiver's port.",
+        'Give it a source with driver = "compass".',
+    ),
+    "bad_date": Entry("warning", "RMC has no date that is one.", "Set the receiver's date."),
     "integrated": Entry(
         "info",
         "Positions come from a plotter or adapter, not from a receiver.",

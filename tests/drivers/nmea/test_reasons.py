@@ -198,6 +198,8 @@ def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
         ([changed(RMC, "GN", "XY")], "talker XY arrive"),
         ([made("GPTXT,01,01,02,u-blox"), made("GPGSV,1,1,00")], "(TXT, GSV), but none that counts"),
         ([made("GPGSV,1,1,00")], "switch on GGA and RMC"),
+        ([made("HEHDT,30.0,T"), made("HEROT,0.1,A")], "compass arrive (HDT), and no position: a s"),
+        ([made("APXDR,A,3.8,D,ROLL"), made("APHDM,218.6,M")], 'driver = "compass" reads them'),
         ([made("PUBX,00,021429.00,3958.1,N,11619.5,E,45.3,G3,2.1,2.0")], "($PUBX: u-blox)"),
         ([made("PTNL,GGK,021429.00,061925,3958.1,N,11619.5,E,3,12,1,EHT45,M")], "($PTNL: Trimble)"),
         ([made("PSTI,030,021429.0,A,3958.1,N,11619.5,E,45.3")], "($PSTI: SkyTraq)"),
@@ -207,12 +209,46 @@ def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
         ([made("PASHR,021429.00,350.0,T,0.1,0.2"), VTG], "which are not read: switch on GGA, RMC"),
         ([VTG, GSA, ZDA], "(VTG, GSA, ZDA), but none has a position: switch on GGA"),
         ([GGA_NO_FIX], "the receiver has no fix"),
+        ([changed(RMC, "GN", "PQ")], "positions of talker PQ arrive"),
+        ([made("GPRMC,,A,3958.1,N,11619.5,E,5.2,87.5,190625,,,A")] * 3, "without a time of day"),
+        ([made("gngga,021429,3958.1,N,11619.5,E,1,07,1.0,9.0,M,9.0,M,,")] * MANY, "small letters"),
         ([changed(GGA, "N,116", "X,116")] * 4, "fields that cannot be true"),
         ([VTG, *["$GPGGA,1,2"] * MANY], "without a checksum"),
     ],
 )
 def test_why_there_is_no_fix(said: list[str], words: str) -> None:
     assert words in fed(wire(*said, *said)).cause
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"!AIVDM,1,1,,A,13HOI:0P0000VOHLCnHQKwvL05Ip,0*23\r\n" * 4, "AIS (!AIVDM) arrives"),
+        (b"\x10\x02\x93\x13" + bytes(range(48, 68)) + b"\x77\x10\x03", "NMEA 2000 by an Actisense"),
+        (b"login: \r\nLinux pi 6.1.0 aarch64\r\nlogin: \r\n", "such as 'Linux pi 6.1.0 aarch64'"),
+        (b"\r\n+CGPSINFO: 4712.3,N,00812.3,E\r\n\r\nOK\r\n", "'+CGPSINFO: 4712.3,N"),
+        (b"".join(UBX[:-1] + bytes([k]) for k in range(9)), "9 UBX frames arrive with wrong check"),
+    ],
+)
+def test_what_is_on_the_port_instead_is_named(data: bytes, words: str) -> None:
+    assert words in fed(data * 3 if b"UBX" not in words.encode() else data).cause
+
+
+def test_a_date_that_is_none_is_told() -> None:
+    said = [changed(each, "190625", "320126") for each in minutes(RMC, 3)]
+    assert "'320126'" in fed(wire(GGA, *said)).cautions["bad_date"]
+
+
+def test_a_parity_bit_is_no_wrong_baud_rate() -> None:
+    """Seven data bits and even parity, read as eight bits."""
+    stream = bytes(b | (b.bit_count() & 1) << 7 for b in wire(GGA, RMC, VTG))
+    assert fed(stream).cause.startswith("NMEA with a parity bit arrives")
+
+
+def test_a_sentence_that_stands_in_for_one_with_a_bad_field_says_so() -> None:
+    said = [s for m in minutes(RMC, 6) for s in (changed(GGA, ",4,", ",-1,"), m)]
+    told = fed(wire(*said)).cautions["rmc_alone"]
+    assert "(other sentences have fields that cannot be true)" in told
 
 
 def test_names_of_nonsense_are_bounded() -> None:
@@ -253,6 +289,8 @@ def test_the_rollover_of_the_gps_week_is_told() -> None:
         ([s for m in range(14, 20) for s in two_dimensional(m)], None),
         ([GGA, changed(RMC, ",A,", ",Z,")], "unknown_status"),
         ([GGA, RMC, *["$GPVTG,1,2"] * MANY], "checksum_missing"),
+        ([GGA, RMC, made("HEHDT,30.0,T")], "compass_left_out"),
+        ([GGA, RMC, made("HCHDG,30.0,,,2.0,E")], "compass_left_out"),
         ([GGA, RMC], None),
     ],
 )
