@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.candidates import Candidate
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -167,10 +168,11 @@ class Aid:
         the aid's instant: itself, unless its corrections depend on the place."""
         return self
 
-    def unturned(self) -> Aid | None:
-        """The aid for a vehicle of which nobody knows which way it faces, the state being that of
-        one that faces north and is level: of a lever arm only its upward part is known, and the
-        rest is noise. None where the measurement says nothing without an attitude."""
+    def unturned(self, way: WayFaced) -> Aid | None:
+        """The aid for a vehicle whose attitude nobody knows, the state being that of one that faces
+        north and is level: of a lever arm only its upward part is known, and the rest is noise; of
+        the `way` that it faces, what headings say. None where the measurement says nothing without
+        an attitude."""
         return None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

@@ -38,7 +38,9 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.candidates import STEADY, SpeedCandidate
+from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeedAid
 from fusiond.aiding.preintegration import add_of_force, turning
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -61,8 +63,6 @@ FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
 _UNKNOWN = np.zeros((0, 0))
-SIGN_SIGMAS = 3.0
-"""A velocity beyond as many of its sigmas has the other sign once in 740."""
 
 
 @lru_cache(maxsize=64)
@@ -324,6 +324,13 @@ class WheelSpeedAid(Aid):
     rounding: str = ""
     shared_step_m_s: float = 0.0
     drifts: tuple[float, float] = STEADY
+
+    def unturned(self, way: WayFaced) -> GroundSpeedAid:
+        return GroundSpeedAid(
+            *(self.source, self.t_ns, self.gate, self.speed_m_s, self.sd_m_s, self.signed),
+            *(self.drift, self.scale, self.latency, self.rounding, self.shared_step_m_s, way),
+            robust=self.robust,
+        )
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p, lent = state

@@ -22,6 +22,7 @@ import numpy as np
 from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import HeightCandidate
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN
 
@@ -39,7 +40,7 @@ class HeightAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return self.of
 
-    def unturned(self) -> HeightAid:
+    def unturned(self, way: WayFaced) -> HeightAid:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -67,7 +68,7 @@ class BarometerAid(Aid):
     scale: str
     airflow: str
 
-    def unturned(self) -> BarometerAid:
+    def unturned(self, way: WayFaced) -> BarometerAid:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

@@ -49,6 +49,7 @@ from fusiond.aiding.antenna import Matrix, antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.aiding.preintegration import add_of_force
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -232,7 +233,7 @@ class PositionAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return self.bias
 
-    def unturned(self) -> PositionAid:
+    def unturned(self, way: WayFaced) -> PositionAid:
         (north, east, down), arm = self.sd, level_arm_m(self.lever)
         sd = math.hypot(north, arm), math.hypot(east, arm), down
         return replace(self, sd=sd, lever=(0.0, 0.0, self.lever[2]), rest="")

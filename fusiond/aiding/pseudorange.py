@@ -69,7 +69,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
 from fusiond.aiding.range_rows import (
     BASIC,
     LEFT,
@@ -88,6 +88,8 @@ from fusiond.aiding.range_rows import (
     measured,
     range_rows,
 )
+from fusiond.aiding.velocity import CORNER_RAD_S
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 
 Array = NDArray[np.float64]
@@ -234,6 +236,17 @@ class PseudorangeAid(Aid):
             self.before,
             self.left,
         )
+
+    def unturned(self, way: WayFaced) -> PseudorangeAid:
+        """Rates are the Dopplers': what a carrier says is the mean since the epoch before, and
+        nothing tells how the velocity has changed meanwhile."""
+        values, arm = self.values.copy(), level_arm_m(self.lever)
+        values[RANGE_VARIANCE] += arm**2
+        values[RATE_VARIANCE] += (CORNER_RAD_S * arm) ** 2
+        values[SPAN] = 0.0
+        lever = 0.0, 0.0, self.lever[2]
+        about = self.source, self.t_ns, self.gate, self.satellites, values, self.clock, lever
+        return PseudorangeAid(*about, self.clock_reset, robust=self.robust)
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
         """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of

@@ -41,6 +41,7 @@ from fusiond.aiding.base import (
     level_arm_m,
 )
 from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
@@ -77,7 +78,7 @@ class RdssPositionAid(Aid):
     def feedback(self) -> Feedback:
         return "hold" if self.holds else "at_once"
 
-    def unturned(self) -> RdssPositionAid:
+    def unturned(self, way: WayFaced) -> RdssPositionAid:
         (nn, ne, ee), arm = self.covariance, level_arm_m(self.lever)
         wider = nn + arm * arm, ne, ee + arm * arm
         return replace(self, covariance=wider, lever=(0.0, 0.0, self.lever[2]))
@@ -126,7 +127,7 @@ class FeedBackAid(Aid):
     def feedback(self) -> Feedback:
         return "release"
 
-    def unturned(self) -> FeedBackAid:
+    def unturned(self, way: WayFaced) -> FeedBackAid:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

@@ -35,6 +35,7 @@ from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
 from fusiond.aiding.candidates import VelocityCandidate
 from fusiond.aiding.preintegration import add_of_force
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
@@ -143,7 +144,7 @@ class VelocityAid(Aid):
     def device(self) -> str:
         return self.source.removesuffix(SUFFIX)
 
-    def unturned(self) -> VelocityAid:
+    def unturned(self, way: WayFaced) -> VelocityAid:
         aside = CORNER_RAD_S * level_arm_m(self.lever)
         north, east, *down = self.sd
         sd = math.hypot(north, aside), math.hypot(east, aside), *down

@@ -1,16 +1,15 @@
 r"""Fit of the model to the inertial sensor's errors.
 
-An error that no state models and no noise of the model covers makes the filter wrong and sure of
-itself. The measure is a minute without aids, t = 60 s, one sigma of the displacement:
+An accelerometer's bias that a model has no state for is noise to it
+(`fusiond.models.missing_states`), so that it stays honest, at the price of its sigma. The measure
+is a minute without aids, t = 60 s, one sigma of the displacement:
 
     an accelerometer bias b       b t^2 / 2
     what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
 
-N and n the densities of velocity and attitude in the model, which is where a bias that it takes for
-noise is (`fusiond.models.missing_states`). The bias is missing where it does more in that minute
-than the model knows. Every shipped model has gyro states. Scale factors do less than the gyro's
-noise in the classes that there are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that
-class 11 m.
+N and n the densities of velocity and attitude in the model, which is where such a bias is. Every
+shipped model has gyro states. Scale factors do less than the gyro's noise in the classes that there
+are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that class 11 m.
 
 Source: Groves, 2nd ed., section 5.7 (short-term straight-line error propagation).
 """
@@ -36,7 +35,7 @@ def after_a_minute(force_noise: float, rate_noise: float) -> float:
 
 
 def model_doubts(config: Config) -> Iterator[str]:
-    """A sentence where the model lacks the accelerometer's bias, or takes it for noise."""
+    """A sentence where the model takes the accelerometer's bias for noise."""
     name, noise = config.estimator.model, imu_noise(config.imu)
     model = make_model(name, noise)
     velocity = math.sqrt(next(b.white for b in model.blocks if b.name == "velocity"))
@@ -50,19 +49,14 @@ def model_doubts(config: Config) -> Iterator[str]:
 
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     moved_m = 0.5 * force * MINUTE_S**2
-    if not all(model.parameters(FORCE_ERROR + axis) for axis in range(2 if planar else 3)):
-        said = f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
-        said += f"{force / MILLI_G:.3g} mg, one sigma"
-        if moved_m > known_m:
-            yield (
-                f"{said}: {_metres(moved_m)} in a minute without aids, where the filter knows of "
-                f"{_metres(known_m)}, and a tilt of {math.atan(force / g) / DEG:.2g} deg; {instead}"
-            )
-        elif velocity > 2.0 * noise.force_noise:
-            yield (
-                f"{said}, which is noise to it: sigma grows by {_metres(known_m)} in a minute "
-                f"without aids, where the bias does {_metres(moved_m)}; {instead}"
-            )
+    lacks = not all(model.parameters(FORCE_ERROR + axis) for axis in range(2 if planar else 3))
+    if lacks and velocity > 2.0 * noise.force_noise:
+        yield (
+            f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
+            f"{force / MILLI_G:.3g} mg, one sigma, which is noise to it: sigma grows by "
+            f"{_metres(known_m)} in a minute without aids, where the bias does {_metres(moved_m)}, "
+            f"and the level is off by {math.atan(force / g) / DEG:.2g} deg; {instead}"
+        )
 
 
 def _metres(value: float) -> str:

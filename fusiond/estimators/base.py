@@ -328,6 +328,8 @@ class ErrorStateFilter:
 
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
+        if self.hypotheses is not None:
+            self.hypotheses.keep_fed_back(dx)
         feed_back(self.nav, self.xi, dx)
 
     def _screen(self, aid: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:

@@ -21,7 +21,10 @@ An onset is not known: each kind runs from restarts of several periods T, in tur
 out to be a likely onset takes the place of a less likely one of the next longer period before it
 begins anew. A fault of the inertial unit begins as a step of
 states, V = 1 at its onset; one of a measurement is its rows' D. A delay of tau is the filter's own
-past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here.
+past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here; its velocities as they
+are known now: what has been fed back since is taken off the past as well. A change of velocity over
+tau is then what was felt, and holds no noise of the measurements since: a filter that states more
+process noise than there is follows each of them, and would find its innovations in what it follows.
 
 All of it lies in the filter's memory: a snapshot copies it, a rewind restores it to the bit. How is
 said here; onsets are in fusiond.estimators.fault_onsets, signatures and evidence in
@@ -88,10 +91,12 @@ LOG_PRIOR = 7
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
-# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, and by
-# how much the unit has been found to have turned on the vehicle in pitch and yaw (rad).
+# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, by how
+# much the unit has been found to have turned on the vehicle in pitch and yaw (rad), and what has
+# been fed back of the velocity in all (m/s).
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, TURNED_BY = range(10, 19)
+FED_BACK = 20
 HEAD = 24
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT

@@ -20,6 +20,7 @@ from fusiond.estimators.fault_bank import (
     E2,
     E_AT,
     ENTRIES,
+    FED_BACK,
     FOLLOWED,
     GROUPS,
     HEAD,
@@ -63,6 +64,7 @@ from fusiond.estimators.fault_bank import (
     group_at,
 )
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import DV
 from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
@@ -71,7 +73,8 @@ Indices = NDArray[np.int64]
 
 @compiled("void(f8[::1], f8[::1], f8, f8)")
 def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
-    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is."""
+    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is, with the
+    velocity before all that has been fed back."""
     for i in range(3):
         bank[PATH + i] += step_s * nav[VN + i]
     bank[PATH_S] = now_s
@@ -83,8 +86,16 @@ def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
     at = HEAD + entries % RING * POINT
     bank[at] = now_s
     for i in range(3):
-        bank[at + 1 + i], bank[at + 4 + i] = bank[PATH + i], nav[VN + i]
+        bank[at + 1 + i] = bank[PATH + i]
+        bank[at + 4 + i] = nav[VN + i] + bank[FED_BACK + i]
     bank[ENTRIES] = entries + 1.0
+
+
+@compiled("void(f8[::1], f8[::1])", forceinline=True)
+def keep_fed_back(bank: Array, dx: Array) -> None:
+    """An error (n,) has been taken out of the state: out of its past velocities as well."""
+    for i in range(3):
+        bank[FED_BACK + i] += dx[DV + i]
 
 
 @compiled("i8(f8[::1], f8)")
@@ -171,7 +182,8 @@ def _of_row(
                 offset = bank[PATH + row] + (t_s - bank[PATH_S]) * nav[VN + row]
                 offset -= _at_past(bank, back, then, row)
             else:
-                offset = nav[VN + row] - _at_past(bank, back, then, 3 + row)
+                offset = nav[VN + row] + bank[FED_BACK + row]
+                offset -= _at_past(bank, back, then, 3 + row)
     elif of == SPEED:
         if measures == ROLLS:
             offset = -math.hypot(nav[VN], nav[VN + 1])

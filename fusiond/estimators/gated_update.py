@@ -20,7 +20,7 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import judge, solve
 from fusiond.estimators.fault_onsets import restart_due
-from fusiond.estimators.fault_rows import account, sensitivity_rows
+from fusiond.estimators.fault_rows import account, keep_fed_back, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
 from fusiond.navigation.compiled import compiled
 
@@ -117,6 +117,7 @@ def fold_and_account(
     if judged <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
+        keep_fed_back(bank, dx)
         feed_back(nav, xi, dx)
         dx[:] = 0.0
     return judged

@@ -37,7 +37,7 @@ from fusiond.estimators.fault_bank import (
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
 from fusiond.estimators.fault_opened import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
-from fusiond.estimators.fault_rows import rows_of_fault
+from fusiond.estimators.fault_rows import keep_fed_back, rows_of_fault
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 
@@ -124,6 +124,10 @@ class Hypotheses:
         """An aid's series returns to service: what was shown of it before is why it was out, and
         its hypotheses begin anew."""
         begin_again(self.bank, self.table.ints, self.n, *self.of(aid), aid.t_ns, nav, step)
+
+    def keep_fed_back(self, dx: Array) -> None:
+        """An error (n,) is taken out of the filter's state: out of the path behind it as well."""
+        keep_fed_back(self.bank, dx)
 
     def adds(self, aid: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
         """D b (3,): what a fault of size `b`, of such an age, does to an aid's rows."""

@@ -278,6 +278,10 @@ class InvariantFilter(TiltAxesFilter):
         for both in (p, p.T):
             keep_down_rows(both, self.nav[Q0:], nav[Q0:], *self._biases)
         self.covariance[:] = 0.5 * (p + p.T)
+        if self.hypotheses is not None:
+            fed_back = np.zeros(self.model.size)
+            fed_back[DV : DV + 3] = self.nav[VN : VN + 3] - nav[VN : VN + 3]
+            self.hypotheses.keep_fed_back(fed_back)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
         turn_step(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)

@@ -48,7 +48,7 @@ class Operator:
                     raise CommandRefusedError(text)
                 return self._injection.inject(command, t_ns)
             case SetPosition():
-                return self._set_position(command)
+                return self._set_position(command, t_ns)
             case RequestFix():
                 said = self._sources.request_fix(t_ns)
                 if not said:
@@ -66,17 +66,18 @@ class Operator:
             case _:
                 raise CommandRefusedError(f"unknown command {type(command).__name__}")
 
-    def _set_position(self, command: SetPosition) -> str:
+    def _set_position(self, command: SetPosition, t_ns: int) -> str:
         navigator = self._navigator
-        if not navigator.imu.end:
-            raise CommandRefusedError("no IMU data yet")
         if command.force:
             navigator.reset("an operator's position")
-        before = navigator.solution(navigator.imu.latest_ns)
+            navigator.without_imu.stop()
+        before = navigator.solution(t_ns)
         lat, lon = command.lat_deg * DEG, command.lon_deg * DEG
-        outcome = navigator.set_position(lat, lon, command.height_m, command.sd_m)
+        outcome = navigator.set_position(lat, lon, command.height_m, command.sd_m, t_ns)
         if outcome == "aligning":
             return "position taken: aligning from it"
+        if outcome == "beginning":
+            return "position taken: without an inertial unit navigation begins there"
         if not math.isfinite(before.lat_rad):
             return f"position {outcome}: aligned from it"
         far = distance_m(before.lat_rad, before.lon_rad, lat, lon)

@@ -78,9 +78,11 @@ def _walking_biases(noise: ImuNoise) -> list[Block]:
 
 
 def _planar10(noise: ImuNoise) -> list[Block]:
-    # One Markov state an axis stands for all of the gyro's drift.
+    # One Markov state an axis stands for all of the gyro's drift; accelerometer biases, of which
+    # paper 001 has none, are noise.
     drift = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
-    return [*navigation_blocks(noise, planar=True), _gyro_markov(noise, drift)]
+    navigation = navigation_blocks(with_force_biases_as_noise(noise), planar=True)
+    return [*navigation, _gyro_markov(noise, drift)]
 
 
 def _planar15(noise: ImuNoise) -> list[Block]:

@@ -221,10 +221,18 @@ class Navigator:
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 
-    def set_position(self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float) -> str:
-        """An operator's position, now: the fix to align by (`aligning`), or a fix like any other,
-        whose outcome is returned."""
-        aid = told_by_operator(self.imu.latest_ns, (lat_rad, lon_rad, height_m), sd_m)
+    def set_position(
+        self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float, t_ns: int
+    ) -> str:
+        """An operator's position at `t_ns`, which is now: the fix to align by (`aligning`), or to
+        begin by where there is no inertial unit (`beginning`), or a fix like any other, whose
+        outcome is returned."""
+        where, without = (lat_rad, lon_rad, height_m), self.without_imu
+        if without.takes_over(t_ns, self.imu):
+            return without.told(told_by_operator(t_ns, where, sd_m), t_ns) or "beginning"
+        if without.active:
+            without.told(told_by_operator(t_ns, where, sd_m), t_ns)
+        aid = told_by_operator(self.imu.latest_ns, where, sd_m)
         if self.started is None:
             self._aligner.aids([aid])
         entry = self.timeline.insert(aid)

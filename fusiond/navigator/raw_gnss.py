@@ -22,6 +22,7 @@ from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
+from fusiond.aiding.way_faced import WayFaced
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
@@ -133,6 +134,9 @@ class RawEpochAid(Aid):
             self.memory.corrected = found
         return found.aid
 
+    def unturned(self, way: WayFaced) -> LevelEpochAid:
+        return LevelEpochAid(self.source, self.t_ns, self.gate, self, way, robust=self.robust)
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return self.at(state.nav).innovation(state)
 
@@ -147,6 +151,35 @@ class RawEpochAid(Aid):
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         if self.memory.corrected is not None:
             self.receiver.judged(self, self.memory.corrected, codes, whitened)
+
+
+@immutable(eq=False)
+class LevelEpochAid(Aid):
+    """An epoch for a vehicle whose attitude nobody knows (`Aid.unturned`)."""
+
+    screened: ClassVar[bool] = True
+    locates: ClassVar[bool] = True
+    placed: ClassVar[bool] = True
+
+    epoch: RawEpochAid
+    way: WayFaced
+
+    @property
+    def shares(self) -> tuple[str, ...]:
+        return RANGE_BIAS
+
+    def at(self, nav: Array) -> PseudorangeAid:
+        """The epoch's ranges for a vehicle there."""
+        return self.epoch.at(nav).unturned(self.way)
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        return self.at(state.nav).innovation(state)
+
+    def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
+        found = self.epoch.memory.corrected
+        if found is not None:
+            level = found._replace(aid=found.aid.unturned(self.way))
+            self.epoch.receiver.judged(self.epoch, level, codes, whitened)
 
 
 class RawGnss:

@@ -7,11 +7,14 @@ vehicle would feel which is level, faces north and goes on as it goes:
     w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
 
 so that velocity changes by the model's noise and by what is measured alone. Attitude is not known
-and not published; aids that say nothing without it are left out, a lever arm counts by its upward
-part (`Aid.unturned`). With `[estimator] filter = "federated"` the receivers have a local filter
-each, as in experiments 3 and 4 of paper 004; every other filter is here the Kalman filter.
+and not published; a lever arm counts by its upward part (`Aid.unturned`). Of a vehicle that does
+not slide a heading says which way it goes, and a wheel how fast: both together carry the position
+on where no fix comes. Bearings say nothing without an attitude and are left out. With `[estimator]
+filter = "federated"` the receivers have a local filter each, as in experiments 3 and 4 of paper
+004; every other filter is here the Kalman filter.
 
-The first fix makes a start that knows next to nothing, and is then an aid like any other. When the
+The first fix, or an operator's position, makes a start that knows next to nothing, and is then an
+aid like any other. When the
 inertial unit has aligned, its navigation takes over.
 """
 
@@ -26,8 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.candidates import PositionCandidate
-from fusiond.configuration.schema import Config
+from fusiond.aiding.candidates import HeadingCandidate, PositionCandidate
+from fusiond.aiding.velocity import CORNER_RAD_S
+from fusiond.aiding.way_faced import Faced, WayFaced
+from fusiond.configuration.schema import Config, NonHolonomic
 from fusiond.estimators.base import Estimator
 from fusiond.models.blocks import Block
 from fusiond.models.constant_velocity import constant_velocity
@@ -55,6 +60,35 @@ START_SD_M = 1000.0
 MOST_REMEMBERED = 128
 
 
+class _Heard:
+    """An aid that has come, and where the vehicle is by it alone: asked for once."""
+
+    __slots__ = ("_asked", "_position", "aid")
+
+    def __init__(self, aid: Aid) -> None:
+        self.aid = aid
+        self._asked = False
+        self._position: PositionCandidate | None = None
+
+    @property
+    def position(self) -> PositionCandidate | None:
+        """None of an aid that says none."""
+        if not self._asked:
+            self._asked = True
+            for candidate in self.aid.candidates():
+                if isinstance(candidate, PositionCandidate):
+                    self._position = candidate
+        return self._position
+
+
+def _slips_m_s(o: NonHolonomic) -> float:
+    """One sigma of the velocity across the vehicle's axis, where positions are measured; infinite
+    for one that may slide."""
+    forward, right, _ = o.lever_arm_m
+    in_corners = CORNER_RAD_S * math.hypot(forward, right)
+    return math.hypot(o.sd_m_s, o.drift_sd_m_s, in_corners) if o.enabled else math.inf
+
+
 class WithoutImu:
     """Takes over where there is no inertial unit. `on_event(code, text)` hears of both changes,
     `on_outcome` of each aid; `last_fused_ns` by source is kept."""
@@ -73,7 +107,8 @@ class WithoutImu:
         self.estimator: Estimator | None = None
         """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
-        self._recent: deque[Aid] = deque(maxlen=MOST_REMEMBERED)
+        self._recent: deque[_Heard] = deque(maxlen=MOST_REMEMBERED)
+        self._way = WayFaced(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None
         self._silent_ns = 0
         self._located_ns = 0
@@ -86,12 +121,30 @@ class WithoutImu:
 
     def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
         """Aids have come at `seen_ns`."""
-        self._recent.extend(aids)
+        self._recent.extend(map(_Heard, aids))
         if self._first_ns is None and aids:
             self._first_ns = seen_ns or aids[0].t_ns
+        for aid in aids if self._way.known else ():
+            for candidate in aid.candidates() if not aid.locates else ():
+                if isinstance(candidate, HeadingCandidate):
+                    self._way.hear(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
         if self.estimator is not None:
             for aid in aids:
                 self._insert(aid)
+
+    def takes_over(self, t_ns: int, imu: ImuBuffer) -> bool:
+        """True if no inertial unit navigates at `t_ns`, nor will with its next sample."""
+        return not imu.end or (t_ns - imu.latest_ns) * 1e-9 > BEARABLE_GAP_S
+
+    def told(self, aid: Aid, t_ns: int) -> str | None:
+        """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
+        if self.estimator is None:
+            self.hear([aid], t_ns)
+            return None
+        self._run(self.estimator, t_ns)
+        entry = self._insert(replace(aid, t_ns=self._imu.latest_ns))
+        self._run(self.estimator, t_ns)
+        return None if entry is None or entry.outcome is None else entry.outcome.name
 
     def tick(self, t_ns: int, imu: ImuBuffer, navigating: bool) -> None:
         """It is `t_ns`: begin, go on or end. `navigating`: inertial navigation has begun."""
@@ -159,16 +212,11 @@ class WithoutImu:
 
     def _begin(self, since_ns: int) -> None:
         """Start at the newest fix since the samples ended, if there is one."""
-        fixes = [
-            candidate
-            for aid in self._recent
-            if aid.t_ns > since_ns and aid.unturned() is not None
-            for candidate in aid.candidates()
-            if isinstance(candidate, PositionCandidate)
-        ]
-        if not fixes:
+        recent = [h for h in self._recent if h.aid.t_ns > since_ns]
+        newest_first = sorted(recent, key=lambda h: h.aid.t_ns, reverse=True)
+        fix = next((h.position for h in newest_first if h.position is not None), None)
+        if fix is None:
             return
-        fix = max(fixes, key=lambda candidate: candidate.t_ns)
         config = self._config
         model = constant_velocity(config.plausibility.manoeuvre, self._blocks)
         estimator = estimator_without_imu(config, model, GAP_S)
@@ -189,18 +237,17 @@ class WithoutImu:
         estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
         self._timeline.start()
         self.estimator = estimator
-        for aid in self._recent:
-            if aid.t_ns >= fix.t_ns:
-                self._insert(aid)
+        for heard in self._recent:
+            if heard.aid.t_ns >= fix.t_ns:
+                self._insert(heard.aid)
         self._event(
             "without_imu",
             "no inertial unit: position and velocity by fixes and a constant velocity, no attitude",
         )
 
-    def _insert(self, aid: Aid) -> None:
-        level = aid.unturned()
-        if level is not None:
-            self._timeline.insert(level)
+    def _insert(self, aid: Aid) -> Entry | None:
+        level = aid.unturned(self._way)
+        return None if level is None else self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:
         """Samples until now, and all that has come."""
@@ -219,6 +266,8 @@ class WithoutImu:
             self._last_fused_ns[source] = max(t_ns, self._last_fused_ns.get(source, -1))
             if entry.aid.locates:
                 self._located_ns = max(self._located_ns, t_ns)
+        if entry.aid.screened and entry.outcome is not None:
+            entry.aid.judged(entry.outcome.rows, entry.outcome.whitened)
         if self._on_outcome is not None:
             self._on_outcome(entry)
 

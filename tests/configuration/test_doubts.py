@@ -69,14 +69,15 @@ def test_examples_leave_no_doubt(path: Path) -> None:
         ("", "sources: none"),
         (
             f"{SOUND}[estimator]\nmodel = 'planar10'\n",
-            "'planar10' has no accelerometer bias, and [imu] has one of 10 mg, one sigma: "
-            "177 m in a minute without aids, where the filter knows of 5.4 m, and a tilt of "
-            "0.57 deg; choose 'planar15' or 'ins21'",
+            "'planar10' has no accelerometer bias, and [imu] has one of 10 mg, one sigma, which is "
+            "noise to it: sigma grows by 646 m in a minute without aids, where the bias does "
+            "177 m, and the level is off by 0.57 deg; choose 'planar15' or 'ins21'",
         ),
         (
             f"{SOUND}[imu]\nsensor_class = 'mems'\n[estimator]\nmodel = 'ins17'\n",
             "and sensor class 'mems' has one of 20 mg, one sigma, which is noise to it: sigma "
-            "grows by 1,136 m in a minute without aids, where the bias does 353 m",
+            "grows by 1,136 m in a minute without aids, where the bias does 353 m, and the level "
+            "is off by 1.1 deg; choose 'ins23' or 'ins21'",
         ),
         (
             f"{SOUND}[outputs.gpsd]\nport = 10110\n[outputs.nmea]\n",

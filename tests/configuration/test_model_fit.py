@@ -77,6 +77,6 @@ def test_the_daemon_says_it_once() -> None:
     Chain(configured("planar10"), clock, events)
     (said,) = [e for e in heard if e.code == "states_absent"]
     assert (said.source, said.level) == ("navigator", "warning")
-    assert "177 m in a minute" in said.text
+    assert "the bias does 177 m" in said.text
     Chain(configured("ins21"), clock, events)
     assert [e.code for e in heard].count("states_absent") == 1

@@ -6,113 +6,25 @@ lost, as receipts are; one daemon is killed with messages under way, and comes b
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import itertools
 import json
 import os
 import signal
-import time
 from collections import Counter
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import aiomqtt
-import numpy as np
 import pytest
 
 from drivers.rdss.messages import Family
-from fusiond.simulation.pty_line import PtyLine
-from fusiond.simulation.rdss.centre import RdssOptions
-from fusiond.simulation.rdss.network import MessageNetwork
-from fusiond.simulation.rdss.terminal import RdssTerminal
-from fusiond.simulation.scenarios import SCENARIOS
 from tests.broker import Broker, Listener, listening
 from tests.hil.processes import DaemonProcess
+from tests.live.radio import CARDS, SERVICE_S, Radio, config, said
 
-CARDS = {"ahead": 242286, "behind": 242407}
-SERVICE_S = 1
 EACH = 6
 ENDS_WITHIN_S = 150.0
 """Expiry of a message, and a card's turns for what waits behind it; on a computer with others."""
-CONFIG = """
-vehicle = "{name}"
-state_file = "{folder}/{name}.json"
-[clock]
-utc = "system"
-[sources.rdss]
-driver = "rdss"
-port = "{folder}/{name}-rdss"
-baud = 115200
-family = "{family}"
-message_expiry_s = 60.0
-[aiding.rdss]
-[mqtt]
-port = {port}
-commands = ["send_message", "request_fix"]
-"""
-
-
-@dataclass
-class Radio:
-    """Both terminals on their lines, served by a task; instants are seconds since its start."""
-
-    folder: Path
-    family: Family
-    terminals: dict[str, RdssTerminal] = field(default_factory=dict)
-
-    @asynccontextmanager
-    async def on(self) -> AsyncIterator[MessageNetwork]:
-        start_ns, start_s = time.time_ns(), time.monotonic()
-        truth = SCENARIOS["static"].truth(30.0)
-        rngs = np.random.default_rng(41).spawn(3)
-        network = MessageNetwork(rngs[2], loss_probability=0.25, delay_s=(0.2, 0.8))
-        lines = {}
-        for (name, card), rng in zip(CARDS.items(), rngs[:2], strict=True):
-            options = RdssOptions(
-                family=self.family,
-                user=card,
-                service_frequency_s=SERVICE_S,
-                delay_s=(0.2, 1.0),
-                mean_delay_s=0.4,
-                refuse_probability=0.1,
-                mute_probability=0.05,
-            )
-            self.terminals[name] = RdssTerminal(truth, options, rng, start_ns)
-            network.join(self.terminals[name])
-            lines[name] = PtyLine(self.folder / f"{name}-rdss")
-            lines[name].plug()
-
-        async def serve() -> None:
-            while True:
-                t_s = time.monotonic() - start_s
-                for name, terminal in self.terminals.items():
-                    if data := lines[name].read():
-                        terminal.receive(data, t_s)
-                    if data := terminal.take(t_s):
-                        lines[name].write(data)
-                await asyncio.sleep(0.01)
-
-        task = asyncio.create_task(serve())
-        try:
-            yield network
-        finally:
-            task.cancel()
-            for line in lines.values():
-                line.unplug()
-
-
-def said(listener: Listener, name: str, topic: str) -> list[dict[str, Any]]:
-    return [json.loads(p) for p in listener.payloads(f"fusiond/{name}/{topic}")]
-
-
-def config(folder: Path, name: str, family: Family, port: int) -> Path:
-    path = folder / f"{name}.toml"
-    path.write_text(CONFIG.format(name=name, folder=folder, family=family, port=port))
-    return path
 
 
 def ended(listener: Listener, name: str) -> dict[str, str]:

@@ -12,8 +12,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import pytest
-
 from fusiond.configuration.schema import Config
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.offline.compare import compare
@@ -64,6 +62,5 @@ def test_ins17_is_honest_and_nearly_as_good() -> None:
     check(bank=False)
 
 
-@pytest.mark.xfail(strict=True, reason="the bank takes a sound receiver for late: 32 m off")
 def test_ins17_is_so_with_the_bank_of_hypotheses() -> None:
     check(bank=True)
