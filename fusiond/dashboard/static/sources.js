@@ -14,7 +14,6 @@ const HEAD = [
   ["received", "n wide-only"],
   ["used", "n"],
   ["refused", "n"],
-  ["why", "wide-only"],
 ];
 for (const [text, name] of HEAD) head.append(element("th", name, text));
 
@@ -97,10 +96,14 @@ export function showSources(store) {
       { text: whole(s.received), className: "n wide-only" },
       { text: whole(s.fused), className: "n" },
       { text: count ? whole(count) : "\u2013", className: "n", title },
-      { text: why, className: "wide-only", title },
     ];
-    row.rowClass = old ? "old" : "";
+    row.rowClass = [old ? "old" : "", why ? "explained" : ""].filter(Boolean).join(" ");
     rows.push(row);
+    if (!why) continue;
+    // In a row of its own: a column of it would be cut on all but the widest screens.
+    const reason = [{ text: why, title, span: HEAD.length, className: wrong ? "warn" : "quiet" }];
+    reason.rowClass = old ? "reason-row old" : "reason-row";
+    rows.push(reason);
   }
   fillRows(body, rows);
 }
