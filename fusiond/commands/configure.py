@@ -13,7 +13,7 @@ from fusiond.commands.shared import EXIT_IO, config_errors, parse_mqtt, spinner
 if TYPE_CHECKING:
     from drivers.can.bus import Interface
     from fusiond.configuration.draft import Draft, DraftSource, Vector
-    from fusiond.doctor.discovery import Device, Unheard
+    from fusiond.doctor.discovery import Device, SilentPort
     from fusiond.doctor.forward_axis import Phase
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
@@ -93,14 +93,14 @@ def init(
     if ask_terminal is None:
         question = "Ask silent serial ports whether an RDSS terminal is there (sends bytes)?"
         ask_terminal = asks and typer.confirm(question, default=False)
-    devices, unheard = _look(port, can, ask_terminal)
+    devices, silent_ports = _look(port, can, ask_terminal)
     for device in devices:
         typer.echo(f"found: {device.text}")
-    for silent in unheard if port is not None else ():
+    for silent in silent_ports if port is not None else ():
         typer.echo(f"found nothing: {silent.text}")
     if not devices:
-        heard = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
-        typer.echo(f"No supported device found on: {heard}")
+        looked_at = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
+        typer.echo(f"No supported device found on: {looked_at}")
     imu = next((d for d in devices if d.driver == "can_imu"), None)
     has_antenna = any(d.driver != "can_imu" for d in devices)
     where = ""
@@ -180,11 +180,11 @@ def _driven_axis(imu: Device, down: str) -> str | None:
 
 def _look(
     ports: list[str] | None, buses: list[str] | None, ask_terminal: bool
-) -> tuple[list[Device], list[Unheard]]:
+) -> tuple[list[Device], list[SilentPort]]:
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
-    from fusiond.doctor.discovery import Device, Unheard, on_bus, on_port  # noqa: PLC0415
+    from fusiond.doctor.discovery import Device, SilentPort, on_bus, on_port  # noqa: PLC0415
 
     channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
 
@@ -192,14 +192,14 @@ def _look(
     lines = similar_ports() if ports is None else ports
     unique = {Path(line).resolve(): line for line in reversed(lines)}
 
-    async def look() -> tuple[list[Device], list[Unheard]]:
+    async def look() -> tuple[list[Device], list[SilentPort]]:
         found = await asyncio.gather(
             *(on_port(line, ask_terminal=ask_terminal) for line in unique.values())
         )
         on_buses = await asyncio.gather(*(on_bus(*channel) for channel in channels))
-        heard = [device for devices in on_buses for device in devices]
-        heard += [one for one in found if isinstance(one, Device)]
-        return heard, [one for one in found if isinstance(one, Unheard)]
+        looked_at = [device for devices in on_buses for device in devices]
+        looked_at += [one for one in found if isinstance(one, Device)]
+        return looked_at, [one for one in found if isinstance(one, SilentPort)]
 
     with spinner("listening to ports and buses"):
         return asyncio.run(look())
@@ -248,14 +248,14 @@ def _write(draft: Draft, out: Path) -> None:
     with TemporaryDirectory(prefix="fusiond-") as folder, config_errors():
         trial = Path(folder) / out.name
         trial.write_text(text, encoding="utf-8")
-        loaded = load_config(trial)
+        settings = load_config(trial)
     try:
         out.write_text(text, encoding="utf-8")
     except OSError as error:
         typer.echo(f"fusiond: {out}: {error.strerror}", err=True)
         raise typer.Exit(EXIT_IO) from error
     typer.echo(f"{out}: written; go on with `fusiond check {out}` and `fusiond doctor {out}`")
-    for doubt in doubts(loaded):
+    for doubt in doubts(settings):
         typer.echo(f"  ! {doubt}")
 
 

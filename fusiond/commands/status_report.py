@@ -157,7 +157,7 @@ def _state(source: dict[str, Any]) -> str:
 
 
 def _fault(source: dict[str, Any]) -> str:
-    """What is wrong with a device or its measurements; empty where nothing is."""
+    """Fault of a device or of its measurements in words; empty without one."""
     if source["state"] != "running":
         return str(source["detail"])
     fault = source["diagnosis"]

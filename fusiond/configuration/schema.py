@@ -256,7 +256,7 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _chrony_hears_another_clock(self) -> Config:
+    def _chrony_has_another_clock(self) -> Config:
         if self.outputs.chrony is not None and self.clock.utc == "system":
             raise ValueError(
                 "[outputs.chrony] with clock.utc 'system' would set the system clock by itself"

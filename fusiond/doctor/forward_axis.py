@@ -35,7 +35,7 @@ MOST_S = 8.0
 MOST_TURN_RAD = np.radians(15.0)
 MOST_ASIDE_RAD = np.radians(30.0)
 """From the nearest axis: beyond it the unit is not mounted parallel to the vehicle."""
-_STANDING_M_S = 0.5
+_REST_SPEED_M_S = 0.5
 """Somebody got in: shaken, and no faster than this when it is quiet again."""
 
 DRIVE_S = 90.0
@@ -80,7 +80,7 @@ class ForwardAxis:
                 self.reason = "the vehicle did not drive off"
             return
         quiet = quiet and float(np.abs(mean - self._rest)[3:].max()) < SAME_FORCE_M_S2
-        if quiet and float(np.linalg.norm(self._velocity)) < _STANDING_M_S:
+        if quiet and float(np.linalg.norm(self._velocity)) < _REST_SPEED_M_S:
             self.phase, self._velocity = "standing", np.zeros(2)
             self._turn_rad = self._moving_s = 0.0
             return

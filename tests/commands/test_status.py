@@ -84,7 +84,7 @@ async def test_a_page_of_what_the_daemon_says(tmp_path: Path) -> None:
             assert lines[rdss + 1] == "  no beam above level 2; refused 4 multi_value, 1 too_old"
             (gnss,) = (k for k, line in enumerate(lines) if line.startswith("gnss"))
             assert " ".join(lines[gnss].split()[1:3]) == "running, out"
-            assert lines[gnss + 1].startswith("  velocity is off by")
+            assert lines[gnss + 1].startswith("  gnss velocity is off by")
             assert all(len(line) <= 80 for line in (lines[rdss], lines[gnss]))
             piped = await asked("--mqtt", f"127.0.0.1:{broker.port}", "--json", "-")
             answer = json.loads(piped.stdout)

@@ -62,14 +62,14 @@ const frequency = (hz) =>
 export function showSources(store) {
   const health = store.said("health");
   if (!health) return;
-  const heard = store.heard.health,
+  const latest = store.latest.health,
     uptime = (store.said("status") || {}).uptime_s;
   const rows = [];
   const sources = Object.entries(health.sources).sort((a, b) => derived(a[1]) - derived(b[1]));
   for (const [name, s] of sources) {
     const inside = derived(s);
-    const hz = heard.at === null ? null : rate(name, s, heard.at);
-    const seen = agedFurther(inside ? s.fused_age_s : s.age_s, heard, store.now);
+    const hz = latest.at === null ? null : rate(name, s, latest.at);
+    const seen = agedFurther(inside ? s.fused_age_s : s.age_s, latest, store.now);
     const old = seen !== null && !inside && seen > sourceLimit(s.received, uptime);
     const service = s.service && s.service !== "nominal" && s.state === "running" ? s.service : "";
     const state = service === "out" ? "left out" : service || (inside ? "derived" : s.state);
@@ -78,7 +78,7 @@ export function showSources(store) {
     const count = refused.count,
       why = wrong || refused.why,
       title = [wrong, refused.title].filter(Boolean).join("\n");
-    const used = agedFurther(s.fused_age_s, heard, store.now);
+    const used = agedFurther(s.fused_age_s, latest, store.now);
     const row = [
       { text: name, title: s.detail, className: inside ? "quiet" : "" },
       {
