@@ -20,7 +20,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load attack man deb docs lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load attack man deb docs lock clean arm \
 	collected dashboard-check kernels prebuilt systemd test-packages
 
 help: ## this list
@@ -149,6 +149,10 @@ man: $(RUNTIME) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
 deb: $(RUNTIME) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh deb
 	$(BIN)/python -m tools.debian_package $(ARGS)
+
+arm: $(RUNTIME) ## smoke test on aarch64, emulated: import, one kernel, a 10 s drive; ARGS="import kernel"
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh arm
+	$(BIN)/python -m tools.arm $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) $(TOOLS:%=--extra %) $(ARGS) --output-file requirements-dev.lock pyproject.toml

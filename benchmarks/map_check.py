@@ -51,7 +51,7 @@ async def shown(
     clock = asyncio.get_running_loop().time
     hub = Hub(clock, "test")
     hub.linked("up")
-    hub.take("truck", "nav", payload("nav"))
+    hub.receive("truck", "nav", payload("nav"))
     troubles: list[str] = []
     async with at_work(hub, base_map=path if tile is not None else None) as address:
         page = await browser.new_page(viewport={"width": 1600, "height": 1180}, color_scheme=scheme)

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Install the Debian packages that `make install` (argument: run), `make test` (run test), `make deb`
-# (deb) or `make dashboard-check` (look) needs and that are missing. Says what it does; asks for root
-# only if something is missing.
+# (deb), `make arm` (arm) or `make dashboard-check` (look) needs and that are missing. Says what it
+# does; asks for root only if something is missing.
 set -eu
 
 packages=""
@@ -46,11 +46,14 @@ for purpose in "$@"; do
     deb)
         need binutils "strip, for a package without what only a debugger reads"
         ;;
+    arm)
+        need qemu-user-static "runs programs of aarch64 (make arm)"
+        ;;
     look)
         need chromium "browser that looks at the dashboard"
         ;;
     *)
-        echo "usage: $0 run|test|deb|look ..." >&2
+        echo "usage: $0 run|test|deb|arm|look ..." >&2
         exit 64
         ;;
     esac

@@ -24,6 +24,8 @@ from pydantic.fields import FieldInfo
 
 from fusiond.commands.app import app
 from fusiond.configuration import aiding, outputs, schema
+from fusiond.configuration.alignment import Alignment
+from fusiond.configuration.constraints import NonHolonomic, ZeroVelocity
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.mistakes import described
 
@@ -49,9 +51,9 @@ ENVIRONMENT = (
 )
 _PARTS: dict[str, type[BaseModel]] = {
     "imu": schema.Imu,
-    "constraints.zero_velocity": schema.ZeroVelocity,
-    "constraints.non_holonomic": schema.NonHolonomic,
-    "alignment": schema.Alignment,
+    "constraints.zero_velocity": ZeroVelocity,
+    "constraints.non_holonomic": NonHolonomic,
+    "alignment": Alignment,
     "consistency": schema.ConsistencyTest,
     "scheduler": schema.Scheduler,
     "clock": schema.ClockOptions,

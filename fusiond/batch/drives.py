@@ -71,12 +71,14 @@ def _recording(config_path: Path, files: list[Path]) -> Row:
 
 
 def _tables(config: Config, folder: Path) -> Row:
-    aids = [(kind, folder / name) for name, kind in AID_FILES.items() if (folder / name).exists()]
+    measurements = [
+        (kind, folder / name) for name, kind in AID_FILES.items() if (folder / name).exists()
+    ]
     if not (folder / TRUTH).exists():
-        return _processed(process(config, folder / IMU, aids))
+        return _processed(process(config, folder / IMU, measurements))
     with TemporaryDirectory(prefix="fusiond-batch-") as made:
         out = Path(made) / "solution.csv"
-        result = process(config, folder / IMU, aids, out=out)
+        result = process(config, folder / IMU, measurements, out=out)
         row = _processed(result)
         if not result["solution_rows"]:
             return row

@@ -30,8 +30,8 @@ import numpy as np
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
+from fusiond.bench.delayed_fix import delayed_fix
 from fusiond.bench.fix_path import ordinary_fix
-from fusiond.bench.late_fix import late_fix
 from fusiond.bench.raw_epoch import raw_epoch
 from fusiond.bench.start import start
 from fusiond.configuration.schema import Config, Imu
@@ -63,7 +63,7 @@ SINGLE_STEPS = 1000
 PRODUCTS = 300
 """Timed at once: 1 to 3 ms, long against the resolution of the clock, short against a throttle."""
 FIX_NS = 200_000_000
-LATE_NS = 2_000_000_000
+DELAY_NS = 2_000_000_000
 HISTORY_S = 4.0
 STEP_RATE_HZ, STEP_SECONDS = 100, 100
 LOCAL_FILTERS = ("first", "second", "third")
@@ -80,7 +80,8 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
     velocity in order of validity, files read and the solution written at every row;
     `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
-    `late_tick_ratio`, the tick in which a fix comes that is 10 s late (`fusiond.bench.late_fix`).
+    `late_tick_ratio`, the tick in which a fix comes that is 10 s late
+    (`fusiond.bench.delayed_fix`).
 
     Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
 
@@ -120,7 +121,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["single_step_ratio"] = ratio(_single, repetitions)
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
     figures["raw_epoch_40_ratio"] = ratio(raw_epoch, repetitions)
-    figures["late_tick_ratio"] = ratio(late_fix(repetitions), repetitions)
+    figures["late_tick_ratio"] = ratio(delayed_fix(repetitions), repetitions)
     figures["multiscale_step_ratio"] = _step_ratio(
         lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), _one_source(), repetitions
     )
@@ -225,10 +226,10 @@ def _rewind(number: int) -> Callable[[], int]:
     for t_ns in range(FIX_NS, steps * STEP_NS + 1, FIX_NS):
         timeline.insert(_fix("gnss", t_ns))
     timeline.run()
-    late = _fix("rdss", buffer.latest_ns - LATE_NS)
+    delayed = _fix("rdss", buffer.latest_ns - DELAY_NS)
 
     def work() -> int:
-        timeline.insert(late)
+        timeline.insert(delayed)
         timeline.run()
         assert timeline.counters.rewinds == 1
         return 1
@@ -239,12 +240,12 @@ def _rewind(number: int) -> Callable[[], int]:
 def _one_source() -> list[Linearised]:
     """A position and a velocity each second."""
     lever, rest, sd = (0.3, 0.0, -1.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)
-    aids: list[Linearised] = []
+    measurements: list[Linearised] = []
     for second in range(1, STEP_SECONDS + 1):
         t_ns = second * 1_000_000_000
-        aids.append(_fix("gnss", t_ns))
-        aids.append(VelocityAid("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
-    return aids
+        measurements.append(_fix("gnss", t_ns))
+        measurements.append(VelocityAid("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
+    return measurements
 
 
 def _three_sources() -> list[Linearised]:
@@ -257,7 +258,7 @@ def _three_sources() -> list[Linearised]:
 
 
 def _step_ratio(
-    make: Callable[[Model, float], Estimator], aids: list[Linearised], repetitions: int
+    make: Callable[[Model, float], Estimator], measurements: list[Linearised], repetitions: int
 ) -> float:
     """Processor time of an estimator's second over the centralised filter's, taken in turns.
 
@@ -272,9 +273,9 @@ def _step_ratio(
             estimator.initialise(0, 0, nav, xi, p)
             gc.collect()
             before = time.process_time()
-            for aid in aids:
-                estimator.propagate(buffer, aid.t_ns)
-                estimator.update(aid)
+            for measurement in measurements:
+                estimator.propagate(buffer, measurement.t_ns)
+                estimator.update(measurement)
             spent.append(time.process_time() - before)
         ratios.append(spent[0] / spent[1])
     return statistics.median(ratios[1:])
@@ -290,8 +291,8 @@ def _process(folder: Path, duration_s: float) -> Callable[[int], Callable[[], in
 
     def make(_: int) -> Callable[[], int]:
         def work() -> int:
-            aids = [("gnss", written.files["gnss"])]
-            process(config, written.files["imu"], aids, out=folder / "solution.csv")
+            measurements = [("gnss", written.files["gnss"])]
+            process(config, written.files["imu"], measurements, out=folder / "solution.csv")
             return written.rows["imu"]
 
         return work

@@ -13,7 +13,7 @@ from collections import Counter
 from types import CodeType, FrameType
 from typing import NamedTuple
 
-from fusiond.bench.late_fix import AT_S, Drive
+from fusiond.bench.delayed_fix import AT_S, Drive
 
 FIXES = 5
 OURS, NOT_OURS = "fusiond.", ("fusiond.bench.", "fusiond.simulation.")

@@ -32,7 +32,7 @@ from fusiond.commands.status import status
 
 # Imports make half a million objects that live for ever. At CPython's own threshold of 700 the
 # collector looks through them again and again: 0.2 s of the processor's time until a command begins
-# its work, which sets a lower one (`fusiond.commands.shared.loaded`).
+# its work, which sets a lower one (`fusiond.commands.shared.freeze_imports`).
 COLLECT_AFTER = 1_000_000
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO
 
-from fusiond.commands.shared import draws, loaded
+from fusiond.commands.shared import draws, freeze_imports
 from fusiond.workers.forked import Forked
 
 # A line of a log every so often, where a terminal's is written anew at each kernel.
@@ -27,7 +27,7 @@ def compiling() -> Iterator[None]:
 
     with gathered() as missing:
         yield
-        loaded()
+        freeze_imports()
     if missing:
         compile_aside(missing, Progress(sys.stderr))
 
@@ -67,7 +67,7 @@ class Progress:
         self._draws = draws(out)
         self._service = ServiceManager()
         self._started_s = time.monotonic()
-        self._told_s = -LINE_EVERY_S
+        self._reported_s = -LINE_EVERY_S
 
     def __call__(self, done: int, total: int) -> None:
         if not done:
@@ -77,8 +77,8 @@ class Progress:
         spent_s = time.monotonic() - self._started_s
         if done == total:
             self._say(f"compiled {total} kernels in {spent_s:.0f} s", ends=True)
-        elif self._draws or spent_s - self._told_s >= LINE_EVERY_S:
-            self._told_s = spent_s
+        elif self._draws or spent_s - self._reported_s >= LINE_EVERY_S:
+            self._reported_s = spent_s
             self._say(text, ends=False)
 
     def _say(self, text: str, ends: bool) -> None:

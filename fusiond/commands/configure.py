@@ -13,7 +13,8 @@ from fusiond.commands.shared import EXIT_IO, config_errors, parse_mqtt, spinner
 if TYPE_CHECKING:
     from drivers.can.bus import Interface
     from fusiond.configuration.draft import Draft, DraftSource, Vector
-    from fusiond.doctor.discovery import Device, Unheard
+    from fusiond.doctor.discovery import Device, SilentPort
+    from fusiond.doctor.forward_axis import Phase
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
 _NAMES = {
@@ -60,6 +61,12 @@ def init(
             help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
         ),
     ] = None,
+    drive: Annotated[
+        bool | None,
+        typer.Option(
+            "--drive/--no-drive", help="Find the IMU's forward axis by driving off straight ahead."
+        ),
+    ] = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Use defaults and options, without questions.")
     ] = False,
@@ -86,14 +93,14 @@ def init(
     if ask_terminal is None:
         question = "Ask silent serial ports whether an RDSS terminal is there (sends bytes)?"
         ask_terminal = asks and typer.confirm(question, default=False)
-    devices, unheard = _look(port, can, ask_terminal)
+    devices, silent_ports = _look(port, can, ask_terminal)
     for device in devices:
         typer.echo(f"found: {device.text}")
-    for silent in unheard if port is not None else ():
+    for silent in silent_ports if port is not None else ():
         typer.echo(f"found nothing: {silent.text}")
     if not devices:
-        heard = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
-        typer.echo(f"No supported device found on: {heard}")
+        looked_at = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
+        typer.echo(f"No supported device found on: {looked_at}")
     imu = next((d for d in devices if d.driver == "can_imu"), None)
     has_antenna = any(d.driver != "can_imu" for d in devices)
     where = ""
@@ -101,7 +108,12 @@ def init(
         question = "GNSS antenna from the IMU, m forward,right,down (empty: later)"
         where = answer(antenna, question, "")
     arms = {} if not where else dict.fromkeys(("gnss", "rdss"), _vector(where))
-    measured, known = _measured_axes(imu)
+    forward = None
+    if axes is None and imu is not None and imu.down is not None:
+        question = "Drive off straight ahead now, to find the IMU's forward axis?"
+        if drive or (drive is None and asks and typer.confirm(question, default=False)):
+            forward = _driven_axis(imu, imu.down)
+    measured, known = _measured_axes(imu, forward)
     if axes is None and imu is not None:
         typer.echo(f"axes: {known}")
     kind = _choice(answer(vehicle_class, "Vehicle class", "road"), VehicleClass)
@@ -121,29 +133,58 @@ def init(
     _write(draft, out)
 
 
-def _measured_axes(imu: Device | None) -> tuple[tuple[str, str, str], str]:
-    """Axes with down as gravity shows it, and what is known of them in words. Forward is assumed to
-    be the first axis that is level: no motion has been seen."""
+def _measured_axes(
+    imu: Device | None, forward: str | None = None
+) -> tuple[tuple[str, str, str], str]:
+    """Axes with down as gravity shows it, and what is known of them in words. Without `forward`,
+    which a drive shows, it is assumed to be the first axis that is level."""
+    from fusiond.doctor.forward_axis import axes_of  # noqa: PLC0415
+
     if imu is None or imu.down is None:
         level = "the unit moved or stands askew" if imu is not None else "no unit was heard"
         return ("+x", "+y", "+z"), f"Not measured ({level}): `fusiond doctor` at rest says down."
-    sign, down = imu.down[0], imu.down[1]
-    forward, right = (axis for axis in "xyz" if axis != down)
-    even = down != "y"  # x, y, z in turn are right-handed; x, z, y are not
-    turned = "+" if (sign == "+") == even else "-"
-    return (f"+{forward}", f"{turned}{right}", imu.down), (
-        f"Down is {imu.down}, by gravity. That +{forward} points forward is assumed: look at the "
-        "unit's mark."
+    if forward is not None:
+        return axes_of(forward, imu.down), (
+            f"Down is {imu.down}, by gravity; {forward} is forward, by driving off."
+        )
+    level_axis = "+" + next(axis for axis in "xyz" if axis != imu.down[1])
+    return axes_of(level_axis, imu.down), (
+        f"Down is {imu.down}, by gravity. That {level_axis} points forward is assumed: look at the "
+        "unit's mark, or use `fusiond config init --drive`."
     )
+
+
+def _driven_axis(imu: Device, down: str) -> str | None:
+    """Forward axis of the unit by a short drive; None, with the reason printed, without one."""
+    import asyncio  # noqa: PLC0415
+
+    from drivers.can.imu import CanImuOptions  # noqa: PLC0415
+    from fusiond.doctor.forward_axis import DRIVE_S, watch_departure  # noqa: PLC0415
+
+    advice = {
+        "standing": "standing: now drive off straight ahead, faster than walking pace",
+        "moving": "moving",
+    }
+
+    def on_phase(phase: Phase) -> None:
+        if phase in advice:
+            typer.echo(advice[phase])
+
+    typer.echo("stand still for two seconds")
+    options = CanImuOptions.model_validate(imu.options)
+    found = asyncio.run(watch_departure(options, down, DRIVE_S, on_phase))
+    if found.axis is None:
+        typer.echo(f"forward axis not found: {found.reason}; try again, or give --axes")
+    return found.axis
 
 
 def _look(
     ports: list[str] | None, buses: list[str] | None, ask_terminal: bool
-) -> tuple[list[Device], list[Unheard]]:
+) -> tuple[list[Device], list[SilentPort]]:
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
-    from fusiond.doctor.discovery import Device, Unheard, on_bus, on_port  # noqa: PLC0415
+    from fusiond.doctor.discovery import Device, SilentPort, on_bus, on_port  # noqa: PLC0415
 
     channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
 
@@ -151,14 +192,14 @@ def _look(
     lines = similar_ports() if ports is None else ports
     unique = {Path(line).resolve(): line for line in reversed(lines)}
 
-    async def look() -> tuple[list[Device], list[Unheard]]:
+    async def look() -> tuple[list[Device], list[SilentPort]]:
         found = await asyncio.gather(
             *(on_port(line, ask_terminal=ask_terminal) for line in unique.values())
         )
         on_buses = await asyncio.gather(*(on_bus(*channel) for channel in channels))
-        heard = [device for devices in on_buses for device in devices]
-        heard += [one for one in found if isinstance(one, Device)]
-        return heard, [one for one in found if isinstance(one, Unheard)]
+        looked_at = [device for devices in on_buses for device in devices]
+        looked_at += [one for one in found if isinstance(one, Device)]
+        return looked_at, [one for one in found if isinstance(one, SilentPort)]
 
     with spinner("listening to ports and buses"):
         return asyncio.run(look())
@@ -207,14 +248,14 @@ def _write(draft: Draft, out: Path) -> None:
     with TemporaryDirectory(prefix="fusiond-") as folder, config_errors():
         trial = Path(folder) / out.name
         trial.write_text(text, encoding="utf-8")
-        loaded = load_config(trial)
+        settings = load_config(trial)
     try:
         out.write_text(text, encoding="utf-8")
     except OSError as error:
         typer.echo(f"fusiond: {out}: {error.strerror}", err=True)
         raise typer.Exit(EXIT_IO) from error
     typer.echo(f"{out}: written; go on with `fusiond check {out}` and `fusiond doctor {out}`")
-    for doubt in doubts(loaded):
+    for doubt in doubts(settings):
         typer.echo(f"  ! {doubt}")
 
 

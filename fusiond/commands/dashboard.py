@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, load, loaded
+from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, freeze_imports, load
 
 if TYPE_CHECKING:
     from fusiond.dashboard.broker import Access
@@ -44,25 +44,25 @@ def dashboard(
 
     from fusiond.dashboard.serve import (  # noqa: PLC0415
         DashboardError,
-        Serving,
+        PageAddress,
         serve_broker,
         serve_log,
     )
 
-    loaded()
+    freeze_imports()
     token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
-    serving = Serving(host, port, token if commands and not logs else None, base_map)
-    if not serving.loopback:
+    page_address = PageAddress(host, port, token if commands and not logs else None, base_map)
+    if not page_address.loopback:
         typer.echo("fusiond: everyone who reaches this address sees the vehicle", err=True)
     try:
         if logs:
             from fusiond.commands.recordings import log_errors  # noqa: PLC0415
 
             with log_errors():
-                serve_log(logs, speed, serving, typer.echo)
+                serve_log(logs, speed, page_address, typer.echo)
         else:
             access = _at(mqtt) if config is None else _of(config)
-            serve_broker(access, serving, typer.echo)
+            serve_broker(access, page_address, typer.echo)
     except DashboardError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error

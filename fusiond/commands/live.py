@@ -16,10 +16,10 @@ from fusiond.commands.shared import (
     ConfigPath,
     config_errors,
     draws,
+    freeze_imports,
     load,
     plain,
 )
-from fusiond.commands.shared import loaded as code_is_there
 
 if TYPE_CHECKING:
     from fusiond.configuration.schema import Config
@@ -32,7 +32,7 @@ RecordPath = Annotated[
 
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
-    loaded = recorded(load(config), record)
+    settings = recorded(load(config), record)
     from fusiond.configuration.load import ConfigError, load_config  # noqa: PLC0415
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415
 
@@ -41,9 +41,9 @@ def run(config: ConfigPath, record: RecordPath = None) -> None:
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
         with suppress(ConfigError):  # the daemon's own will say so
-            Navigator(loaded)
-    code_is_there()
-    run_daemon(loaded, config, lambda: recorded(load_config(config), record), missing)
+            Navigator(settings)
+    freeze_imports()
+    run_daemon(settings, config, lambda: recorded(load_config(config), record), missing)
 
 
 def recorded(config: Config, folder: Path | None) -> Config:
@@ -93,7 +93,7 @@ def check(
     What is valid and cannot work is told too, marked with !, and leaves the exit code at 0. With
     --compile also that the model, with all that its aids add, fits the kernels.
     """
-    loaded = load(config)
+    settings = load(config)
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415
 
     if compile_kernels:
@@ -101,17 +101,19 @@ def check(
             import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
             from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
-            Navigator(loaded)  # and so does its filter
-    typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
-    for name, source in loaded.sources.items():
-        aid = loaded.aiding.get(name)
-        typer.echo(f"  {name}: driver {source.driver}" + (f", aids as {aid.kind}" if aid else ""))
-    for name in loaded.outputs.served:
+            Navigator(settings)  # and so does its filter
+    typer.echo(f"{config}: ok, vehicle {settings.vehicle}")
+    for name, source in settings.sources.items():
+        section = settings.aiding.get(name)
+        typer.echo(
+            f"  {name}: driver {source.driver}" + (f", aids as {section.kind}" if section else "")
+        )
+    for name in settings.outputs.served:
         typer.echo(f"  output {name}")
-    for name, aid in loaded.aiding.items():
-        if name not in loaded.sources:
-            typer.echo(f"  {name}: aids as {aid.kind}, no source (for `process`)")
-    for doubt in doubts(loaded):
+    for name, section in settings.aiding.items():
+        if name not in settings.sources:
+            typer.echo(f"  {name}: aids as {section.kind}, no source (for `process`)")
+    for doubt in doubts(settings):
         typer.echo(f"  ! {doubt}")
 
 
@@ -123,7 +125,7 @@ def doctor(
     ] = False,
 ) -> None:
     """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
-    loaded = load(config)
+    settings = load(config)
     from fusiond.doctor.doctor import doctor as run_doctor  # noqa: PLC0415
 
-    raise typer.Exit(run_doctor(loaded, seconds, transmit))
+    raise typer.Exit(run_doctor(settings, seconds, transmit))

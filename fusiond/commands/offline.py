@@ -87,19 +87,19 @@ def process(
         raise typer.BadParameter("Give --imu or --can")
     if smooth and out is None:
         raise typer.BadParameter("--smooth: name a file to write with --out")
-    loaded = load(config)
+    settings = load(config)
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
-        raw_receivers(loaded.aiding)  # what they compile comes with the rest
+        raw_receivers(settings.aiding)  # what they compile comes with the rest
     wanted = _systems_argument(systems)
     try:
         with config_errors(), data_errors(), progress_bar("processing") as bar:
             result = run_process(
-                loaded,
+                settings,
                 imu,
                 aids,
                 outages,
@@ -147,7 +147,7 @@ def calibrate(
     aids = [_aid_argument(text) for text in aid or []]
     if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
-    loaded = load(config)
+    settings = load(config)
     from fusiond.commands.recordings import log_errors  # noqa: PLC0415
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
@@ -157,10 +157,10 @@ def calibrate(
         from fusiond.offline.calibrate import files  # noqa: PLC0415
 
         navigate = _recording(logs) if logs else files(imu, aids, can)
-        raw_receivers(loaded.aiding)  # what they compile comes with the rest
+        raw_receivers(settings.aiding)  # what they compile comes with the rest
     try:
         with config_errors(), data_errors(), log_errors(), progress_bar("calibrating") as bar:
-            found = run_calibrate(loaded, navigate, bar or (lambda done, total: None))
+            found = run_calibrate(settings, navigate, bar or (lambda done, total: None))
     except MissingPackageError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error

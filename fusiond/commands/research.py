@@ -157,9 +157,9 @@ def model(
 
     if name not in MODELS:
         raise typer.BadParameter(f"{name!r}: there are {', '.join(MODELS)}")
-    loaded = None if config is None else load(config)
+    settings = None if config is None else load(config)
     with config_errors():
-        report = model_report(name, loaded)
+        report = model_report(name, settings)
     if json_path != "-":
         print_model(report)
     write_json(report, json_path)

@@ -79,7 +79,7 @@ def data_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_IO) from error
 
 
-def loaded() -> None:
+def freeze_imports() -> None:
     """The code of a command is there, and lives as long as the process: no collection looks through
     it any more, and from now on there are some."""
     gc.freeze()

@@ -40,7 +40,7 @@ _ASKED = ("status", "nav", "health")
 
 
 @dataclass(slots=True)
-class Heard:
+class VehicleMessages:
     """One vehicle's last message of each topic; `live` if any of it was said just now."""
 
     topics: dict[str, Any] = field(default_factory=dict)
@@ -82,8 +82,8 @@ def status(
 
     access = None
     if config is not None:
-        loaded = load(config)
-        access, vehicle = loaded.mqtt, vehicle or loaded.vehicle
+        settings = load(config)
+        access, vehicle = settings.mqtt, vehicle or settings.vehicle
         if not access.enabled:
             typer.echo(
                 f"fusiond: {config}: [mqtt] is not enabled: there is no way to ask", err=True
@@ -94,12 +94,14 @@ def status(
         host, port = parse_mqtt(mqtt)
     try:
         with config_errors():
-            name, heard = chosen(asyncio.run(ask(host, port, access, vehicle, wait)), vehicle, wait)
+            name, messages = chosen(
+                asyncio.run(ask(host, port, access, vehicle, wait)), vehicle, wait
+            )
     except UnansweredError as error:
         write_json({"state": error.state, "why": str(error)}, json_path)
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
-    answer = {"state": "online", "vehicle": name, **heard.topics}
+    answer = {"state": "online", "vehicle": name, **messages.topics}
     if json_path != "-":
         from fusiond.commands.status_report import page  # noqa: PLC0415
 
@@ -111,7 +113,7 @@ def status(
 
 async def ask(
     host: str, port: int, access: Mqtt | None, vehicle: str | None, wait_s: float
-) -> dict[str, Heard]:
+) -> dict[str, VehicleMessages]:
     """Retained messages of each vehicle, or of `vehicle` alone, after `wait_s` at most.
 
     `access`: user, password and TLS. Raises `UnansweredError` where no broker lets us in.
@@ -122,7 +124,7 @@ async def ask(
 
     from fusiond.outputs import packet_limit  # noqa: PLC0415
 
-    vehicles: dict[str, Heard] = {}
+    vehicles: dict[str, VehicleMessages] = {}
     loop = asyncio.get_running_loop()
     until_s = loop.time() + wait_s
 
@@ -131,7 +133,12 @@ async def ask(
         async for message in client.messages:
             name, _, topic = message.topic.value.removeprefix("fusiond/").rpartition("/")
             if isinstance(message.payload, bytes) and len(message.payload) <= _MOST_BYTES:
-                _take(vehicles.setdefault(name, Heard()), topic, message.payload, message.retain)
+                _receive(
+                    vehicles.setdefault(name, VehicleMessages()),
+                    topic,
+                    message.payload,
+                    message.retain,
+                )
 
     credentials: dict[str, Any] = {}
     if access is not None:
@@ -149,7 +156,7 @@ async def ask(
             listening = asyncio.create_task(listen(client))
             await asyncio.wait({listening}, timeout=min(_SETTLE_S, wait_s))
             while loop.time() < until_s and not (
-                vehicles and all(heard.complete for heard in vehicles.values())
+                vehicles and all(messages.complete for messages in vehicles.values())
             ):
                 await asyncio.wait({listening}, timeout=_LOOK_EVERY_S)
                 if listening.done():
@@ -163,18 +170,22 @@ async def ask(
     return vehicles
 
 
-def _take(heard: Heard, topic: str, payload: bytes, retained: bool) -> None:
+def _receive(messages: VehicleMessages, topic: str, payload: bytes, retained: bool) -> None:
     if topic == "online":
-        heard.online = payload.decode(errors="replace")
+        messages.online = payload.decode(errors="replace")
         return
     with suppress(ValueError, RecursionError):  # another program's message below our topic
-        heard.topics[topic] = json.loads(payload)
-        heard.live |= topic in _ASKED and not retained
+        messages.topics[topic] = json.loads(payload)
+        messages.live |= topic in _ASKED and not retained
 
 
-def chosen(vehicles: dict[str, Heard], vehicle: str | None, wait_s: float) -> tuple[str, Heard]:
+def chosen(
+    vehicles: dict[str, VehicleMessages], vehicle: str | None, wait_s: float
+) -> tuple[str, VehicleMessages]:
     """The vehicle that is meant, if it answers. Raises `UnansweredError`."""
-    there = {name: heard for name, heard in vehicles.items() if heard.online or heard.live}
+    there = {
+        name: messages for name, messages in vehicles.items() if messages.online or messages.live
+    }
     if not there:
         whose = "no daemon" if vehicle is None else f"no daemon of a vehicle {vehicle!r}"
         raise UnansweredError(
@@ -182,24 +193,24 @@ def chosen(vehicles: dict[str, Heard], vehicle: str | None, wait_s: float) -> tu
             f"the broker knows of {whose}: start one (systemctl start fusiond, or `fusiond run`), "
             "and look at host, port and vehicle of its configuration",
         )
-    running = [name for name, heard in there.items() if heard.online != "offline"]
+    running = [name for name, messages in there.items() if messages.online != "offline"]
     if len(running or there) > 1:
         raise UnansweredError(
             "ambiguous", f"--vehicle: which of {', '.join(sorted(running or there))}?"
         )
     (name,) = running or there
-    heard = there[name]
-    last = heard.topics.get("status", {})
+    messages = there[name]
+    last = messages.topics.get("status", {})
     said = f"; last heard {last['t_utc']}: {last['mode']}, {last['why']}" if last else ""
-    if heard.online == "offline":
+    if messages.online == "offline":
         raise UnansweredError(
             "offline",
             f"{name} is offline{said}. journalctl -u fusiond says why; systemctl start fusiond",
         )
-    if not heard.live or not last:
+    if not messages.live or not last:
         raise UnansweredError(
             "silent",
             f"{name} is online, but has said nothing for {wait_s:g} s{said}. "
             "It has stopped, hangs, or its network does: systemctl status fusiond",
         )
-    return name, heard
+    return name, messages

@@ -7,6 +7,7 @@ from math import atan2, degrees, hypot
 from typing import Any
 
 _SHOWN_EVENTS = 6
+_SHOWN_REASONS = 2
 _UNKNOWN = "-"
 
 
@@ -122,38 +123,55 @@ def _process(health: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _sources(
     sources: dict[str, dict[str, Any]], consistency: dict[str, Any] | None
 ) -> Iterator[str]:
+    """A row a source, and below it why it is not fused as usual: together within 80 columns."""
     verdicts = {} if consistency is None else consistency["sources"]
-    rows = [("source", "state", "service", "fused", "refused", "age", "latency", "verdict", "")]
+    rows = [("source", "state", "fused", "refused", "age", "latency", "verdict")]
     for name, source in sources.items():
+        refused = sum(source["rejected"].values())
         rows.append(
             (
                 name,
-                source["state"],
-                source["service"] or _UNKNOWN,
+                _state(source),
                 str(source["fused"]),
-                _refused(source["rejected"]),
+                str(refused) if refused else _UNKNOWN,
                 _time(source["age_s"]),
                 _time(source["latency_s"]),
                 verdicts.get(name, {}).get("verdict") or source["verdict"] or _UNKNOWN,
-                source["detail"] if source["state"] != "running" else _left_out(source),
             )
         )
-    return columns(rows)
+    head, *lines = columns(rows)
+    yield head
+    for line, source in zip(lines, sources.values(), strict=True):
+        yield line
+        why = "; ".join(part for part in (_fault(source), _refused(source["rejected"])) if part)
+        if why:
+            yield f"  {why}"
 
 
-def _left_out(source: dict[str, Any]) -> str:
-    """Fault or exclusion of a source; empty without one."""
+def _state(source: dict[str, Any]) -> str:
+    """State of the device; of one that runs, its service where that is not as usual."""
+    service = source["service"]
+    if source["state"] == "running" and service not in (None, "nominal"):
+        return f"running, {service}"
+    return str(source["state"])
+
+
+def _fault(source: dict[str, Any]) -> str:
+    """Fault of a device or of its measurements in words; empty without one."""
+    if source["state"] != "running":
+        return str(source["detail"])
     fault = source["diagnosis"]
     return str(source["isolated"] or "") if fault is None else str(fault["text"])
 
 
 def _refused(reasons: dict[str, int]) -> str:
-    """The commonest reason, and how many of the others."""
+    """The commonest reasons with their counts."""
     if not reasons:
-        return _UNKNOWN
-    reason, count = max(reasons.items(), key=lambda item: item[1])
-    others = sum(reasons.values()) - count
-    return f"{count} {reason}" + (f" +{others}" if others else "")
+        return ""
+    first = sorted(reasons.items(), key=lambda item: -item[1])
+    words = ", ".join(f"{count} {reason}" for reason, count in first[:_SHOWN_REASONS])
+    others = sum(count for _, count in first[_SHOWN_REASONS:])
+    return f"refused {words}" + (f", {others} others" if others else "")
 
 
 def _time(seconds: float | None) -> str:

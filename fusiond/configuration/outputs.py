@@ -98,8 +98,8 @@ class Outputs(Section):
     """Shared options of outputs, and a section each."""
 
     geoid_separation_m: Annotated[float, Field(ge=-120.0, le=100.0)] | None = None
-    """Height of the geoid above the ellipsoid where the vehicle drives; without it no height above
-    sea level is told."""
+    """Height of the geoid above the ellipsoid where the vehicle drives, for heights above the sea;
+    by default that of EGM96, to some metres."""
     gpsd: Gpsd | None = None
     nmea: NmeaServed | None = None
     prometheus: Prometheus | None = None

@@ -30,6 +30,8 @@ from fusiond.configuration.aiding import (
     Section,
     Vector,
 )
+from fusiond.configuration.alignment import Alignment
+from fusiond.configuration.constraints import Constraints
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.outputs import Outputs
@@ -127,104 +129,6 @@ class Imu(Section):
         named = data.get("sensor_class") if isinstance(data, dict) else None
         known = CLASSES.get(named) if named is not None else None
         return {**known, **data} if known else data
-
-
-class ZeroVelocity(Section):
-    """Stationary detector: zero velocity and zero rate while the sensor is quiet."""
-
-    enabled: bool = True
-    window_s: PositiveFloat = 1.0
-    """Samples judged together, on a fixed grid of time."""
-    gyro_sd_deg_s: PositiveFloat = 0.5
-    """Quiet below this standard deviation on every axis; twice what standing with the engine
-    on shows."""
-    accel_sd_m_s2: PositiveFloat = 0.15
-    """The same for specific force."""
-    max_rate_deg_s: PositiveFloat = 2.0
-    """Quiet below this mean rate, beyond three sigma of the gyro's bias."""
-    max_speed_m_s: PositiveFloat = 0.5
-    """A quiet sensor means standstill only below this computed speed."""
-    velocity_sd_m_s: PositiveFloat = 0.05
-    """One sigma of the velocity at rest."""
-    rate_sd_deg_s: PositiveFloat = 0.1
-    """Largest rate of a standing vehicle."""
-    interval_s: PositiveFloat = 0.5
-
-
-class NonHolonomic(Section):
-    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point; see
-    `docs/vehicle.md`."""
-
-    enabled: bool = False
-    sd_m_s: PositiveFloat = 0.2
-    """Sideways, of what is new in each interval."""
-    sd_down_m_s: PositiveFloat = 0.5
-    """Downwards: heave and pitch of the suspension, which last for seconds."""
-    drift_sd_m_s: NonNegativeFloat = 0.1
-    """Sideways, of what lasts (slip angle, a road's crown): one sigma of a state; 0: none."""
-    drift_s: PositiveFloat = 5.0
-    """Correlation time of that drift."""
-    mounting_sd_deg: NonNegativeFloat = 5.0
-    """One sigma of pitch and yaw of the IMU against the vehicle beyond `imu.mounting_deg`, which
-    the filter estimates. 0: the mounting is as measured."""
-    min_speed_m_s: NonNegativeFloat = 2.0
-    interval_s: PositiveFloat = 0.1
-    lever_arm_m: Vector = (0.0, 0.0, 0.0)
-    """From the IMU to the point that does not slide (the rear axle)."""
-    lever_arm_sd_m: NonNegativeFloat = 1.0
-    """One sigma of what its forward part is wrong by, which the filter estimates. 0: nothing."""
-
-
-class Constraints(Section):
-    zero_velocity: ZeroVelocity = Field(default_factory=ZeroVelocity.unsaid)
-    non_holonomic: NonHolonomic = Field(default_factory=NonHolonomic.unsaid)
-
-
-class Alignment(Section):
-    """Alignment: sources of attitude and position before navigation starts.
-
-    `heading` lists the allowed sources of the first heading in order of preference.
-    """
-
-    heading: tuple[
-        Literal[
-            "saved",
-            "config",
-            "dual_antenna",
-            "compass",
-            "gyrocompass",
-            "gnss_course",
-            "positions",
-        ],
-        ...,
-    ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course", "positions")
-    """Allowed sources of the first heading, in order of preference."""
-    heading_deg: float | None = None
-    """For `config`: true heading at the start."""
-    heading_sd_deg: PositiveFloat = 5.0
-    """One sigma of it."""
-    position_deg_m: Vector | None = None
-    """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
-    position_sd_m: PositiveFloat = 100.0
-    """One sigma of it."""
-    levelling_s: PositiveFloat = 2.0
-    """Rest needed to level by gravity."""
-    course_speed_m_s: PositiveFloat = 3.0
-    """Speed from which the GNSS course is taken for the heading."""
-    course_sd_deg: PositiveFloat = 5.0
-    """One sigma of that (side slip, mounting)."""
-    gyrocompass_s: PositiveFloat = 120.0
-    """Rest needed to gyrocompass."""
-    gyrocompass_max_sd_deg: PositiveFloat = 5.0
-    """Gyrocompassing is used only if bias and noise allow this heading sigma."""
-    saved_max_age_s: PositiveFloat = 86400.0
-    """A saved state older than this is not used."""
-
-    @model_validator(mode="after")
-    def _heading_given(self) -> Alignment:
-        if "config" in self.heading and self.heading_deg is None:
-            raise ValueError("heading lists 'config': set heading_deg too")
-        return self
 
 
 class ConsistencyTest(Section):
@@ -352,7 +256,7 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _chrony_hears_another_clock(self) -> Config:
+    def _chrony_has_another_clock(self) -> Config:
         if self.outputs.chrony is not None and self.clock.utc == "system":
             raise ValueError(
                 "[outputs.chrony] with clock.utc 'system' would set the system clock by itself"

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.aiding import RawAiding
-from fusiond.configuration.schema import Imu, ZeroVelocity
+from fusiond.configuration.constraints import ZeroVelocity
+from fusiond.configuration.schema import Imu
 from fusiond.models.blocks import ClockNoise, ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.rotation import dcm_from_rpy

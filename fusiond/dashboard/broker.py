@@ -100,7 +100,7 @@ class Broker:
             levels = message.topic.value.split("/")
             if isinstance(message.payload, bytes):
                 topic = "/".join(levels[2:])
-                self._hub.take(levels[1], topic, message.payload, message.retain)
+                self._hub.receive(levels[1], topic, message.payload, message.retain)
 
     async def _ask(self, client: aiomqtt.Client) -> None:
         while True:

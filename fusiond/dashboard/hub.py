@@ -74,7 +74,7 @@ class Hub:
         kinds = {kind: n for kind in REFUSALS if (n := self.counters[kind])}
         return {"count": sum(kinds.values()), "kinds": kinds, "last": self._refused_last}
 
-    def take(self, vehicle: str, topic: str, payload: bytes, kept: bool = False) -> None:
+    def receive(self, vehicle: str, topic: str, payload: bytes, kept: bool = False) -> None:
         """A message of `topic` below a vehicle's base; what cannot be used is counted."""
         if topic.startswith("fleet/"):  # of each card one
             topic = "fleet"
@@ -82,13 +82,13 @@ class Hub:
             self.counters["other_topic"] += 1
             return
         try:
-            self._take(vehicle, topic, payload, kept)
+            self._receive(vehicle, topic, payload, kept)
         except _NotTakenError as refused:
             self.counters[refused.kind] += 1
             where = f"{vehicle[:MOST_NAME]}/{topic}"
             self._refused_last = f"{where}: {refused}"[:MOST_REASON]
 
-    def _take(self, vehicle: str, topic: str, payload: bytes, kept: bool) -> None:
+    def _receive(self, vehicle: str, topic: str, payload: bytes, kept: bool) -> None:
         if len(payload) > LARGEST_BYTES:
             raise _NotTakenError("too_large", f"more than {LARGEST_BYTES} bytes")
         if len(vehicle) > MOST_NAME:
@@ -102,13 +102,13 @@ class Hub:
             one = self.vehicles[vehicle] = Vehicle(vehicle)
         self.counters["received"] += 1
         if not kept:
-            one.heard_s = now_s
-        one.take(topic, said, now_s, kept)
+            one.received_s = now_s
+        one.receive(topic, said, now_s, kept)
 
     def _make_room(self, now_s: float, kept: bool) -> None:
         """For a vehicle that speaks, in place of the one that was silent longest."""
-        silent = min(self.vehicles.values(), key=lambda one: one.heard_s)
-        if kept or now_s - silent.heard_s < GIVES_WAY_S:
+        silent = min(self.vehicles.values(), key=lambda one: one.received_s)
+        if kept or now_s - silent.received_s < GIVES_WAY_S:
             raise _NotTakenError("too_many_vehicles", f"there are {MOST_VEHICLES} already")
         del self.vehicles[silent.name]
 

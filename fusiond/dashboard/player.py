@@ -51,6 +51,6 @@ class Player:
                 await asyncio.sleep(max(0.0, ahead_s) / self.speed)
             if ahead_s < 0.0:  # it cannot be played so fast: the clock waits for it
                 self._began -= ahead_s / self.speed
-            hub.take(self.vehicle, message.topic[1:], message.data)
+            hub.receive(self.vehicle, message.topic[1:], message.data)
         hub.linked("ended", "; ".join(self._log.problems))
         await asyncio.Event().wait()

@@ -16,16 +16,16 @@ class Recent:
 
     def __init__(self, *names: str) -> None:
         self._names = names
-        self._heard: deque[tuple[float, dict[str, int]]] = deque()
+        self._window: deque[tuple[float, dict[str, int]]] = deque()
 
     def of(self, said: Mapping[str, Any], at_s: float) -> dict[str, Any]:
         """The message with each counter less what it was a minute ago, or at the first message
         since then."""
         now = {name: said[name] for name in self._names if isinstance(said.get(name), int)}
-        if self._heard and any(now.get(n, 0) < k for n, k in self._heard[-1][1].items()):
-            self._heard.clear()
-        self._heard.append((at_s, now))
-        while self._heard[0][0] < at_s - WINDOW_S:
-            self._heard.popleft()
-        first = self._heard[0][1]
+        if self._window and any(now.get(n, 0) < k for n, k in self._window[-1][1].items()):
+            self._window.clear()
+        self._window.append((at_s, now))
+        while self._window[0][0] < at_s - WINDOW_S:
+            self._window.popleft()
+        first = self._window[0][1]
         return {**said, **{name: k - first.get(name, 0) for name, k in now.items()}}

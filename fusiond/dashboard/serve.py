@@ -31,7 +31,7 @@ class DashboardError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
+class PageAddress:
     """Address of the server. `token`: whoever has it may send commands; None: nobody. `base_map`: a
     PMTiles file to draw below the track."""
 
@@ -53,17 +53,17 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def serve_broker(access: Access, serving: Serving, tell: Callable[[str], None]) -> None:
-    """Show the vehicles of a broker until a signal. `tell` hears the page's address."""
+def serve_broker(access: Access, page_address: PageAddress, report: Callable[[str], None]) -> None:
+    """Show the vehicles of a broker until a signal. `report` hears the page's address."""
     hub = Hub(time.monotonic, f"{access.host}:{access.port}")
     broker = Broker(access, hub)
-    if serving.token is not None:
+    if page_address.token is not None:
         hub.send_command = broker.send_command
-    _run(hub, broker.run, serving, tell)
+    _run(hub, broker.run, page_address, report)
 
 
 def serve_log(
-    paths: Sequence[Path], speed: float, serving: Serving, tell: Callable[[str], None]
+    paths: Sequence[Path], speed: float, page_address: PageAddress, report: Callable[[str], None]
 ) -> None:
     """Play a log. Raises `LogError` for what is none."""
     from fusiond.dashboard.player import Player  # noqa: PLC0415 - 150 MB of numerics behind it
@@ -74,26 +74,28 @@ def serve_log(
     async def play() -> None:
         await player.run(hub)
 
-    _run(hub, play, serving, tell)
+    _run(hub, play, page_address, report)
 
 
 def _run(
     hub: Hub,
     source: Source,
-    serving: Serving,
-    tell: Callable[[str], None],
+    page_address: PageAddress,
+    report: Callable[[str], None],
 ) -> None:
-    if serving.base_map is not None:
-        check_map(serving.base_map)
+    if page_address.base_map is not None:
+        check_map(page_address.base_map)
     if importlib.util.find_spec("uvicorn") is None or importlib.util.find_spec("starlette") is None:
         raise DashboardError(f"the dashboard's packages are not installed: {install('dashboard')}")
-    door = listening(serving)
-    port = door.getsockname()[1]
-    host = f"[{serving.host}]" if ":" in serving.host else serving.host
-    tell(f"http://{host}:{port}/" + (f"#token={serving.token}" if serving.token else ""))
+    listener = listening(page_address)
+    port = listener.getsockname()[1]
+    host = f"[{page_address.host}]" if ":" in page_address.host else page_address.host
+    report(
+        f"http://{host}:{port}/" + (f"#token={page_address.token}" if page_address.token else "")
+    )
 
     # A signal is the web server's: it ends in order, then lets the signal do its work.
-    asyncio.run(serve(hub, source, serving, door, asyncio.Event()))
+    asyncio.run(serve(hub, source, page_address, listener, asyncio.Event()))
 
 
 def check_map(path: Path) -> None:
@@ -107,11 +109,11 @@ def check_map(path: Path) -> None:
         raise DashboardError(f"{path}: no PMTiles file of version 3")
 
 
-def listening(serving: Serving) -> socket.socket:
+def listening(page_address: PageAddress) -> socket.socket:
     """A socket that listens there. Raises `DashboardError` where none can."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
-            serving.host, serving.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            page_address.host, page_address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
         made = socket.socket(family, socket.SOCK_STREAM)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -119,22 +121,26 @@ def listening(serving: Serving) -> socket.socket:
         made.bind(address)
         made.listen()
     except OSError as error:
-        text = f"{serving.host}:{serving.port}: {error.strerror or error}"
+        text = f"{page_address.host}:{page_address.port}: {error.strerror or error}"
         raise DashboardError(f"{text}: choose another with --host and --port") from error
     return made
 
 
 async def serve(
-    hub: Hub, source: Source, serving: Serving, door: socket.socket, stop: asyncio.Event
+    hub: Hub,
+    source: Source,
+    page_address: PageAddress,
+    listener: socket.socket,
+    stop: asyncio.Event,
 ) -> None:
-    """Serve at `door` what `source` feeds into the hub, until `stop` is set or the source fails."""
+    """Serve at `listener` what `source` feeds into the hub, until `stop` or a failed source."""
     import uvicorn  # noqa: PLC0415 - an extra
 
     from fusiond.dashboard.connections import BoundedConnection  # noqa: PLC0415 - the same
     from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
 
     config = uvicorn.Config(
-        application(hub, serving.token, serving.loopback, serving.base_map),
+        application(hub, page_address.token, page_address.loopback, page_address.base_map),
         http=BoundedConnection,
         ws="websockets-sansio",
         ws_per_message_deflate=False,  # a core's worth of it, for a local network
@@ -146,7 +152,7 @@ async def serve(
     )
     server = uvicorn.Server(config)
     feeding = asyncio.create_task(source(), name="source")
-    served = asyncio.create_task(server.serve(sockets=[door]), name="server")
+    served = asyncio.create_task(server.serve(sockets=[listener]), name="server")
     stopped = asyncio.create_task(stop.wait())
     try:
         await asyncio.wait({feeding, served, stopped}, return_when=asyncio.FIRST_COMPLETED)

@@ -41,7 +41,7 @@ CARRIED = ("nav", "status", "health", "consistency", "calibration")
 
 
 @dataclass
-class Heard:
+class LatestMessage:
     """The last message of a topic. `at_s` is when it came, None where the broker had kept it."""
 
     number: int
@@ -56,9 +56,9 @@ class Vehicle:
     def __init__(self, name: str) -> None:
         self.name = name
         self.count = 0
-        self.heard_s = float("-inf")
+        self.received_s = float("-inf")
         """Instant of its last message; what the broker had kept is no sign of it."""
-        self._latest: dict[str, Heard] = {}
+        self._latest: dict[str, LatestMessage] = {}
         self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
         self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
         self._next_row_s = float("-inf")
@@ -66,7 +66,7 @@ class Vehicle:
         self._recent = {"health": Recent("ticks", "overruns"), "status": Recent("mqtt_taken_over")}
         self._lately: dict[str, Said] = {}
 
-    def take(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
+    def receive(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
         """A message of `topic`. `kept`: the broker had it, nobody knows here for how long."""
         if topic == "online":
             if said in ("online", "offline"):
@@ -76,7 +76,7 @@ class Vehicle:
         elif topic == "event":
             self._row("event", [None if kept else at_s, said])
         elif topic == "events":
-            self._told_before(said.get("events"), kept)
+            self._earlier_events(said.get("events"), kept)
         elif topic == "innovation":  # of a recording: one by one
             self._innovation(said, number(said, "t_ns"), at_s)
         elif topic == "innovations":
@@ -96,9 +96,9 @@ class Vehicle:
     def since(self, count: int) -> dict[str, Any]:
         """All that is newer than `count`: `messages` by topic, `rows` by kind."""
         messages = {
-            topic: {"at": heard.at_s, "limit": self.limit_s(topic), "said": heard.said}
-            for topic, heard in self._latest.items()
-            if heard.number > count
+            topic: {"at": latest.at_s, "limit": self.limit_s(topic), "said": latest.said}
+            for topic, latest in self._latest.items()
+            if latest.number > count
         }
         kinds: dict[str, Ring | Keyed] = {**self._rows, "innovation": self._innovations}
         newer = {kind: kept.newer(count) for kind, kept in kinds.items()}
@@ -114,20 +114,20 @@ class Vehicle:
 
     def said(self, topic: str) -> Any:
         """The last message of a topic, an empty one before the first."""
-        heard = self._latest.get(topic)
-        return {} if heard is None else heard.said
+        latest = self._latest.get(topic)
+        return {} if latest is None else latest.said
 
     # ------------------------------------------------------------------ inside
 
     def _put(self, topic: str, said: Any, at_s: float | None) -> None:
         self.count += 1
         before = self._latest.get(topic)
-        heard = Heard(self.count, at_s, said)
+        latest = LatestMessage(self.count, at_s, said)
         if before is not None:
-            heard.intervals = before.intervals
+            latest.intervals = before.intervals
             if at_s is not None and before.at_s is not None:
-                heard.intervals.append(at_s - before.at_s)
-        self._latest[topic] = heard
+                latest.intervals.append(at_s - before.at_s)
+        self._latest[topic] = latest
 
     def _other(self, said: Said, at_s: float | None) -> None:
         """Position of another vehicle: a message of its own for each card."""
@@ -140,7 +140,7 @@ class Vehicle:
         self.count += 1
         self._rows[kind].add(self.count, row)
 
-    def _told_before(self, events: object, kept: bool) -> None:
+    def _earlier_events(self, events: object, kept: bool) -> None:
         """The events before anybody listened here, which the broker had kept."""
         if kept and isinstance(events, list) and not self._rows["event"]:
             for one in events:

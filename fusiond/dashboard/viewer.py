@@ -24,7 +24,7 @@ FRAME_S = 0.1
 BEAT_S = 1.0
 """A frame goes out so often even if nothing is new: a page that hears none knows that we are
 gone."""
-PATIENCE_S = 20.0
+SEND_TIMEOUT_S = 20.0
 """A browser that takes nothing for so long is disconnected; it comes back when it can."""
 MOST_VIEWERS = 16
 LARGEST_REQUEST = 4096
@@ -41,7 +41,7 @@ class Viewer:
         self._token = token
         self._vehicle: str | None = None
         self._count = 0
-        self._answers: list[dict[str, Any]] = []
+        self._replies: list[dict[str, Any]] = []
 
     async def run(self) -> None:
         """Send and receive; returns when the browser has left or has been given up."""
@@ -70,18 +70,18 @@ class Viewer:
     async def _send(self) -> None:
         await self._put({"hello": self._greeting()})
         loop = asyncio.get_running_loop()
-        beat_s, told = 0.0, None
+        beat_s, sent_link = 0.0, None
         while True:
             frame = self._frame()
-            news = frame["messages"] or frame["rows"] or frame["link"] != told or self._answers
+            news = frame["messages"] or frame["rows"] or frame["link"] != sent_link or self._replies
             if news or loop.time() >= beat_s:
-                frame["answers"], self._answers = self._answers, []
+                frame["answers"], self._replies = self._replies, []
                 await self._put(frame)
-                beat_s, told = loop.time() + BEAT_S, frame["link"]
+                beat_s, sent_link = loop.time() + BEAT_S, frame["link"]
             await asyncio.sleep(FRAME_S)
 
     async def _put(self, frame: dict[str, Any]) -> None:
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(SEND_TIMEOUT_S):
             await self._socket.send_text(json.dumps(frame, separators=(",", ":"), allow_nan=False))
 
     def _greeting(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ class Viewer:
             self._answer(True, f"{name} is on its way")
 
     def _answer(self, ok: bool, text: str) -> None:
-        self._answers = [*self._answers[-7:], {"ok": ok, "text": text}]
+        self._replies = [*self._replies[-7:], {"ok": ok, "text": text}]
 
 
 def _same(given: str, token: str) -> bool:

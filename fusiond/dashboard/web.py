@@ -74,7 +74,7 @@ def application(
             WebSocketRoute("/watch", watch),
             Mount("/static", StaticFiles(directory=static, follow_symlink=True)),
         ],
-        middleware=[Middleware(_Door, loopback=loopback)],
+        middleware=[Middleware(_HostCheck, loopback=loopback)],
     )
 
 
@@ -92,7 +92,7 @@ def host_name(host: str) -> str | None:
         return None
 
 
-class _Door:
+class _HostCheck:
     """Refuses names that are not ours, and puts the headers on every answer."""
 
     def __init__(self, app: ASGIApp, loopback: bool) -> None:

@@ -153,11 +153,11 @@ class _Run:
             await asyncio.gather(*others, ended, return_exceptions=True)
             await asyncio.wait([daemon])
         daemon.result()
-        self._tell()
+        self._print_story()
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
-        self._score.take(solution, self._daemon.navigator.serving.covariance)
+        self._score.add(solution, self._daemon.navigator.serving.covariance)
 
     async def _subscribe(self) -> None:
         """Listen as a dashboard does."""
@@ -183,8 +183,8 @@ class _Run:
         )
         position = np.radians([[nav["lat_deg"], nav["lon_deg"], 0.0]])
         position[:, 2] = math.nan if nav["height_m"] is None else nav["height_m"]
-        told = [nav["roll_deg"], nav["pitch_deg"], nav["yaw_deg"]]
-        rpy = np.radians([math.nan if x is None else x for x in told]) - truth.rpy[0]
+        angles_deg = [nav["roll_deg"], nav["pitch_deg"], nav["yaw_deg"]]
+        rpy = np.radians([math.nan if x is None else x for x in angles_deg]) - truth.rpy[0]
         velocity = np.array([nav["v_n_m_s"], nav["v_e_m_s"], nav["v_d_m_s"]]) - truth.v_ned[0]
         self._live.errors = [
             *ned_error(position, truth.position)[0],
@@ -230,7 +230,7 @@ class _Run:
             "rejected_by_source": {name: source.rejected for name, source in health.items()},
         }
 
-    def _tell(self) -> None:
+    def _print_story(self) -> None:
         """Report an event on standard error: the last line of the output is the summary."""
         t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
         start_s = self._vehicle.start_ns * 1e-9
@@ -246,7 +246,7 @@ class Score:
         self._last = 0
         self._rows: list[tuple[float, ...]] = []
 
-    def take(self, s: Solution, covariance: Array) -> None:
+    def add(self, s: Solution, covariance: Array) -> None:
         """A solution, and P (n, n) with position n, e at 6 and 7."""
         if s.mode not in (Mode.NAVIGATING, Mode.COASTING) or s.t_ns // _SCORE_NS == self._last:
             return

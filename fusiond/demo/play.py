@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fusiond.configuration.schema import Config, Source
-from fusiond.simulation.can.aids import SIM_SAR, SIM_STAR
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.can.sensors import SIM_SAR, SIM_STAR
 from fusiond.simulation.gnss.raw_stream import RawFormat
 from fusiond.simulation.scenarios import Scenario
 from fusiond.simulation.vehicle import Device, SimulatedVehicle

@@ -181,17 +181,19 @@ class Screen:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         width, height = options.max_width, console.height
         live = self._live
-        head: list[RenderableType] = [self._title(), self._mode(), Rule(style="dim")]
+        mode = self._mode()
+        head: list[RenderableType] = [self._title(), mode, Rule(style="dim")]
+        lines = len(head) - 1 + len(mode.wrap(console, width))
         foot = self._foot()
         for inside, rows in ((True, _ROWS), (False, _ROWS), (False, _WITHOUT_VELOCITY)):
             solution, sources = self._solution(rows), self._sources(inside)
             if width >= WIDE:
                 body = Table.grid(padding=(0, 2))
                 body.add_row(solution, sources)
-                used = len(head) + max(solution.row_count, sources.row_count) + 1
+                used = lines + max(solution.row_count, sources.row_count) + 1
                 parts = [*head, body]
             else:
-                used = len(head) + solution.row_count + sources.row_count + 2
+                used = lines + solution.row_count + sources.row_count + 2
                 parts = [*head, solution, sources]
             room = height - used - len(foot) - 1
             if room >= _LEAST_EVENTS:
@@ -212,7 +214,7 @@ class Screen:
 
     def _mode(self) -> Text:
         live = self._live
-        text = Text(no_wrap=True, overflow="ellipsis")
+        text = Text()  # it wraps: the end says what to do
         text.append(live.mode.upper(), style=_MODE_STYLE.get(live.mode, ""))
         text.append(f"  {live.status.get('why', '')}")
         return text

@@ -88,7 +88,7 @@ class Device:
 
 
 @dataclass(frozen=True, slots=True)
-class Unheard:
+class SilentPort:
     """A port at which nothing was found, and why, in words."""
 
     text: str
@@ -103,7 +103,7 @@ class _Line:
     blocks: BlockSplitter = field(default_factory=lambda: BlockSplitter(Counter()))
     kinds: Counter[str] = field(default_factory=Counter)
 
-    def take(self, data: bytes, t_seen_ns: int) -> None:
+    def receive(self, data: bytes, t_seen_ns: int) -> None:
         for item in self.splitter.feed(data):
             self.kinds[_kind(item)] += 1
         self.kinds["bestpos"] += sum(log.name in LOGGED_POSITIONS for log in self.logs.feed(data))
@@ -133,32 +133,34 @@ def _kind(item: Sentence | Frame) -> str:
     return "raw" if number in _MSM else "rtcm"
 
 
-async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) -> Device | Unheard:
+async def on_port(
+    port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S
+) -> Device | SilentPort:
     """The device on a serial port, or that nobody says anything there that is understood.
 
     `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
     """
     for baud in BAUDS:
-        heard = _Line()
+        received = _Line()
         line = SerialLine(port, baud)
-        async with _running(line.run(heard.take)):
-            await _until(lambda heard=heard: heard.known, listen_s)
-            if heard.sound:
-                await _until(lambda heard=heard: "raw" in heard.kinds, EPOCH_S)
-        if heard.sound:
-            return _receiver(port, baud, heard.kinds)
+        async with _running(line.run(received.receive)):
+            await _until(lambda received=received: received.known, listen_s)
+            if received.sound:
+                await _until(lambda received=received: "raw" in received.kinds, EPOCH_S)
+        if received.sound:
+            return _receiver(port, baud, received.kinds)
         if not line.counters["opened"]:
-            return Unheard(f"{port}: cannot be opened: {line.detail}")
+            return SilentPort(f"{port}: cannot be opened: {line.detail}")
         if not line.counters["bytes_in"]:
             break  # silent at one rate is silent at all
     else:
         rates = f"{len(BAUDS)} baud rates"
-        return Unheard(
+        return SilentPort(
             f"{port}: bytes come, and none of {rates} makes sense of them: look at the "
             "wiring, and whether another program reads it"
         )
     found = await _terminal(port) if ask_terminal else None
-    return found or Unheard(
+    return found or SilentPort(
         f"{port}: silent: is the device powered and its output on?"
         + ("" if ask_terminal else " An RDSS terminal is silent until it is asked: --ask-terminal")
     )
@@ -167,27 +169,29 @@ async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) 
 def _receiver(port: str, baud: int, kinds: Counter[str]) -> Device:
     nmea = {*FORMATTERS, "position", "nmea"}
     if kinds["rdss"] > sum(kinds[kind] for kind in nmea):
-        return Device("rdss", {"port": port}, _told(port, baud, ["sentences of an RDSS terminal"]))
+        return Device(
+            "rdss", {"port": port}, _description(port, baud, ["sentences of an RDSS terminal"])
+        )
     said = [_BINARY[kind] for kind in _BINARY if kinds[kind]]
     if nmea & set(kinds):
         said.insert(0, "NMEA sentences")
     options = {"port": port, "baud": baud}
     if kinds["raw"]:
-        return Device("gnss", options, _told(port, baud, said))
+        return Device("gnss", options, _description(port, baud, said))
     if not kinds["position"]:
         for kind, driver in _SOLUTIONS.items():
             if kinds[kind]:
-                return Device(driver, options, _told(port, baud, said))
+                return Device(driver, options, _description(port, baud, said))
     headings = [name for name in FORMATTERS if kinds[name]]
     if headings and not kinds["position"]:
-        text = _told(port, baud, [f"a compass ({', '.join(headings)})"])
+        text = _description(port, baud, [f"a compass ({', '.join(headings)})"])
         kind = "heading" if headings == ["HDT"] else "compass"
         return Device("compass", options, text, aiding=kind)
-    return Device("nmea", options, _told(port, baud, said))
+    return Device("nmea", options, _description(port, baud, said))
 
 
-def _told(port: str, baud: int, heard: list[str]) -> str:
-    return f"{port}: {', '.join(heard)} at {baud} baud"
+def _description(port: str, baud: int, received: list[str]) -> str:
+    return f"{port}: {', '.join(received)} at {baud} baud"
 
 
 async def _terminal(port: str) -> Device | None:
@@ -211,7 +215,7 @@ async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) ->
     samples: dict[int, list[int]] = {number: [] for number, _ in decoders}
     forces: dict[int, list[tuple[float, ...]]] = {number: [] for number, _ in decoders}
 
-    def take(frame: CanFrame) -> None:
+    def receive(frame: CanFrame) -> None:
         if frame.remote or frame.error:
             return
         for number, decoder in decoders:
@@ -221,7 +225,7 @@ async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) ->
                     forces[number].append(measured.accel_m_s2)
 
     bus = CanBus(interface, channel)
-    async with _running(bus.run(take, lambda up, why: None, lambda state: None)):
+    async with _running(bus.run(receive, lambda up, why: None, lambda state: None)):
         await asyncio.sleep(listen_s)
     found: dict[str, tuple[int, int]] = {}
     for number, decoder in decoders:

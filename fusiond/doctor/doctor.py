@@ -71,7 +71,7 @@ class Kind:
         return (len(self.seen_ns) - 1) / span_s if span_s > BURST_S else None
 
 
-class Heard:
+class ObservedSource:
     """One source while it is listened to."""
 
     def __init__(self, name: str, driver_name: str, options: Any, clock: Clock) -> None:
@@ -93,7 +93,7 @@ class Heard:
             return  # whom it is for will have it from the daemon; its counters are told
         kind = self.kinds.setdefault(type(item).__name__, Kind(Values(type(item))))
         kind.count += 1
-        kind.values.take(item)
+        kind.values.add(item)
         kind.seen_ns.append(item.t_seen_ns)
         if isinstance(item, TimeReport):
             self._clock.report(item)
@@ -126,12 +126,12 @@ def doctor(config: Config, seconds: float, transmit: bool = False) -> int:
 async def examine(config: Config, seconds: float, out: TextIO, transmit: bool = False) -> int:
     """`doctor` inside a running loop."""
     clock = Clock(config.clock)
-    sources: list[Heard] = []
+    sources: list[ObservedSource] = []
     for name, section in config.sources.items():
         options = driver_entry_points()[section.driver].load().Options(**section.options)
         if not transmit and "transmit" in type(options).model_fields:
             options = options.model_copy(update={"transmit": False})
-        sources.append(Heard(name, section.driver, options, clock))
+        sources.append(ObservedSource(name, section.driver, options, clock))
     broker = asyncio.create_task(_broker(config))
     tasks = [asyncio.create_task(s.driver.run(), name=s.name) for s in sources]
     await asyncio.sleep(seconds)
@@ -159,33 +159,36 @@ async def examine(config: Config, seconds: float, out: TextIO, transmit: bool = 
 # --------------------------------------------------------------------------- a source
 
 
-def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: float) -> Report:
-    status = heard.driver.status
-    title = f"{heard.name}: {heard.driver_name} on {device_name(heard.options)}: {status.state}"
+def _source(
+    observed: ObservedSource, task: asyncio.Task[None], config: Config, seconds: float
+) -> Report:
+    status = observed.driver.status
+    device = device_name(observed.options)
+    title = f"{observed.name}: {observed.driver_name} on {device}: {status.state}"
     report = Report(title + (f" ({status.detail})" if status.detail else ""))
-    for name, kind in heard.kinds.items():
+    for name, kind in observed.kinds.items():
         report.facts.append(_kind_line(name, kind))
         report.facts += [f"  {line}" for line in kind.values.lines()]
-    report.facts += list(dict.fromkeys(heard.events))[-_SHOWN_EVENTS:]
-    beams: BeamPower | None = getattr(heard.driver, "beams", None)
+    report.facts += list(dict.fromkeys(observed.events))[-_SHOWN_EVENTS:]
+    beams: BeamPower | None = getattr(observed.driver, "beams", None)
     if beams is not None:
         report.facts.append(_beams_line(beams))
-    counters = {name: count for name, count in heard.driver.counters.items() if count}
+    counters = {name: count for name, count in observed.driver.counters.items() if count}
     if counters:
         report.facts.append(", ".join(f"{name} {count}" for name, count in counters.items()))
     if task.done() and not task.cancelled():
         report.findings.append(finding("driver_ended", error=repr(task.exception())))
-    report.findings += open_findings(heard.name, heard.driver, heard.options, seconds)
-    report.findings += _damage(heard.driver.counters, report.findings)
-    report.findings += getattr(heard.driver, "cautions", {}).values()
-    if "ImuSample" in heard.kinds:
-        _imu(heard, config, report)
-    elif "PositionFix" in heard.kinds:
-        oldest = max(heard.kinds["PositionFix"].age_s)
+    report.findings += open_findings(observed.name, observed.driver, observed.options, seconds)
+    report.findings += _damage(observed.driver.counters, report.findings)
+    report.findings += getattr(observed.driver, "cautions", {}).values()
+    if "ImuSample" in observed.kinds:
+        _imu(observed, config, report)
+    elif "PositionFix" in observed.kinds:
+        oldest = max(observed.kinds["PositionFix"].age_s)
         if oldest > OLD_FIX_S:
             report.findings.append(finding("fixes_old", age=oldest))
     elif status.state == "running" and not status.detail:
-        cause = getattr(heard.driver, "cause", "")
+        cause = getattr(observed.driver, "cause", "")
         if cause:
             report.findings.append(cause)
     return report
@@ -229,13 +232,13 @@ def _damage(counters: Counter[str], said: list[str]) -> list[str]:
     return findings
 
 
-def _imu(heard: Heard, config: Config, report: Report) -> None:
+def _imu(observed: ObservedSource, config: Config, report: Report) -> None:
     """Rate, gravity, axes and turn rate, the latter three only at rest."""
-    rate = heard.kinds["ImuSample"].rate_hz
+    rate = observed.kinds["ImuSample"].rate_hz
     wanted = config.imu.rate_hz
     if rate is not None and abs(rate - wanted) > RATE_TOLERANCE * wanted:
         report.findings.append(finding("imu_rate", seen=rate, set=wanted))
-    values = np.array(heard.imu)
+    values = np.array(observed.imu)
     mean = values.mean(axis=0)
     limits = quiet_limits(config.constraints.zero_velocity, imu_noise(config.imu))
     sd = values.std(axis=0)
@@ -253,14 +256,16 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
     )
     if abs(force / STANDARD_GRAVITY_M_S2 - 1.0) > GRAVITY_TOLERANCE:
         gravity = STANDARD_GRAVITY_M_S2
-        report.findings.append(finding("imu_force", force=force, gravity=gravity, name=heard.name))
+        report.findings.append(
+            finding("imu_force", force=force, gravity=gravity, name=observed.name)
+        )
     elif tilt > MAX_TILT_DEG:
         up = int(np.argmax(np.abs(mean[3:])))
         down = ("-" if mean[3 + up] > 0.0 else "+") + "xyz"[up]
         now = config.imu.axes[2]
         report.findings.append(finding("imu_axes", tilt=tilt, down=down, axes=now))
     if turn > np.degrees(limits.mean_rate):
-        report.findings.append(finding("imu_turns", rate=turn, name=heard.name))
+        report.findings.append(finding("imu_turns", rate=turn, name=observed.name))
 
 
 # --------------------------------------------------------------------------- clock and broker

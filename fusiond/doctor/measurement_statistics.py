@@ -104,7 +104,7 @@ class Values:
             quantity.name: deque(maxlen=KEPT) for quantity in self._quantities
         }
 
-    def take(self, measurement: Emitted) -> None:
+    def add(self, measurement: Emitted) -> None:
         """Remember one."""
         for quantity in self._quantities:
             values = quantity.of(measurement)

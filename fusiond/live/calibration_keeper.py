@@ -49,7 +49,7 @@ class CalibrationKeeper:
         self._due = Every(SAVE_EVERY_S * SECOND_NS)
         self._working: asyncio.Task[None] | None = None
 
-    def offer(self, navigator: Navigator) -> None:
+    def restore_into(self, navigator: Navigator) -> None:
         """Let the navigator take up the calibration of the last run, if its mounting is this."""
         if self._path is None:
             return

@@ -40,7 +40,7 @@ class Chain:
         self.config = config
         self.clock = clock
         self.events = events
-        self._hears: Callable[[str], None] | None = None
+        self._on_code: Callable[[str], None] | None = None
         navigator_event = partial(self._report, "navigator")
         self.innovations = Innovations(clock)
         self._on_outcome = on_outcome
@@ -51,7 +51,7 @@ class Chain:
         self.sources = Sources(config, clock, self.navigator, self.injection, self._report)
         drivers = {name: source.driver for name, source in self.sources.all.items()}
         self.messaging = Messaging(config, clock, drivers, events.report)
-        self.sources.on_mail, self._hears = self.messaging.take, self.messaging.heard
+        self.sources.on_mail, self._on_code = self.messaging.receive, self.messaging.note_event
         self.operator = Operator(self.navigator, self.sources, self.injection, self.messaging)
         self.solution: Solution | None = None
         self.changed = False
@@ -61,11 +61,11 @@ class Chain:
     def _report(self, source: str, code: str, text: str) -> None:
         """An event of a device or of the navigator."""
         self.events.report(source, code, text)
-        if self._hears is not None:  # not yet while the parts are made
-            self._hears(code)
+        if self._on_code is not None:  # not yet while the parts are made
+            self._on_code(code)
 
     def _ended(self, entry: Entry) -> None:
-        self.innovations.take(entry)
+        self.innovations.add(entry)
         if self._on_outcome is not None:
             self._on_outcome(entry)
 

@@ -88,12 +88,14 @@ class Daemon:
         self.navigator = self._chain.navigator
         self.navigator.timeline.keeps_raw = config.recording.directory is not None
         self.sources = self._chain.sources
-        self._calibration.offer(self.navigator)
+        self._calibration.restore_into(self.navigator)
         if saved is None or "saved" not in config.alignment.heading:
             # A vehicle that stood knows more by what it kept then.
-            self._warm.offer(self.navigator)
+            self._warm.restore_into(self.navigator)
         messages = self._messages.load(self._chain.messaging)
-        self._loaded = RestoredState(saved, self._warm.loaded, self.navigator.calibration, messages)
+        self._restored = RestoredState(
+            saved, self._warm.restored, self.navigator.calibration, messages
+        )
         self.service = front.service
         self.scheduler = Scheduler(
             config.scheduler.rate_hz,
@@ -101,7 +103,7 @@ class Daemon:
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self._serving = front.serving
+        self._output_tasks = front.output_tasks
         front.on_command = self._carry_out
         self.outputs = self._completed(front.outputs)
         self._publishing = Publishing(
@@ -123,12 +125,12 @@ class Daemon:
         """With what the navigator's parts have to do with them."""
         mqtt = outputs.get("mqtt")
         if isinstance(mqtt, MqttPublisher):
-            mqtt.on_confirmed = self._chain.messaging.told
+            mqtt.on_confirmed = self._chain.messaging.confirm
         if self.config.recording.directory is not None:
             return {**outputs, "recording": self.recorder}
         return outputs
 
-    def _tell_outputs(self, message: EventMessage) -> None:
+    def _send_event(self, message: EventMessage) -> None:
         for output in self.outputs.values():
             output.take(EVENT, message)
 
@@ -163,17 +165,17 @@ class Daemon:
         # Nothing is refused from here on.
         self.config = found.config
         made = self._completed(made)
-        await self._serving.stop(found.outputs)
+        await self._output_tasks.stop(found.outputs)
         self.outputs = made
         self._publishing.serve(found.config, made)
-        self._serving.start(made)
+        self._output_tasks.start(made)
         log.setLevel(found.config.log_level.upper())
         if found.gates:
             self._carry_out(SetGates(id="reload", gates=dict(found.gates)))
-        tell = partial(self._events.report, "daemon")
-        tell("reloaded", f"changed: {', '.join(found.taken) or 'nothing'}")
+        report = partial(self._events.report, "daemon")
+        report("reloaded", f"changed: {', '.join(found.taken) or 'nothing'}")
         if found.restart:
-            tell("restart_needed", f"by {', '.join(found.restart)}: they are as before")
+            report("restart_needed", f"by {', '.join(found.restart)}: they are as before")
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set."""
@@ -184,9 +186,9 @@ class Daemon:
             config_digest(self.config),
         )
         self.recorder.listen(self.sources.inputs)
-        self.recorder.arm(RESTORED_STATE.dump_python(self._loaded, mode="json"))
-        self._events.listen(self._tell_outputs)
-        self._serving.start(self.outputs)
+        self.recorder.arm(RESTORED_STATE.dump_python(self._restored, mode="json"))
+        self._events.listen(self._send_event)
+        self._output_tasks.start(self.outputs)
         work = [
             asyncio.create_task(self.sources.run(), name="sources"),
             asyncio.create_task(self.scheduler.run(), name="scheduler"),
@@ -202,7 +204,7 @@ class Daemon:
             await self._state.close(self.solution, confirmed=not self.navigator.unconfirmed)
             await self._warm.close(self.solution, self.navigator)
             await self._calibration.close(self.navigator)
-            await self._serving.stop()
+            await self._output_tasks.stop()
             await self._messages.close(self.clock.now_ns(), self._chain.messaging)
             self.service.close()
             log.info(
@@ -210,12 +212,12 @@ class Daemon:
             )
 
     def _tick(self, t_ns: int) -> None:
-        late_ns = self.clock.now_ns() - t_ns
+        delay_ns = self.clock.now_ns() - t_ns
         self.recorder.tick_begins(t_ns)
         solution = self._chain.tick(t_ns)
         if self.recorder.active:
             digest = state_digest(self.navigator, solution)
-            self.recorder.tick_ended(t_ns, late_ns, self.scheduler.overruns, digest)
+            self.recorder.tick_ended(t_ns, delay_ns, self.scheduler.overruns, digest)
             self._keep_in_log(t_ns, solution)
         if self._on_solution is not None:
             self._on_solution(solution)
@@ -261,7 +263,7 @@ class Daemon:
 
     def _each_second(self, solution: Solution) -> None:
         """Tell the service manager how it stands."""
-        self._front.tell(f"{solution.mode}: {solution.reason}", self.sources.all_running)
+        self._front.report_status(f"{solution.mode}: {solution.reason}", self.sources.all_running)
 
 
 async def _cancel(*tasks: asyncio.Task[Any]) -> None:

@@ -44,7 +44,7 @@ class Front:
         self.clock = clock
         self.events = Events(clock)
         self.service = ServiceManager()
-        self.serving = OutputTasks(self.events.report)
+        self.output_tasks = OutputTasks(self.events.report)
         self.guests = Guests()
         self.on_command: Callable[[Command], str | Awaitable[str]] = _refuse
         self.outputs = self.make_outputs(config, {})
@@ -65,7 +65,7 @@ class Front:
     def _carry_out(self, command: Command) -> str | Awaitable[str]:
         return self.on_command(command)
 
-    def tell(self, text: str, all_running: bool) -> None:
+    def report_status(self, text: str, all_running: bool) -> None:
         """One sentence for the service manager; readiness where it is due."""
         if self.ready:
             self.service.status(text)
@@ -78,7 +78,7 @@ class Front:
     async def wait_for(self, compiling: Forked, stop: asyncio.Event) -> None:
         """Say how far the kernels are, over MQTT, in the journal and to the service manager, until
         they are compiled or `stop` is set."""
-        self.serving.start({n: o for n, o in self.outputs.items() if n == "mqtt"})
+        self.output_tasks.start({n: o for n, o in self.outputs.items() if n == "mqtt"})
         loop = asyncio.get_running_loop()
         over = loop.create_future()
 
@@ -96,7 +96,7 @@ class Front:
             if line.due(t_ns):
                 log.info(text)
             self._publish(t_ns, text)
-            self.tell(text, all_running=False)
+            self.report_status(text, all_running=False)
             self.service.feed_watchdog(t_ns)
             waiting = {over, stopped}
             await asyncio.wait(waiting, timeout=STATUS_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
@@ -108,7 +108,7 @@ class Front:
     async def close(self) -> None:
         """Say farewell: nobody is to follow."""
         self.service.stopping()
-        await self.serving.stop()
+        await self.output_tasks.stop()
         self.service.close()
 
     def _publish(self, t_ns: int, text: str) -> None:

@@ -61,13 +61,15 @@ class Injection:
     def inject(self, command: Inject, t_ns: int) -> str:
         """Begin a fault at `t_ns`, in place of one that the source has; what was done."""
         self.faults[command.source] = Fault(command, t_ns)
-        self._on_event(command.source, "injected", _told(command))
-        return f"{command.source}: {_told(command)}"
+        self._on_event(command.source, "injected", _description(command))
+        return f"{command.source}: {_description(command)}"
 
     @property
     def active(self) -> tuple[str, ...]:
         """The faults in force, in words."""
-        return tuple(f"{n}: {_told(f.command)}" for n, f in self.faults.items() if not f.over)
+        return tuple(
+            f"{n}: {_description(f.command)}" for n, f in self.faults.items() if not f.over
+        )
 
     def pass_on(self, item: Emitted) -> Iterator[Emitted]:
         """Items that remain after a fault."""
@@ -83,7 +85,7 @@ class Injection:
             yield from fault.due(t_ns)
             if not fault.over and t_ns >= fault.end_ns:
                 fault.over = True
-                self._on_event(source, "injection_ended", _told(fault.command))
+                self._on_event(source, "injection_ended", _description(fault.command))
             if fault.over and not fault.held:
                 del self.faults[source]
 
@@ -191,7 +193,7 @@ def _plus(
             return x, y, z + error
 
 
-def _told(c: Inject) -> str:
+def _description(c: Inject) -> str:
     """A fault in words."""
     size = f" {c.size:g}" if c.fault in ("delay", "jump", "drift", "noise") else ""
     return f"{c.fault}{size} for {c.duration_s:g} s"

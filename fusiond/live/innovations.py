@@ -21,7 +21,7 @@ class Innovations:
         self._clock = clock
         self._ended: dict[Key, Entry] = {}
 
-    def take(self, entry: Entry) -> None:
+    def add(self, entry: Entry) -> None:
         """An aid has ended; one that a rewind brings again is there already."""
         if entry.aid.constraint:
             return
@@ -32,9 +32,11 @@ class Innovations:
     def since(self) -> list[Innovation]:
         """All since the last call, by validity."""
         ended, self._ended = self._ended, {}
-        return [told for key in sorted(ended) if (told := self._told(ended[key])) is not None]
+        return [
+            message for key in sorted(ended) if (message := self._message(ended[key])) is not None
+        ]
 
-    def _told(self, entry: Entry) -> Innovation | None:
+    def _message(self, entry: Entry) -> Innovation | None:
         outcome = entry.outcome
         if outcome is None:
             return None

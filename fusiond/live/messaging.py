@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # a vehicle without a terminal does without them
     from drivers.rdss.driver import RdssDriver
     from fusiond.live.stored_messages import KeptMessages
 
-MOST_UNTOLD = 40
+MOST_UNCONFIRMED = 40
 """Messages that a broker has yet to confirm: what a minute of all cards brings at the most."""
 MOST_CARDS = 256
 """Retained topics at the broker, one each; a command terminal lists 100 (ICXX)."""
@@ -59,7 +59,7 @@ class Messaging:
             name: driver for name, driver in drivers.items() if hasattr(driver, "post_text")
         }
         self._waiting: deque[tuple[Topic, Message]] = deque()
-        self._untold: OrderedDict[int, ShortMessage] = OrderedDict()
+        self._unconfirmed: OrderedDict[int, ShortMessage] = OrderedDict()
         self._serial = 0
         self._reports = 0
         self._places: dict[int, int] = {}
@@ -95,7 +95,7 @@ class Messaging:
             raise CommandRefusedError(f"no terminal {wanted!r}; there are {names}")
         return wanted
 
-    def heard(self, code: str) -> None:
+    def note_event(self, code: str) -> None:
         """An event of a device or of the navigator."""
         if code in self._options.events:
             self._report_due = code
@@ -142,19 +142,19 @@ class Messaging:
 
     # ------------------------------------------------------------------ in
 
-    def take(self, mail: Mail) -> None:
+    def receive(self, mail: Mail) -> None:
         """Receive mail of a driver."""
         utc_ns = self._clock.utc_ns(mail.t_seen_ns)
         match mail:
             case MessageStage():
                 self._serial += 1
-                self._tell(of_stage(mail, self._serial, utc_ns))
+                self._queue(of_stage(mail, self._serial, utc_ns))
                 if mail.over and mail.stage not in ("sent", "delivered", "superseded"):
                     text = f"to card {mail.receiver:07d}, {mail.key}: {mail.why or mail.stage}"
                     self._on_event(mail.source, f"message_{mail.stage}", text)
             case MessageReceived():
                 self._serial += 1
-                self._tell(of_received(mail, self._serial, utc_ns))
+                self._queue(of_received(mail, self._serial, utc_ns))
                 if mail.fault:
                     text = f"from card {mail.sender:07d} for {mail.receiver:07d}: {mail.fault}"
                     self._on_event(mail.source, f"message_{mail.fault}", text)
@@ -164,11 +164,11 @@ class Messaging:
             case FleetFix():
                 self._place(of_centre(mail, utc_ns))
 
-    def _tell(self, message: ShortMessage) -> None:
+    def _queue(self, message: ShortMessage) -> None:
         self.revision += 1
-        self._untold[message.serial] = message
-        if len(self._untold) > MOST_UNTOLD:
-            self._untold.popitem(last=False)
+        self._unconfirmed[message.serial] = message
+        if len(self._unconfirmed) > MOST_UNCONFIRMED:
+            self._unconfirmed.popitem(last=False)
             self._count(message.source, "message_untold")
         self._waiting.append((MESSAGE, message))
 
@@ -193,10 +193,10 @@ class Messaging:
         while self._waiting:
             yield self._waiting.popleft()
 
-    def told(self, message: object) -> None:
+    def confirm(self, message: object) -> None:
         """A broker has confirmed a message, or there is none to tell."""
-        if isinstance(message, ShortMessage) and message.serial in self._untold:
-            del self._untold[message.serial]
+        if isinstance(message, ShortMessage) and message.serial in self._unconfirmed:
+            del self._unconfirmed[message.serial]
             self.revision += 1
 
     def state(self, t_ns: int) -> KeptMessages:
@@ -207,7 +207,7 @@ class Messaging:
         return KeptMessages(
             self._serial,
             {n: kept_box(d.outbox, d.inbox, t_ns) for n, d in self._terminals.items()},
-            tuple(self._untold.values()),
+            tuple(self._unconfirmed.values()),
             None if utc_ns is None else utc_ns * 1e-9,
         )
 
@@ -218,7 +218,7 @@ class Messaging:
         t_ns = kept.taken_up_ns or 0
         self._serial = max(self._serial, kept.serial)
         for message in kept.untold:
-            self._untold[message.serial] = message
+            self._unconfirmed[message.serial] = message
             self._waiting.append((MESSAGE, message))
         for name, box in kept.boxes.items():
             driver = self._terminals.get(name)

@@ -95,7 +95,7 @@ class Publishing:
         self._publish_waiting(most=1)
         self._publish_calibration(t_ns, utc_ns)
 
-    def _tell(self, topic: Topic, message: Message) -> None:
+    def _publish(self, topic: Topic, message: Message) -> None:
         for output in self._outputs.values():
             output.take(topic, message)
 
@@ -106,7 +106,7 @@ class Publishing:
         message = settled = nav_message(solution, utc_ns)
         tracker = self._tracking.due(t_ns, message)
         if tracker is not None:
-            self._tell(TRACKER, tracker)
+            self._publish(TRACKER, tracker)
         if utc_ns is not None and not self._clock.sets_others:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:
@@ -114,9 +114,9 @@ class Publishing:
 
     def _publish_messages(self) -> None:
         for topic, message in self._messaging.take_waiting():
-            self._tell(topic, message)
+            self._publish(topic, message)
             if "mqtt" not in self._outputs:
-                self._messaging.told(message)
+                self._messaging.confirm(message)
 
     def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
         watch = self._navigator.calibrating
@@ -125,12 +125,12 @@ class Publishing:
             return
         self._calibrated = states
         message = calibration_message(utc_ns, watch.parameters, watch.settled)
-        self._tell(CALIBRATION, message)
+        self._publish(CALIBRATION, message)
 
     def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         fused, rejected = _totals(self._navigator)
         mqtt = self._outputs.get("mqtt")
-        self._tell(
+        self._publish(
             STATUS,
             status_message(
                 solution,
@@ -153,7 +153,7 @@ class Publishing:
 
     def _publish_waiting(self, most: int) -> None:
         for _ in range(min(most, len(self._waiting))):
-            self._tell(*self._waiting.popleft())
+            self._publish(*self._waiting.popleft())
 
     def _of_health(self, t_ns: int, utc_ns: int | None) -> Iterator[tuple[Topic, Message]]:
         cpu_percent, memory_mb = self._usage.sample()

@@ -65,7 +65,7 @@ def difference(running: Config, read: Config) -> Difference:
         mistakes = "; ".join(e["msg"] for e in error.errors())
         raise ConfigError(f"only with a restart: {mistakes}") from error
     restart = tuple(key for key in changed if key not in taken)
-    return Difference(config, taken, restart, _anew(running, read), gates)
+    return Difference(config, taken, restart, _restarted(running, read), gates)
 
 
 def _can_be_taken(key: str, gates: Mapping[str, float]) -> bool:
@@ -76,7 +76,7 @@ def _can_be_taken(key: str, gates: Mapping[str, float]) -> bool:
     return section in ("mqtt", "outputs", "log_level")
 
 
-def _anew(running: Config, read: Config) -> frozenset[str]:
+def _restarted(running: Config, read: Config) -> frozenset[str]:
     """An output is made for one section and one broker: those through it go with it."""
     before, after = running.outputs.served, read.outputs.served
     found = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}

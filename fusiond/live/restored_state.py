@@ -23,7 +23,7 @@ class RestoredState:
     messages: str | None = None
     """As `fusiond.live.stored_messages` has them in JSON."""
 
-    def offer(self, chain: Chain) -> None:
+    def restore_into(self, chain: Chain) -> None:
         """Let a chain that was made with `saved` go on from the rest. Raises `DamagedStateError`
         for a state of another model."""
         chain.navigator.calibration = self.calibration

@@ -120,11 +120,11 @@ class Scheduler:
         while True:
             # Also when late: other tasks must run between two ticks.
             await self._sleep(max(0, deadline - self._now()) / SECOND_NS)
-            late = self._now() - deadline
-            if late < 0:
+            behind_ns = self._now() - deadline
+            if behind_ns < 0:
                 continue
-            self.lateness.add(late)
-            missed = late // self.period_ns
+            self.lateness.add(behind_ns)
+            missed = behind_ns // self.period_ns
             self.overruns += missed
             deadline += missed * self.period_ns
             self._tick(deadline)

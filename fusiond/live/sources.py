@@ -97,17 +97,17 @@ class Sources:
 
     def _emit(self, item: Emitted) -> None:
         if not self._injection.faults:
-            self._take(item)
+            self._receive(item)
             return
         for left in self._injection.pass_on(item):
-            self._take(left)
+            self._receive(left)
 
     def release(self, t_ns: int) -> None:
         """Take in what an injected delay has held back until the tick at `t_ns`."""
         for item in self._injection.tick(t_ns):
-            self._take(item)
+            self._receive(item)
 
-    def _take(self, item: Emitted) -> None:
+    def _receive(self, item: Emitted) -> None:
         if not isinstance(item, ImuSample):  # of which there are most
             if isinstance(item, DeviceEvent):
                 self._on_event(item.source, item.code, item.text)
@@ -153,8 +153,8 @@ class Sources:
     @property
     def inputs(self) -> dict[str, Inputs]:
         """Inputs that move each driver from outside; not of those that have no such door."""
-        doors = {name: getattr(s.driver, "inputs", None) for name, s in self.all.items()}
-        return {name: door for name, door in doors.items() if door is not None}
+        found = {name: getattr(s.driver, "inputs", None) for name, s in self.all.items()}
+        return {name: inputs for name, inputs in found.items() if inputs is not None}
 
     def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
         """Tell the terminals that can use it the height of their antenna by the solution.
@@ -192,11 +192,11 @@ class Sources:
     def _diagnosed(self, now_ns: int) -> Callable[[str], dict[str, Any]]:
         """Service and latest fault of a source for `health`."""
         service = self._navigator.service
-        told = list(zip(service.faults(now_ns), self.faults(now_ns), strict=True))
+        pairs = list(zip(service.faults(now_ns), self.faults(now_ns), strict=True))
 
         def of(name: str) -> dict[str, Any]:
             states = service.states(name)
-            faults = [said for f, said in told if said.source == name or name in f.series]
+            faults = [said for f, said in pairs if said.source == name or name in f.series]
             return {
                 "service": worst(states.values()),
                 "series": states,

@@ -82,10 +82,10 @@ class WarmKeeper:
         self._due = Every(SNAPSHOT_NS)
         self._working: asyncio.Task[None] | None = None
         self._failing = False
-        self.loaded: KeptState | None = None
+        self.restored: KeptState | None = None
         """State offered to the navigator."""
 
-    def offer(self, navigator: Navigator) -> None:
+    def restore_into(self, navigator: Navigator) -> None:
         """Let clock and navigator go on from the state of the last run, if it is one of this
         boot."""
         if self._path is None:
@@ -97,7 +97,7 @@ class WarmKeeper:
             same_run(state.navigation, self._config, self._boot_id, _asleep_ns())
             navigator.warm = WarmStart(state.navigation, navigator.model)
             self._clock.resume(state.utc)
-            self.loaded = state
+            self.restored = state
         except DamagedStateError as error:
             self._event("warm_state_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
         except RefusedStateError as error:
@@ -142,7 +142,7 @@ class WarmKeeper:
             )
             return KeptState(state, self._clock.known())
         except ValidationError as error:
-            self._told(f"warm state not kept: {error.errors(include_url=False)[0]}")
+            self._report(f"warm state not kept: {error.errors(include_url=False)[0]}")
             return None
 
     def _write(self, path: Path, state: KeptState) -> None:
@@ -150,9 +150,9 @@ class WarmKeeper:
             write_state(path, KEPT_STATE.dump_json(state), durable=False)
             self._failing = False
         except OSError as error:
-            self._told(f"warm state not kept: {error}")
+            self._report(f"warm state not kept: {error}")
 
-    def _told(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         """Once a row of failures: it would be twice a second."""
         if not self._failing:
             self._failing = True

@@ -9,7 +9,7 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
-from fusiond.configuration.schema import Constraints, NonHolonomic
+from fusiond.configuration.constraints import Constraints, NonHolonomic
 from fusiond.configuration.settings import DEG, quiet_limits
 from fusiond.models.blocks import Block, ImuNoise
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting

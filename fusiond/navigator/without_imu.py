@@ -32,7 +32,8 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.candidates import HeadingCandidate, PositionCandidate
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.aiding.way_faced import Faced, WayFaced
-from fusiond.configuration.schema import Config, NonHolonomic
+from fusiond.configuration.constraints import NonHolonomic
+from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.models.blocks import Block
 from fusiond.models.constant_velocity import constant_velocity

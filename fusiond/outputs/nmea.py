@@ -2,7 +2,7 @@
 
 RMC, GGA, VTG, GST and THS, with the talker GN. Mode letter A while it navigates, E and quality 6
 while it coasts (dead reckoning), N, quality 0 and RMC's status V otherwise. Sentences have no field
-for a height above the ellipsoid: GGA has a height where the geoid is configured.
+for a height above the ellipsoid: GGA has the one above the sea, and the geoid's separation.
 
 Source: NMEA 0183 v4.11 as the u-blox ZED-F9P interface manual prints it; THS and PASHR as the
 Trimble and u-blox manuals do.
@@ -22,6 +22,7 @@ from fusiond.configuration.outputs import NmeaServed
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.derived_figures import known, motion, usable
+from fusiond.outputs.geoid import sea_height
 from fusiond.outputs.latest_value import Latest
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
@@ -151,11 +152,10 @@ class _Epoch:
     def gga(self) -> list[str]:
         quality = _QUALITY.get(self._nav.mode, "0")
         satellites = SATELLITES if self._usable else "00"
+        found = sea_height(self._nav, self._geoid_m)
         height = ["", "M", "", "M"]
-        above = known(self._nav.height_m)
-        vertical = known(self._nav.sd_d_m) is not None
-        if self._usable and self._geoid_m is not None and above is not None and vertical:
-            height = [f"{above - self._geoid_m:.3f}", "M", f"{self._geoid_m:.3f}", "M"]
+        if found is not None:
+            height = [f"{found.above_sea_m:.3f}", "M", f"{found.separation_m:.3f}", "M"]
         return [self._time, *self._position(), quality, satellites, "", *height, "", ""]
 
     def vtg(self) -> list[str]:

@@ -18,6 +18,7 @@ from drivers.base import DriverStatus
 from fusiond.configuration.outputs import OwnTracks
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.derived_figures import known, motion
+from fusiond.outputs.geoid import sea_height
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.tracker import TrackerMessage
@@ -67,8 +68,7 @@ class OwnTracksLocations:
 
     def _location(self, tracker: TrackerMessage, t_ms: int, nav: NavMessage) -> Location:
         moving = motion(nav)
-        height, sd_d = known(nav.height_m), known(nav.sd_d_m)
-        above_sea = None if height is None or self._geoid_m is None else height - self._geoid_m
+        above_sea, sd_d = sea_height(nav, self._geoid_m), known(nav.sd_d_m)
         course = None if moving is None else moving.course_deg
         figures: dict[str, str | int | float | None] = {
             "_type": "location",
@@ -77,7 +77,7 @@ class OwnTracksLocations:
             "tst": t_ms // 1000,
             "tid": self._tid,
             "acc": max(1, round(tracker.gps_accuracy)),
-            "alt": None if above_sea is None else round(above_sea),
+            "alt": None if above_sea is None else round(above_sea.above_sea_m),
             "vac": None if sd_d is None or above_sea is None else max(1, round(sd_d)),
             "vel": None if moving is None else round(moving.speed_m_s / _KMH_M_S),
             "cog": None if course is None else round(course) % 360,

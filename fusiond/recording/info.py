@@ -25,7 +25,7 @@ def info(recording: Log) -> dict[str, Any]:
     channels = Counter(message.topic for message in recording.messages() if message.topic != INPUT)
     inputs = _Inputs(recording)
     for record in recording.records():
-        inputs.take(record)
+        inputs.add(record)
     about = recording.about
     bytes_in_all = sum(path.stat().st_size for path in recording.paths)
     hours = inputs.duration_s / 3600.0
@@ -64,7 +64,7 @@ class _Inputs:
         self.steps: list[dict[str, Any]] = []
         self.gaps: list[dict[str, Any]] = []
 
-    def take(self, record: Record) -> None:
+    def add(self, record: Record) -> None:
         self.first_ns = record.t_ns if self.first_ns is None else self.first_ns
         self.last_ns = record.t_ns
         for clock, t_ns, ahead_ns in record.readings:

@@ -85,7 +85,7 @@ class Recorder:
         self._again = Again()
         self._ring: deque[Item] = deque()
         self._until_ns: int | None = None
-        self._begun: Record | None = None
+        self._started: Record | None = None
         self._readings: list[Reading] = []
         self._after: list[Record] = []
         self._message: list[bytes] = []
@@ -103,30 +103,30 @@ class Recorder:
         self._inputs = dict(inputs)
         self._numbers = {name: number for number, name in enumerate(inputs)}
 
-    def arm(self, loaded: Mapping[str, Any]) -> None:
-        """Do from the start what the configuration says. `loaded` is what the start had loaded: it
-        is what a replay starts from."""
+    def arm(self, restored: Mapping[str, Any]) -> None:
+        """Do from the start what the configuration says. `restored` is what the start had read
+        from disk: a replay starts from it."""
         if self._options.directory is None:
             return
         if self._options.when == "always":
-            self.begin(loaded)
+            self.begin(restored)
         elif self._options.when == "event":
-            self._attach(loaded)
+            self._attach(restored)
             self.state = "waiting"
 
-    def begin(self, loaded: Mapping[str, Any] | None = None) -> str:
+    def begin(self, restored: Mapping[str, Any] | None = None) -> str:
         """Record from now on; the file's name. Raises `RecordingRefusedError`.
 
-        `loaded` is None for a recording that begins on the way.
+        `restored` is None for a recording that begins on the way.
         """
         if self.state == "recording":
             raise RecordingRefusedError(f"recording already, into {self._path().name}")
         self._again.give_up()
-        return self._record_into(self._open(), loaded)
+        return self._record_into(self._open(), restored)
 
-    def _record_into(self, writer: LogWriter, loaded: Mapping[str, Any] | None) -> str:
+    def _record_into(self, writer: LogWriter, restored: Mapping[str, Any] | None) -> str:
         if self.state != "waiting":
-            self._attach(loaded)
+            self._attach(restored)
         self._writer = writer
         while self._ring:
             writer.put(self._ring.popleft())
@@ -238,14 +238,14 @@ class Recorder:
         if self.active:
             self._begin(Record(Kind.TICK, NO_SOURCE, t_ns, b""))
 
-    def tick_ended(self, t_ns: int, late_ns: int, overruns: int, digest: bytes) -> None:
+    def tick_ended(self, t_ns: int, delay_ns: int, overruns: int, digest: bytes) -> None:
         """And has ended; what follows until the next input is still its own."""
         if self._writer is not None and self._writer.stopped is not None:
             self.end(self._writer.stopped)
-        if self._begun is None or self._begun.kind is not Kind.TICK:
+        if self._started is None or self._started.kind is not Kind.TICK:
             return
-        payload = tick_payload(Tick(self._count, overruns, late_ns, digest))
-        self._begun = self._begun._replace(payload=payload)
+        payload = tick_payload(Tick(self._count, overruns, delay_ns, digest))
+        self._started = self._started._replace(payload=payload)
         if self._until_ns is not None and t_ns > self._until_ns:
             self.end(f"{self._options.after_s:.0f} s after the last event")
 
@@ -315,16 +315,16 @@ class Recorder:
         assert self._writer is not None
         return self._writer.path
 
-    def _attach(self, loaded: Mapping[str, Any] | None) -> None:
+    def _attach(self, restored: Mapping[str, Any] | None) -> None:
         self._count = self._sequence = 0
         self._readings.clear()
         for name, inputs in self._inputs.items():
-            inputs.heard = partial(self.heard, self._numbers[name])
-        self._clock.readings.heard = self._heard_reading
+            inputs.heard = partial(self.record_input, self._numbers[name])
+        self._clock.readings.heard = self._record_reading
         start = {
-            "from_start": loaded is not None,
+            "from_start": restored is not None,
             "system_clock": self._clock.system_state(),
-            **(loaded or {}),
+            **(restored or {}),
         }
         t_ns = self._clock.now_ns()
         self._begin(Record(Kind.START, NO_SOURCE, t_ns, json.dumps(start).encode()))
@@ -333,11 +333,11 @@ class Recorder:
         for inputs in self._inputs.values():
             inputs.heard = None
         self._clock.readings.heard = None
-        self._begun = None
+        self._started = None
         self._ring.clear()
         self._message, self._message_bytes = [], 0
 
-    def heard(
+    def record_input(
         self, source: int, kind: str, t_ns: int, payload: bytes | str | CanFrame | None
     ) -> None:
         """A driver is about to handle an input, or has sent something."""
@@ -348,20 +348,20 @@ class Recorder:
         self._count += 1
         self._begin(record)
 
-    def _heard_reading(self, clock: ReadClock, t_ns: int, ahead_ns: int) -> None:
+    def _record_reading(self, clock: ReadClock, t_ns: int, ahead_ns: int) -> None:
         self._readings.append(reading(clock, t_ns, ahead_ns))
 
     def _begin(self, record: Record) -> None:
         self._complete()
-        self._begun = record
+        self._started = record
 
     def _complete(self) -> None:
-        """The record that was begun has all its readings."""
-        record = self._begun
+        """The record that was started has all its readings."""
+        record = self._started
         if record is None:
             self._readings.clear()
             return
-        self._begun = None
+        self._started = None
         if self._readings:
             record = record._replace(readings=self._readings)
             self._readings = []

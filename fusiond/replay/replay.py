@@ -123,16 +123,16 @@ class Replay:
         start: dict[str, Any] = json.loads(record.payload) if record.kind is Kind.START else {}
         from_start = bool(start.get("from_start"))
         system_clock = start.get("system_clock") or _system_clock(record, self._log)
-        loaded, after_ns = RestoredState(), 0
+        restored, after_ns = RestoredState(), 0
         if self._afresh:
             self.began = "an alignment, as was asked"
         elif from_start:
-            loaded = RESTORED_STATE.validate_json(
+            restored = RESTORED_STATE.validate_json(
                 json.dumps({name: start.get(name) for name in ("saved", "warm", "calibration")})
             )
             self.began = "the daemon's start"
         else:
-            loaded, after_ns = self._on_the_way(start)
+            restored, after_ns = self._on_the_way(start)
         self._time = RecordedTime(max(record.t_ns, after_ns))
         self._readings = RecordedReadings(self._time, system_clock)
         clock = Clock(self._config.clock, self._time, self._readings)
@@ -140,16 +140,16 @@ class Replay:
         events = Events(clock)
         if self._on_event is not None:
             events.listen(self._on_event)
-        self.chain = Chain(self._config, clock, events, loaded.saved, self._on_outcome)
+        self.chain = Chain(self._config, clock, events, restored.saved, self._on_outcome)
         try:
-            loaded.offer(self.chain)
+            restored.restore_into(self.chain)
         except DamagedStateError as error:
             self.began = f"an alignment: the log's state is of another filter ({error})"
         self.chain.sources.on_arrival = self._on_arrival
-        doors = self.chain.sources.inputs
-        for name, inputs in doors.items():
+        of_drivers = self.chain.sources.inputs
+        for name, inputs in of_drivers.items():
             inputs.heard = self._listener(name)
-        self._doors = [doors.get(name) for name in self._sources]
+        self._driver_inputs = [of_drivers.get(name) for name in self._sources]
         self.exact = self._same and from_start and self._log.first_part and not self._afresh
         self._finish()
         return after_ns
@@ -167,11 +167,11 @@ class Replay:
         return RestoredState(), 0
 
     def _listener(self, name: str) -> Callable[[str, int, Any], None]:
-        def heard(kind: str, t_ns: int, payload: Any) -> None:
+        def record(kind: str, t_ns: int, payload: Any) -> None:
             if kind == "sent":
                 self._sent.append((name, payload))
 
-        return heard
+        return record
 
     # ------------------------------------------------------------------ on the way
 
@@ -193,7 +193,7 @@ class Replay:
             self._compare_sent(record)
         else:
             self._inputs += 1
-            self._take(record)
+            self._replay_input(record)
         if readings:
             self._finish()
         return tick
@@ -204,13 +204,13 @@ class Replay:
         while self._readings.pending:
             self.chain.clock.look()
 
-    def _take(self, record: Record) -> None:
-        door = self._doors[record.source]
-        if door is None:  # another configuration, without it
+    def _replay_input(self, record: Record) -> None:
+        inputs = self._driver_inputs[record.source]
+        if inputs is None:  # another configuration, without it
             return
         kind, payload = input_of(record)
         try:
-            door.take(kind, payload, record.t_ns)
+            inputs.take(kind, payload, record.t_ns)
         except KeyError:
             self._fault(f"{self._sources[record.source]}: its driver knows no input {kind!r}")
         except Exception as error:  # the daemon restarts a driver that raises

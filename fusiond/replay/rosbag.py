@@ -49,14 +49,14 @@ def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]
         to_ros = _TO_ROS[:, None] * sensor_to_body(config.imu)
         epoch_ns = recording.about.epoch_ns
 
-        def take(m: Measurement | RawGnssEpoch, instant: Instant) -> None:
+        def add(m: Measurement | RawGnssEpoch, instant: Instant) -> None:
             if isinstance(m, ImuSample):
                 t_ns = instant.t_valid_ns + epoch_ns
                 imu = made.imu(t_ns, to_ros @ m.gyro_rad_s, to_ros @ m.accel_m_s2)
                 bag.write(samples, t_ns, store.serialize_cdr(imu, made.imu_type))
                 counts["/imu"] += 1
 
-        arrivals(recording, config, take)
+        arrivals(recording, config, add)
     return counts
 
 

@@ -62,7 +62,7 @@ def replay(paths: Sequence[Path], wish: Wish) -> dict[str, Any]:
         began = time.process_time()
         if wish.speed is None:
             for tick in run.replay.ticks():
-                run.take(tick)
+                run.add(tick)
         else:
             asyncio.run(_publish(run, config, wish.speed))
         return run.summary(time.process_time() - began)
@@ -126,7 +126,7 @@ class _Run:
         self._lateness = LatenessHistogram()
         self._overruns = 0
 
-    def take(self, tick: ReplayedTick) -> None:
+    def add(self, tick: ReplayedTick) -> None:
         solution = tick.solution
         self._modes[solution.mode] += 1
         self._first_ns = solution.t_ns if self._first_ns is None else self._first_ns
@@ -198,7 +198,7 @@ async def _publish(run: _Run, config: Config, speed: float) -> None:
                 assert run.replay.chain is not None
                 publishing = Publishing(config, run.replay.chain, run.scheduler, {"mqtt": mqtt})
                 start_s, start_ns = loop.time(), t_ns
-            run.take(tick)
+            run.add(tick)
             publishing.tick(t_ns, tick.solution)
             await asyncio.sleep(start_s + (t_ns - start_ns) * 1e-9 / speed - loop.time())
         await asyncio.sleep(FAREWELL_S)

@@ -62,7 +62,7 @@ def write_tables(recording: Log, config: Config, folder: Path) -> dict[str, int]
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as files:
         tables = _Tables(folder, recording.about.epoch_ns, files)
-        arrivals(recording, config, tables.take)
+        arrivals(recording, config, tables.add)
         return tables.rows
 
 
@@ -72,7 +72,7 @@ class _Tables:
         self._writers: dict[str, Any] = {}
         self.rows: dict[str, int] = {}
 
-    def take(self, m: Measurement | RawGnssEpoch, instant: Instant) -> None:
+    def add(self, m: Measurement | RawGnssEpoch, instant: Instant) -> None:
         t_s = _seconds(instant.t_valid_ns + self._epoch_ns)
         seen_s = _seconds(m.t_seen_ns + self._epoch_ns)
         match m:

@@ -31,7 +31,7 @@ class Biases:
         self._slots = _bias_slots(config)
         self._rows: list[tuple[float, list[float], list[float]]] = []
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
         navigation = said.get("navigation")
         if self._slots is None or not isinstance(navigation, dict):
             return

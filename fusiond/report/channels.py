@@ -60,16 +60,16 @@ class InnovationLists:
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns
-        self._aids: dict[str, dict[int, _Ended]] = {}
+        self._ended: dict[str, dict[int, _Ended]] = {}
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
         t_ns, source = said.get("t_ns"), said.get("source")
         if not isinstance(t_ns, int) or not isinstance(source, str):
             return
-        aids = self._aids.setdefault(source, {})
+        ended = self._ended.setdefault(source, {})
         valid_s = (t_ns + self._epoch_ns) / SECOND_NS
-        aids[t_ns] = _Ended(
-            aids[t_ns].delay_s if t_ns in aids else t_s - valid_s,
+        ended[t_ns] = _Ended(
+            ended[t_ns].delay_s if t_ns in ended else t_s - valid_s,
             str(said.get("outcome", "")),
             number(said.get("nis")),
             number(said.get("degrees")),
@@ -79,11 +79,11 @@ class InnovationLists:
         )
 
     def by_source(self) -> dict[str, Innovations]:
-        return {source: self._of(aids) for source, aids in self._aids.items()}
+        return {source: self._of(ended) for source, ended in self._ended.items()}
 
-    def _of(self, aids: dict[int, _Ended]) -> Innovations:
-        times = sorted(aids)
-        rows = [aids[t] for t in times]
+    def _of(self, ended: dict[int, _Ended]) -> Innovations:
+        times = sorted(ended)
+        rows = [ended[t] for t in times]
         return Innovations(
             t_s=np.array([(t + self._epoch_ns) / SECOND_NS for t in times]),
             delay_s=np.array([row.delay_s for row in rows]),
@@ -104,7 +104,7 @@ class VerdictLists:
         self._rows: dict[str, list[tuple[float, ...]]] = {}
         self._verdicts: dict[str, list[str]] = {}
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
         for source, one in _objects(said, "sources").items():
             rho = one.get("rho")
             first = rho[0] if isinstance(rho, list) and rho else None
@@ -129,7 +129,7 @@ class Calibrations:
         self._rows: dict[str, list[tuple[float, ...]]] = {}
         self._states: dict[str, str] = {}
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
         for name, one in _objects(said, "parameters").items():
             row = (t_s, number(one.get("value")), number(one.get("sd")))
             self._rows.setdefault(name, []).append(row)
@@ -159,7 +159,7 @@ class Healths:
         self.service: dict[str, Counter[str]] = {}
         """By source: messages in each state of service."""
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
         self._usage.append((t_s, number(said.get("cpu_percent")), number(said.get("memory_mb"))))
         for source, one in _objects(said, "sources").items():
             rejected = _counts(one.get("rejected"))
@@ -207,10 +207,10 @@ class FaultLists:
         self.found: list[Fault] = []
         self._now: dict[tuple[str, ...], Fault] = {}
 
-    def take(self, t_s: float, said: dict[str, Any]) -> None:
-        told = said.get("faults")
+    def read(self, t_s: float, said: dict[str, Any]) -> None:
+        faults = said.get("faults")
         before, self._now = self._now, {}
-        for one in told if isinstance(told, list) else ():
+        for one in faults if isinstance(faults, list) else ():
             if not isinstance(one, dict):
                 continue
             source, kind, axis, unit, action = (
@@ -219,8 +219,8 @@ class FaultLists:
             key = source, kind, action
             fault = before.get(key)
             if fault is None:
-                begun_s = t_s - number(one.get("since_s"))
-                fault = Fault(source, kind, begun_s, t_s)
+                started_s = t_s - number(one.get("since_s"))
+                fault = Fault(source, kind, started_s, t_s)
                 self.found.append(fault)
             fault.last_s, fault.axis, fault.unit, fault.action = t_s, axis, unit, action
             fault.size, fault.sd = number(one.get("size")), number(one.get("sd"))

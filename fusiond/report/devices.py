@@ -81,15 +81,15 @@ def computer(run: Run) -> Section | None:
     if run.log is None:
         return None
     items: list[tuple[str, Item]] = []
-    if run.log.late_ms is None:
+    if run.log.tick_delay_ms is None:
         items.append(("late", Sentence("The log holds no tick: lateness is not known.")))
     else:
-        t_s, late_ms = run.log.late_ms
-        middle, far = np.percentile(late_ms, [50.0, 99.0])
+        t_s, tick_delay_ms = run.log.tick_delay_ms
+        middle, far = np.percentile(tick_delay_ms, [50.0, 99.0])
         good = (
             f"Good: below one tick's interval; here median {middle:.2f}, 99 % below {far:.2f} ms."
         )
-        series = [Series("after its deadline", late_ms)]
+        series = [Series("after its deadline", tick_delay_ms)]
         items.append(("late", Plot("Lateness of the ticks", "ms", t_s, series, good)))
     if run.log.usage is None:
         items.append(

@@ -52,27 +52,27 @@ class InputLook:
     def __init__(self, about: About, folder: Path) -> None:
         self._epoch_ns = about.epoch_ns
         self._units = _Units(about, folder)
-        self._late: list[tuple[int, int]] = []
+        self._tick_delays: list[tuple[int, int]] = []
         self._first_ns: int | None = None
 
-    def take(self, record: Record) -> None:
+    def read(self, record: Record) -> None:
         if self._first_ns is None:
             self._first_ns = record.t_ns
         if record.kind is Kind.TICK:
             with suppress(DamagedRecordError):
-                self._late.append((record.t_ns, tick_of(record).late_ns))
+                self._tick_delays.append((record.t_ns, tick_of(record).late_ns))
         elif record.source != NO_SOURCE:
             since_s = (record.t_ns - self._first_ns) / SECOND_NS
             if since_s < WHOLE_S:
-                self._units.take(0, record)
+                self._units.read(0, record)
             elif since_s % EVERY_S < STRETCH_S:
-                self._units.take(int(since_s / EVERY_S), record)
+                self._units.read(int(since_s / EVERY_S), record)
 
-    def late_ms(self) -> tuple[Floats, Floats] | None:
+    def tick_delay_ms(self) -> tuple[Floats, Floats] | None:
         """Lateness of each tick (ms), and its instant."""
-        if not self._late:
+        if not self._tick_delays:
             return None
-        table = np.array(self._late, dtype=np.int64)
+        table = np.array(self._tick_delays, dtype=np.int64)
         return (table[:, 0] + self._epoch_ns) / SECOND_NS, table[:, 1] / MILLISECOND_NS
 
     def imu(self) -> ImuLook | None:
@@ -91,7 +91,7 @@ class _Units:
         self._samples: dict[str, list[tuple[int, ImuSample]]] = {}
         self._stretch = self._now_ns = 0
 
-    def take(self, stretch: int, record: Record) -> None:
+    def read(self, stretch: int, record: Record) -> None:
         number = record.source
         if number not in self._takers:
             self._takers[number] = self._driver(self._names[number])
@@ -122,11 +122,11 @@ class _Units:
         except (KeyError, TypeError, ValueError, OSError, ImportError, PermanentDriverError):
             return None  # a log of another version, or a driver that is not installed here
 
-        def take(record: Record) -> None:
+        def feed(record: Record) -> None:
             kind, payload = input_of(record)
             driver.inputs.take(kind, payload, record.t_ns)
 
-        return take
+        return feed
 
     def _emitted(self, item: object) -> None:
         if isinstance(item, ImuSample):

@@ -43,7 +43,7 @@ _MOST_NAMED = 5
 """Gaps and steps that the banner names one by one."""
 
 
-class _Heard(Log):
+class _TappedLog(Log):
     """A log that is read by somebody else: each message and record is heard on the way."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -65,17 +65,17 @@ class _Heard(Log):
 
 def run_from_log(paths: Sequence[Path]) -> Run:
     """Raises `LogError`, OSError."""
-    log = _Heard(paths)
+    log = _TappedLog(paths)
     reader = _Channels(log)
-    log.on_message = reader.take
+    log.on_message = reader.read
     with TemporaryDirectory(prefix="fusiond-report-") as folder:
         look = InputLook(log.about, Path(folder))
-        log.on_record = look.take
+        log.on_record = look.read
         known = info(log)  # reads all messages, then all records
     problems = [Problem("error", text) for text in known["problems"]]
-    problems += _told_by(known)
+    problems += _log_problems(known)
     parts = reader.parts()
-    parts.late_ms, parts.imu = look.late_ms(), look.imu()
+    parts.tick_delay_ms, parts.imu = look.tick_delay_ms(), look.imu()
     run = Run(log.paths[0].name, reader.solution(), posix=True, log=parts)
     run.events = reader.events
     run.truth_offset_s = reader.utc_ahead_s()
@@ -92,7 +92,7 @@ def run_from_log(paths: Sequence[Path]) -> Run:
     return run
 
 
-def _told_by(known: dict[str, Any]) -> list[Problem]:
+def _log_problems(known: dict[str, Any]) -> list[Problem]:
     problems = []
     if not known["from_the_daemons_start"]:
         text = "it begins on the way: counters of `health` are since the daemon's start, before it"
@@ -143,21 +143,21 @@ class _Channels:
         self._faults = FaultLists()
         self._calibration = Calibrations()
         self._biases = Biases(log.about.attachments.get(CONFIG))
-        self._take: dict[str, Callable[[float, dict[str, Any]], None]] = {
+        self._readers: dict[str, Callable[[float, dict[str, Any]], None]] = {
             "/nav": self._nav_message,
             "/event": self._event,
             "/status": self._status,
-            "/health": self._health.take,
-            "/consistency": self._verdicts.take,
-            "/calibration": self._calibration.take,
-            STATE: self._biases.take,
-            INNOVATION: self._innovations.take,
+            "/health": self._health.read,
+            "/consistency": self._verdicts.read,
+            "/calibration": self._calibration.read,
+            STATE: self._biases.read,
+            INNOVATION: self._innovations.read,
         }
         self._sources = log.about.sources
 
-    def take(self, message: LogMessage) -> None:
-        take = self._take.get(message.topic)
-        if take is None:
+    def read(self, message: LogMessage) -> None:
+        reader = self._readers.get(message.topic)
+        if reader is None:
             return
         try:
             said = message.json()
@@ -166,7 +166,7 @@ class _Channels:
         if not isinstance(said, dict):
             self.unreadable += 1
             return
-        take(message.t_log_ns / SECOND_NS, said)
+        reader(message.t_log_ns / SECOND_NS, said)
 
     def _nav_message(self, t_s: float, said: dict[str, Any]) -> None:
         if self._nav and t_s <= self._nav[-1][0]:
@@ -185,7 +185,7 @@ class _Channels:
         self.events.append(Event(t_s, level, code, source, text))
 
     def _status(self, t_s: float, said: dict[str, Any]) -> None:
-        self._faults.take(t_s, said)
+        self._faults.read(t_s, said)
         dropped = number(said.get("recording_dropped"))
         self.dropped = self.dropped if isnan(dropped) else int(dropped)
 

@@ -84,8 +84,8 @@ def _distance(solution: TrajectoryTable) -> str:
 
 def _modes(run: Run) -> Item:
     lengths: Counter[str] = Counter()
-    for begun, ended, mode in run.modes():
-        lengths[mode] += ended - begun  # type: ignore[assignment]
+    for started, ended, mode in run.modes():
+        lengths[mode] += ended - started  # type: ignore[assignment]
     total = sum(lengths.values())
     if not total:
         return Sentence("The file does not say in which mode each row is.")
@@ -150,7 +150,7 @@ def _faults(run: Run) -> Item:
     first = run.span_s[0]
     rows = [
         [
-            *(f.source, f.kind, f"{f.begun_s - first:.1f}", f"{f.last_s - first:.1f}", f.axis),
+            *(f.source, f.kind, f"{f.started_s - first:.1f}", f"{f.last_s - first:.1f}", f.axis),
             *(f"{f.size:.4g} {f.unit}", f"{f.sd:.2g}", f"{f.log_odds:.1f}", f.action),
         ]
         for f in run.log.faults

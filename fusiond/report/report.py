@@ -51,7 +51,7 @@ def document(title: str, runs: Sequence[Run], truth: TrajectoryTable | None) -> 
         note = "The second run is drawn beside the first, on the same axes."
         if not same_time:
             note += " They have no time in common: each begins at 0."
-        elif (difference := states.apart(*runs)) is not None:
+        elif (difference := states.difference(*runs)) is not None:
             rows = [[item.as_json(zeros[1])] for _, item in difference.items]
             joined.insert(1, {"title": difference.title, "rows": rows})
     return {
@@ -75,12 +75,12 @@ def _zeros(runs: Sequence[Run]) -> list[float]:
 
 
 def _about(run: Run, zero: float) -> dict[str, Any]:
-    begun = f"t_s = {zero:.3f} of the file"
+    started = f"t_s = {zero:.3f} of the file"
     if run.posix:
-        begun = f"{datetime.fromtimestamp(zero, UTC):%Y-%m-%d %H:%M:%S.%f} UTC"
+        started = f"{datetime.fromtimestamp(zero, UTC):%Y-%m-%d %H:%M:%S.%f} UTC"
     return {
         "name": run.name,
-        "zero": f"Time 0 is {begun}.",
+        "zero": f"Time 0 is {started}.",
         "problems": [list(problem) for problem in run.problems],
         "modes": [[a - zero, b - zero, mode] for a, b, mode in run.modes()],
         "events": [[e.t_s - zero, e.level, e.source, e.code, e.text] for e in run.events],

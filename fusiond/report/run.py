@@ -124,7 +124,7 @@ class Fault:
 
     source: str
     kind: str
-    begun_s: float
+    started_s: float
     last_s: float
     axis: str = ""
     unit: str = ""
@@ -148,7 +148,7 @@ class LogParts:
     calibration: dict[str, Estimated] = field(default_factory=dict)
     sky: dict[str, Sky] = field(default_factory=dict)
     latency: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
-    late_ms: tuple[Floats, Floats] | None = None
+    tick_delay_ms: tuple[Floats, Floats] | None = None
     usage: tuple[Floats, Floats, Floats] | None = None
     """Times, CPU in percent of a core, resident memory in MB."""
     imu: ImuLook | None = None
@@ -179,8 +179,8 @@ class Run:
     def modes(self) -> Iterator[tuple[float, float, str]]:
         """Stretches of one mode: from, to, which."""
         status, t_s = self.solution.status, self.solution.t_s
-        begun = 0
+        started = 0
         for k in range(1, len(status) + 1):
-            if k == len(status) or status[k] != status[begun]:
-                yield float(t_s[begun]), float(t_s[min(k, len(status) - 1)]), status[begun]
-                begun = k
+            if k == len(status) or status[k] != status[started]:
+                yield float(t_s[started]), float(t_s[min(k, len(status) - 1)]), status[started]
+                started = k

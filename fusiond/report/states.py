@@ -159,7 +159,7 @@ def _coverage(found: Errors) -> Item:
     return Table("Coverage", ("", "found", "Gaussian"), rows, good)
 
 
-def apart(first: Run, second: Run) -> Section | None:
+def difference(first: Run, second: Run) -> Section | None:
     """Instants at which two runs differ; None where they have no time in common."""
     try:
         found = errors_of(second.solution, first.solution)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.files.fixed_decimal import MAX_CELL, format_rows
-from fusiond.simulation.aid_sensors import aid_tables
+from fusiond.simulation.aiding_sensors import sensor_tables
 from fusiond.simulation.barometer import BAROMETER_COLUMNS, Barometer, barometer_stream
 from fusiond.simulation.gnss.raw import GnssRaw
 from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
@@ -87,7 +87,7 @@ def simulate(
         "gnss": (_GNSS, _gnss_rows(GnssReceiver(truth, scenario.gnss, gnss_rng))),
         "rdss": (_RDSS, _rdss_rows(truth, scenario, rdss_rng)),
         "truth": (_TRUTH, truth_rows(truth)),
-        **aid_tables(truth, scenario.star_tracker, scenario.sar, seed),
+        **sensor_tables(truth, scenario.star_tracker, scenario.sar, seed),
     }
     if scenario.barometer is not None:
         barometer = Barometer(truth, scenario.barometer, barometer_stream(seed))

@@ -73,7 +73,7 @@ def configuration(folder: Path, interface: Interface, channel: str) -> str:
 
 
 def live(
-    folder: Path, duration_s: float | None, seed: int, tell: Callable[[str], None]
+    folder: Path, duration_s: float | None, seed: int, report: Callable[[str], None]
 ) -> dict[str, int]:
     """Drive until the end, Ctrl-C or SIGTERM; the counters of what was sent."""
     interface, channel = bus_here()
@@ -91,13 +91,13 @@ def live(
         gnss_link=folder / "gnss",
         rdss_link=folder / "rdss",
     )
-    tell(f"a car: IMU on {interface} {channel}, receiver {folder}/gnss, terminal {folder}/rdss")
-    tell(f"it stands for {REST_S:g} s, then drives. In another terminal: fusiond run {config}")
-    asyncio.run(_until_told(vehicle))
+    report(f"a car: IMU on {interface} {channel}, receiver {folder}/gnss, terminal {folder}/rdss")
+    report(f"it stands for {REST_S:g} s, then drives. In another terminal: fusiond run {config}")
+    asyncio.run(_until_stopped(vehicle))
     return dict(vehicle.counters)
 
 
-async def _until_told(vehicle: SimulatedVehicle) -> None:
+async def _until_stopped(vehicle: SimulatedVehicle) -> None:
     driving = asyncio.create_task(vehicle.run())
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, driving.cancel)

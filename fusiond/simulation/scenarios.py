@@ -9,7 +9,7 @@ import numpy as np
 
 from fusiond.configuration.aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
 from fusiond.configuration.schema import Config, Imu
-from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
+from fusiond.simulation.aiding_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.barometer import BarometerOptions
 from fusiond.simulation.gnss.masks import Mask
 from fusiond.simulation.gnss.raw import GnssRawOptions

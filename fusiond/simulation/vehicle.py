@@ -31,8 +31,8 @@ from drivers.can.imu import CanImuOptions
 from drivers.can.python_can import can
 from fusiond.configuration.load import load_config
 from fusiond.navigation.gps_time import utc_ns_to_gps
-from fusiond.simulation.can.aids import CanAid, can_aids
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from fusiond.simulation.can.sensors import CanSensor, can_sensors
 from fusiond.simulation.files import write_truth
 from fusiond.simulation.gnss.masks import parse_mask
 from fusiond.simulation.gnss.raw import START, GnssRaw
@@ -87,7 +87,7 @@ class SimulatedVehicle:
         self.encoder = CanImu(can_imu)
         self._can = (can_imu.interface, can_imu.channel)
         self._bus: can.BusABC | None = None
-        self.aids: dict[str, CanAid] = can_aids(
+        self.can_sensors: dict[str, CanSensor] = can_sensors(
             self.truth, scenario.star_tracker, scenario.sar, seed, self._can
         )
         self.lines: dict[Device, PtyLine] = {}
@@ -126,8 +126,8 @@ class SimulatedVehicle:
                 # Datagrams of a bus over UDP stay on this computer.
                 here: dict[str, Any] = {"hop_limit": 0} if interface == "udp_multicast" else {}
                 self._bus = can.Bus(interface=interface, channel=channel, **here)
-        elif device in self.aids:
-            self.aids[device].plug()
+        elif device in self.can_sensors:
+            self.can_sensors[device].plug()
         elif device in self.lines:
             self.lines[device].plug()
 
@@ -137,8 +137,8 @@ class SimulatedVehicle:
             if self._bus is not None:
                 self._bus.shutdown()
                 self._bus = None
-        elif device in self.aids:
-            self.aids[device].unplug()
+        elif device in self.can_sensors:
+            self.can_sensors[device].unplug()
         elif device in self.lines:
             self.lines[device].unplug()
 
@@ -166,7 +166,11 @@ class SimulatedVehicle:
 
     def _next_s(self, t_s: float) -> float:
         """Next instant of work."""
-        due = [self.truth.duration_s, t_s + SERIAL_POLL_S, *(a.next_s for a in self.aids.values())]
+        due = [
+            self.truth.duration_s,
+            t_s + SERIAL_POLL_S,
+            *(a.next_s for a in self.can_sensors.values()),
+        ]
         if self._next_imu < len(self.imu.gyro):
             due.append(float(self.truth.t_s[self._next_imu + 1]))
         if self._next_gnss < len(self.gnss):
@@ -183,8 +187,8 @@ class SimulatedVehicle:
                 break
             self._next_imu += 1
             self._send_sample(k)
-        for aid in self.aids.values():
-            aid.serve(t_s, self.counters)
+        for sensor in self.can_sensors.values():
+            sensor.serve(t_s, self.counters)
         while self._next_gnss < len(self.gnss):
             k = self._next_gnss
             if self.gnss.t_arrival_s[k] > t_s:
@@ -199,7 +203,7 @@ class SimulatedVehicle:
                 self.terminal.receive(data, t_s)
             if self.convoy is not None:
                 self.convoy.tick(t_s)
-            if data := self.terminal.take(t_s):
+            if data := self.terminal.read(t_s):
                 self._write("rdss", data)
 
     def _serve_raw(self, raw: GnssRawStream, t_s: float) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import beta, binomtest
 
 from fusiond.integrity.consistency import FEWEST, LAGS, ConsistencyOptions, judge
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.level_axis import Aided, Fault, innovations
 from fusiond.studies.monte_carlo import Progress, step_counter
 
@@ -288,7 +289,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     )
     left.invert_yaxis()
     left.set_xlabel("windows not found consistent, % (99 % interval)")
-    left.set_title("matched filter")
+    left.set_title("false alarms of a matched filter")
     for row in result["power"]:
         points = [
             (int(k), found["epochs"])
@@ -306,6 +307,6 @@ def plot(result: dict[str, Any], path: Path) -> None:
     right.yaxis.set_major_formatter("{x:.0f}")
     right.set_xlabel("window K, epochs")
     right.set_ylabel("epochs until noticed in 90 % of runs")
-    right.set_title("faults")
+    right.set_title("time to notice a fault")
     figure.legend(loc="outside lower right", ncols=3, fontsize="small")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

@@ -29,6 +29,7 @@ from fusiond.offline.process import outcomes_of
 from fusiond.simulation.imu_truth import Truth
 from fusiond.studies.faults.drawn import drawn_by
 from fusiond.studies.faults.runs import VEHICLE, navigate
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, of_run, on_processes, step_counter
 
 DEFAULT_RUNS = 200
@@ -156,5 +157,6 @@ def plot(result: dict[str, Any], path: Path) -> None:
     axes.hist(result["nees"], bins=60)
     axes.axvline(EXPECTED_NEES, color="black", label="expected")
     axes.set_xlabel("NEES of the position, mean of a drive")
+    axes.set_ylabel("drives")
     axes.legend()
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

@@ -68,12 +68,12 @@ class LiveFilter:
         estimator.initialise(0, 0, nav.copy(), np.zeros(estimator.model.size), np.diag(sd**2))
         self._timeline.start()
 
-    def advance(self, t_s: float, aids: Iterable[Aid] = ()) -> None:
-        """IMU samples up to `t_s` and then `aids` arrive."""
+    def advance(self, t_s: float, measurements: Iterable[Aid] = ()) -> None:
+        """IMU samples up to `t_s` and then `measurements` arrive."""
         end = round(t_s * RATE_HZ)
         if end > self._given:
             self._buffer.append(self._times[self._given : end], self._samples[self._given : end])
             self._given = end
-        for aid in aids:
-            self._timeline.insert(aid)
+        for measurement in measurements:
+            self._timeline.insert(measurement)
         self._timeline.run()

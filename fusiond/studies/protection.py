@@ -42,6 +42,7 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, gnss_fixes
 from fusiond.studies.faults.runs import VEHICLE
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, on_processes, step_counter
 from fusiond.studies.navigation_error import nav_error, true_nav
 
@@ -266,7 +267,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
     off = np.abs(interval - share)
     axes.errorbar(share, names, xerr=off, fmt="o", label="beyond the level, 99 %")
     axes.plot([of["allowed"] for of in cases], names, "|", markersize=18, label="allowed")
+    axes.set_title("errors beyond the protection level")
     axes.set_xlabel("share of seconds")
     axes.invert_yaxis()
     axes.legend()
-    figure.savefig(path)
+    save_figure(figure, path)

@@ -119,15 +119,15 @@ def _figures(result: Any) -> Row:
     if isinstance(result, dict) and all(isinstance(v, str | int | float) for v in result.values()):
         return flat(result)
     packed = base64.b64encode(zlib.compress(pickle.dumps(result, protocol=5))).decode("ascii")
-    return flat(_told(result)) | {"result": packed}
+    return flat(_reported(result)) | {"result": packed}
 
 
-def _told(value: Any) -> Any:
+def _reported(value: Any) -> Any:
     """A result as nested names and plain numbers."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _told(getattr(value, f.name)) for f in fields(value)}
+        return {f.name: _reported(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
-        return {str(name): _told(item) for name, item in value.items()}
+        return {str(name): _reported(item) for name, item in value.items()}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):
@@ -135,7 +135,7 @@ def _told(value: Any) -> Any:
     if isinstance(value, list | tuple):
         if all(isinstance(item, int | float) for item in value):
             return _of_array(np.array(value, dtype=float))
-        return {str(k): _told(item) for k, item in enumerate(value)}
+        return {str(k): _reported(item) for k, item in enumerate(value)}
     return value
 
 
@@ -146,13 +146,13 @@ def _of_array(values: np.ndarray[Any, Any]) -> Any:
         return None
     if values.size <= AS_IT_IS:
         return {str(k): v for k, v in enumerate(values.ravel().tolist())}
-    told = {}
+    reported = {}
     for k, column in enumerate(values.reshape(len(values), -1).T.astype(float)):
         finite = column[np.isfinite(column)]
         if len(finite):
             rms = float(np.sqrt(np.mean(finite * finite)))
-            told[str(k)] = {"mean": float(finite.mean()), "rms": rms}
-    return told if values.ndim == 2 else told.get("0")
+            reported[str(k)] = {"mean": float(finite.mean()), "rms": rms}
+    return reported if values.ndim == 2 else reported.get("0")
 
 
 def _outcome(row: Row) -> Outcome[Any]:

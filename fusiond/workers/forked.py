@@ -116,8 +116,8 @@ class _Child:
 class _Jobs:
     """The first child: hands out jobs, in their order."""
 
-    def __init__(self, jobs: Sequence[Job], share: int, told: int) -> None:
-        self._jobs, self._share, self._told = jobs, share, told
+    def __init__(self, jobs: Sequence[Job], share: int, done_pipe: int) -> None:
+        self._jobs, self._share, self._done_pipe = jobs, share, done_pipe
         self._waiting = deque(range(len(jobs)))
         self._alone: deque[int] = deque()
 
@@ -142,7 +142,7 @@ class _Jobs:
                 if not answer and waiting is not self._alone and child.job is not None:
                     self._alone.append(child.job)
                 elif answer:
-                    os.write(self._told, b".")
+                    os.write(self._done_pipe, b".")
                 if answer == _DONE and waiting:
                     child.give(waiting.popleft())
                 else:

@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from fusiond.workers.outcome import Ended, Outcome, R, T
-from fusiond.workers.process import BEGUN
+from fusiond.workers.process import STARTED
 
 ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -74,7 +74,7 @@ class Pool:
                     worker.give(work, waiting.popleft())
                 ready = wait([w.connection for w in busy], _least_s(busy))
                 for worker in list(busy):
-                    outcome = worker.hear(worker.connection in ready)
+                    outcome = worker.receive(worker.connection in ready)
                     if outcome is not None:
                         yield outcome
                     if worker.dead:
@@ -125,10 +125,10 @@ class _Worker:
         self.todo, self.began = deque(items), False
         try:
             self.connection.send_bytes(pickle.dumps((work, items)))
-        except OSError:  # it has died since its last answer: `hear` will find out
+        except OSError:  # it has died since its last answer: `receive` will find out
             return
 
-    def hear(self, ready: bool) -> Outcome[Any] | None:
+    def receive(self, ready: bool) -> Outcome[Any] | None:
         """The outcome of its first item, if it has come."""
         if not ready:
             if self.deadline_s is None or time.monotonic() < self.deadline_s:
@@ -140,7 +140,7 @@ class _Worker:
             return self._lost("died", "")
         if self._timeout_s is not None:
             self.deadline_s = time.monotonic() + self._timeout_s
-        if answer == BEGUN:
+        if answer == STARTED:
             self.began = True
             return None
         self.todo.popleft()

@@ -1,6 +1,6 @@
 """A worker's process: takes chunks of items from its socket, answers item by item.
 
-What comes is the pickle of (work, [(index, item), ...]). What goes is pickled, too: `BEGUN` when
+What comes is the pickle of (work, [(index, item), ...]). What goes is pickled, too: `STARTED` when
 `work` has been loaded, then for each item (index, ended, reason, result).
 """
 
@@ -14,7 +14,7 @@ import traceback
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
-BEGUN = "begun"
+STARTED = "begun"
 
 
 def serve(descriptor: int) -> None:
@@ -37,7 +37,7 @@ def _listen(connection: Connection, chunks: SimpleQueue[bytes]) -> None:
 
 def _work_off(connection: Connection, chunk: bytes) -> None:
     work, items = pickle.loads(chunk)
-    connection.send(BEGUN)
+    connection.send(STARTED)
     for index, item in items:
         try:
             answer = pickle.dumps((index, "done", "", work(item)))

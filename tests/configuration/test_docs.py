@@ -10,6 +10,8 @@ import pytest
 from fusiond.configuration import aiding as config_aiding
 from fusiond.configuration import estimator, outputs
 from fusiond.configuration import schema as config
+from fusiond.configuration.alignment import Alignment
+from fusiond.configuration.constraints import NonHolonomic, ZeroVelocity
 from fusiond.configuration.integrity import Integrity
 from tests.places import REPOSITORY
 
@@ -28,9 +30,9 @@ SECTIONS = {
     "[aiding.height]": config_aiding.HeightAiding,
     "[aiding.barometer]": config_aiding.BarometerAiding,
     "[aiding.wheel]": config_aiding.WheelAiding,
-    "[constraints.zero_velocity]": config.ZeroVelocity,
-    "[constraints.non_holonomic]": config.NonHolonomic,
-    "[alignment]": config.Alignment,
+    "[constraints.zero_velocity]": ZeroVelocity,
+    "[constraints.non_holonomic]": NonHolonomic,
+    "[alignment]": Alignment,
     "[estimator]": estimator.Estimator,
     "[estimator.multiscale]": estimator.Multiscale,
     "[estimator.federated]": estimator.Federated,

@@ -13,7 +13,7 @@ import websockets
 from websockets.asyncio.client import ClientConnection, connect
 
 from fusiond.dashboard.hub import Hub
-from fusiond.dashboard.serve import Serving, listening, serve
+from fusiond.dashboard.serve import PageAddress, listening, serve
 from fusiond.outputs.topics import TOPICS
 from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S
@@ -43,12 +43,12 @@ async def at_work(
     base_map: Path | None = None,
 ) -> AsyncIterator[str]:
     """Its address as HOST:PORT."""
-    serving = Serving(port=0, token=token, base_map=base_map)
-    door = listening(serving)
+    serving = PageAddress(port=0, token=token, base_map=base_map)
+    listener = listening(serving)
     stop = asyncio.Event()
-    task = asyncio.create_task(serve(hub, source, serving, door, stop))
+    task = asyncio.create_task(serve(hub, source, serving, listener, stop))
     try:
-        yield f"127.0.0.1:{door.getsockname()[1]}"
+        yield f"127.0.0.1:{listener.getsockname()[1]}"
         assert not task.done(), task
     finally:
         stop.set()
@@ -62,21 +62,21 @@ class Browser:
         self.connection = connection
         self.hello: dict[str, Any] = {}
         self.frames = 0
-        self.heard: dict[str, dict[str, Any]] = {}
+        self.latest: dict[str, dict[str, Any]] = {}
         self.rows: dict[str, list[Any]] = {}
         self.last: dict[str, Any] = {}
         self.answers: list[dict[str, Any]] = []
 
-    def take(self, text: str | bytes) -> None:
+    def receive(self, text: str | bytes) -> None:
         frame = json.loads(text)
         if "hello" in frame:
             self.hello = frame["hello"]
             return
         self.frames += 1
         if frame.get("first"):
-            self.heard, self.rows = {}, {}
+            self.latest, self.rows = {}, {}
         self.last = frame
-        self.heard.update(frame["messages"])
+        self.latest.update(frame["messages"])
         for kind, rows in frame["rows"].items():
             self.rows.setdefault(kind, []).extend(rows)
         self.answers += frame["answers"]
@@ -85,7 +85,7 @@ class Browser:
         """The first true value of `condition(self)`."""
         async with asyncio.timeout(PATIENCE_S):
             while not (value := condition(self)):
-                self.take(await self.connection.recv())
+                self.receive(await self.connection.recv())
         return value
 
     async def ask(self, **request: Any) -> dict[str, Any]:

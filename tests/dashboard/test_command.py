@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.dashboard import serve
 from fusiond.dashboard.broker import Access
-from fusiond.dashboard.serve import Serving, is_loopback
+from fusiond.dashboard.serve import PageAddress, is_loopback
 from tests.patience import PATIENCE_S
 
 
@@ -65,15 +65,15 @@ def test_a_broker_is_host_and_port(address: str) -> None:
 
 
 @pytest.fixture
-def served(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, Serving]]:
+def served(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Access, PageAddress]]:
     """What the command would serve."""
-    calls: list[tuple[Access, Serving]] = []
-    monkeypatch.setattr(serve, "serve_broker", lambda a, s, tell: calls.append((a, s)))
+    calls: list[tuple[Access, PageAddress]] = []
+    monkeypatch.setattr(serve, "serve_broker", lambda a, s, report: calls.append((a, s)))
     return calls
 
 
 def test_the_broker_of_a_configuration(
-    served: list[tuple[Access, Serving]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    served: list[tuple[Access, PageAddress]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "truck.toml"
     path.write_text(
@@ -91,7 +91,7 @@ def test_the_broker_of_a_configuration(
     assert serving.loopback
 
 
-def test_who_serves_to_others_is_told(served: list[tuple[Access, Serving]]) -> None:
+def test_who_serves_to_others_is_told(served: list[tuple[Access, PageAddress]]) -> None:
     result = CliRunner().invoke(app, ["dashboard", "--host", "0.0.0.0"])
     assert result.exit_code == 0
     assert "everyone who reaches this address sees the vehicle" in result.output

@@ -54,21 +54,21 @@ async def test_from_broker_to_browser_and_back_after_the_broker_was_away(tmp_pat
             hub = Hub(clock, "test")
             broker = Broker(Access("127.0.0.1", mosquitto.port), hub)
             async with at_work(hub, broker.run) as address, browsing(address) as page:
-                kept = await page.until(lambda p: p.heard.get("status"))
+                kept = await page.until(lambda p: p.latest.get("status"))
                 assert kept["at"] is None  # nobody knows how long the broker has had it
                 await daemon.publish(f"{BASE}/of_others", b"{}", qos=1)
                 for topic in NAMES:
                     await daemon.publish(f"{BASE}/{topic}", payload(topic), qos=1)
-                await page.until(lambda p: {"nav", "health", "reply"} <= set(p.heard))
-                await page.until(lambda p: p.heard["status"]["at"] is not None)
+                await page.until(lambda p: {"nav", "health", "reply"} <= set(p.latest))
+                await page.until(lambda p: p.latest["status"]["at"] is not None)
                 assert hub.counters["other_topic"] == 0, "not asked for"
-                assert page.heard["nav"]["said"] == said("nav")
-                assert page.heard["nav"]["at"] <= page.last["now"]
+                assert page.latest["nav"]["said"] == said("nav")
+                assert page.latest["nav"]["at"] <= page.last["now"]
                 assert page.last["vehicle"] == "truck"
                 assert page.rows["event"][0][1] == said("event")
                 mosquitto.kill()
                 await page.until(lambda p: p.last["link"]["state"] == "lost")
-                assert page.heard["nav"]["said"] == said("nav")
+                assert page.latest["nav"]["said"] == said("nav")
                 mosquitto.start()
                 await page.until(lambda p: p.last["link"]["state"] == "up")
                 async with listening(mosquitto) as (_, again):
@@ -79,7 +79,7 @@ async def test_from_broker_to_browser_and_back_after_the_broker_was_away(tmp_pat
                             await asyncio.sleep(0.05)
 
                     talking = asyncio.create_task(talk())
-                    await page.until(lambda p: p.heard["nav"]["said"]["height_m"] == 3.0)
+                    await page.until(lambda p: p.latest["nav"]["said"]["height_m"] == 3.0)
                     talking.cancel()
 
 
@@ -94,7 +94,7 @@ async def test_a_command_needs_the_token_and_gets_the_daemons_answer(tmp_path: P
                 browsing(address) as page,
             ):
                 await daemon.publish(f"{BASE}/status", payload("status"), qos=1, retain=True)
-                await page.until(lambda p: "status" in p.heard)
+                await page.until(lambda p: "status" in p.latest)
                 assert page.hello["commands"] == list(viewer.COMMANDS)
                 for wrong in ({}, {"token": "s3cret-tokem"}, {"token": 5}, {"token": None}):
                     answer = await page.ask(command="request_fix", **wrong)
@@ -106,15 +106,15 @@ async def test_a_command_needs_the_token_and_gets_the_daemons_answer(tmp_path: P
                 request_id = json.loads(sent)["id"]
                 reply = payload("reply", id=request_id, text="request in 3 s")
                 await daemon.publish(f"{BASE}/reply", reply, qos=1)
-                heard = await page.until(lambda p: p.heard.get("reply"))
-                assert heard["said"]["id"] == request_id
+                latest = await page.until(lambda p: p.latest.get("reply"))
+                assert latest["said"]["id"] == request_id
                 assert not listener.payloads(f"{BASE}/cmd/set_position")
 
 
 async def test_without_a_token_nothing_can_be_commanded() -> None:
     hub = make_hub()
     hub.send_command = lambda *sent: pytest.fail(f"sent {sent}")
-    hub.take("truck", "nav", payload("nav"))
+    hub.receive("truck", "nav", payload("nav"))
     async with at_work(hub) as address, browsing(address) as page:
         answer = await page.ask(command="request_fix", token="")
         assert "--commands" in answer["text"]
@@ -130,8 +130,8 @@ async def test_a_late_browser_gets_the_history() -> None:
     assert isinstance(clock, Clock)
     for _ in range(20):
         clock.s += 1.0
-        hub.take("truck", "nav", payload("nav"))
-        hub.take("truck", "event", payload("event"))
+        hub.receive("truck", "nav", payload("nav"))
+        hub.receive("truck", "event", payload("event"))
     async with at_work(hub) as address, browsing(address) as page:
         await page.until(lambda p: p.rows.get("nav"))
         assert [row[0] for row in page.rows["nav"]] == [101.0 + k for k in range(20)]
@@ -141,16 +141,16 @@ async def test_a_late_browser_gets_the_history() -> None:
 
 async def test_several_vehicles_are_offered_and_one_is_shown() -> None:
     hub = make_hub()
-    hub.take("van", "nav", payload("nav", height_m=2.0))
-    hub.take("car", "nav", payload("nav", height_m=1.0))
+    hub.receive("van", "nav", payload("nav", height_m=2.0))
+    hub.receive("car", "nav", payload("nav", height_m=1.0))
     async with at_work(hub) as address, browsing(address) as page:
-        await page.until(lambda p: "nav" in p.heard)
+        await page.until(lambda p: "nav" in p.latest)
         assert page.last["vehicles"] == ["car", "van"]
-        assert page.heard["nav"]["said"]["height_m"] == 1.0
+        assert page.latest["nav"]["said"]["height_m"] == 1.0
         await page.connection.send(json.dumps({"vehicle": "ship"}))
         await page.connection.send(json.dumps({"vehicle": "van"}))
         await page.until(lambda p: p.last["vehicle"] == "van")
-        assert page.heard["nav"]["said"]["height_m"] == 2.0
+        assert page.latest["nav"]["said"]["height_m"] == 2.0
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", '"x"', "{}", '{"command": 5}', "x" * 5000])
@@ -169,7 +169,7 @@ async def test_a_silent_hub_is_heard_once_a_second() -> None:
 
 
 def shows(why: str) -> Callable[[Browser], bool]:
-    return lambda page: "status" in page.heard and page.heard["status"]["said"]["why"] == why
+    return lambda page: "status" in page.latest and page.latest["status"]["said"]["why"] == why
 
 
 async def test_a_slow_browser_gets_the_newest_and_holds_up_nobody() -> None:
@@ -186,7 +186,7 @@ async def test_a_slow_browser_gets_the_newest_and_holds_up_nobody() -> None:
             held.connection.transport.pause_reading()
             for number in range(25):
                 why = str(number).rjust(60_000)
-                hub.take("truck", "status", payload("status", why=why))
+                hub.receive("truck", "status", payload("status", why=why))
                 await quick.until(shows(why))  # every single one, though the other takes none
             held.connection.transport.resume_reading()
             await held.until(shows(why))
@@ -264,18 +264,18 @@ async def test_every_file_of_the_page_is_served_and_asks_nobody_else() -> None:
 def test_what_cannot_be_read_is_counted_and_left() -> None:
     hub = make_hub()
     for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b"", b'{"lat_deg": -1e999}', b"[" * 60_000):
-        hub.take("truck", "nav", bad)
+        hub.receive("truck", "nav", bad)
     digits = b'{"t_ms": ' + b"9" * 400 + b"}"
-    hub.take("truck", "nav", digits)
-    hub.take("truck", "nav", b" " * (LARGEST_BYTES + 1))
-    hub.take("t" * 65, "nav", b"{}")
-    hub.take("truck", "online", b"maybe")
-    hub.take("truck", "tracker", b"{")
+    hub.receive("truck", "nav", digits)
+    hub.receive("truck", "nav", b" " * (LARGEST_BYTES + 1))
+    hub.receive("t" * 65, "nav", b"{}")
+    hub.receive("truck", "online", b"maybe")
+    hub.receive("truck", "tracker", b"{")
     refused = {"malformed": 7, "too_large": 2, "not_as_published": 1}
     assert hub.counters == {**refused, "other_topic": 1}
     assert not hub.vehicles
     for k in range(MOST_VEHICLES + 3):
-        hub.take(f"v{k}", "online", b"online")
+        hub.receive(f"v{k}", "online", b"online")
     assert len(hub.vehicles) == MOST_VEHICLES
     assert hub.counters["too_many_vehicles"] == 3
     last = f"v{MOST_VEHICLES + 2}/online: there are {MOST_VEHICLES} already"
@@ -288,20 +288,20 @@ def test_names_that_a_broker_has_kept_shut_out_nobody_who_speaks() -> None:
     clock = hub.now_s
     assert isinstance(clock, Clock)
     for k in range(MOST_VEHICLES + 100):
-        hub.take(f"junk{k}", "online", b"online", kept=True)
+        hub.receive(f"junk{k}", "online", b"online", kept=True)
     assert len(hub.vehicles) == MOST_VEHICLES
-    hub.take("truck", "online", b"online", kept=True)
+    hub.receive("truck", "online", b"online", kept=True)
     assert "truck" not in hub.vehicles
-    hub.take("truck", "status", payload("status"))
+    hub.receive("truck", "status", payload("status"))
     assert "truck" in hub.vehicles
     for k in range(MOST_VEHICLES - 1):  # who speaks, too, but does not push out who speaks
-        hub.take(f"talking{k}", "online", b"online")
-    hub.take("van", "status", payload("status"))
+        hub.receive(f"talking{k}", "online", b"online")
+    hub.receive("van", "status", payload("status"))
     assert "van" not in hub.vehicles
     clock.s += GIVES_WAY_S - 1.0
-    hub.take("truck", "status", payload("status"))
+    hub.receive("truck", "status", payload("status"))
     clock.s += 1.0
-    hub.take("van", "status", payload("status"))
+    hub.receive("van", "status", payload("status"))
     assert {"truck", "van"} < set(hub.vehicles)
     assert len(hub.vehicles) == MOST_VEHICLES
 
@@ -331,7 +331,7 @@ async def test_no_message_ends_the_page_and_it_says_what_was_refused(tmp_path: P
                 assert page.last["vehicles"] == []
                 await daemon.publish(f"{BASE}/innovations", blind, qos=1)
                 await daemon.publish(f"{BASE}/status", payload("status"), qos=1)
-                await page.until(lambda p: "status" in p.heard)
+                await page.until(lambda p: "status" in p.latest)
                 assert page.last["refused"]["last"] == "truck/innovations: t_ms: no integer"
                 assert page.last["refused"]["kinds"] == {"malformed": 1, "not_as_published": 4}
 

@@ -15,7 +15,7 @@ from fusiond.dashboard.vehicle import (
 from tests.dashboard.serving import NAMES, said
 
 
-def heard(vehicle: Vehicle, count: int = 0) -> dict[str, dict[str, object]]:
+def latest(vehicle: Vehicle, count: int = 0) -> dict[str, dict[str, object]]:
     messages = vehicle.since(count)["messages"]
     assert isinstance(messages, dict)
     return messages
@@ -23,9 +23,9 @@ def heard(vehicle: Vehicle, count: int = 0) -> dict[str, dict[str, object]]:
 
 def test_every_topic_is_taken() -> None:
     vehicle = Vehicle("truck")
-    vehicle.take("online", "online", 0.5)
+    vehicle.receive("online", "online", 0.5)
     for k, topic in enumerate(NAMES):
-        vehicle.take(topic, said(topic), 1.0 + k)
+        vehicle.receive(topic, said(topic), 1.0 + k)
     new = vehicle.since(0)
     for k, topic in enumerate(NAMES):
         if topic in ("event", "message"):
@@ -43,9 +43,9 @@ def test_every_topic_is_taken() -> None:
 def test_other_vehicles_are_kept_by_card_and_no_more_than_a_daemon_tells() -> None:
     vehicle = Vehicle("truck")
     for card in range(MOST_CARDS + 5):
-        vehicle.take("fleet", {**said("fleet"), "card": card}, 1.0)
-    vehicle.take("fleet", {**said("fleet"), "card": 0, "lat_deg": 1.0}, 2.0)
-    messages = heard(vehicle)
+        vehicle.receive("fleet", {**said("fleet"), "card": card}, 1.0)
+    vehicle.receive("fleet", {**said("fleet"), "card": 0, "lat_deg": 1.0}, 2.0)
+    messages = latest(vehicle)
     assert len(messages) == MOST_CARDS
     first = messages["fleet/0"]["said"]
     assert isinstance(first, dict)
@@ -54,9 +54,9 @@ def test_other_vehicles_are_kept_by_card_and_no_more_than_a_daemon_tells() -> No
 
 def test_events_before_the_first_look_are_those_that_the_broker_has_kept() -> None:
     vehicle = Vehicle("truck")
-    vehicle.take("events", said("events"), 5.0, kept=True)
-    vehicle.take("event", said("event"), 6.0)
-    vehicle.take("events", said("events"), 6.0)
+    vehicle.receive("events", said("events"), 5.0, kept=True)
+    vehicle.receive("event", said("event"), 6.0)
+    vehicle.receive("events", said("events"), 6.0)
     told = said("events")["events"]
     expected = [*([None, one] for one in told), [6.0, said("event")]]
     assert vehicle.since(0)["rows"]["event"] == expected
@@ -64,26 +64,26 @@ def test_events_before_the_first_look_are_those_that_the_broker_has_kept() -> No
 
 def test_only_what_is_new_is_told() -> None:
     vehicle = Vehicle("truck")
-    vehicle.take("nav", said("nav"), 1.0)
-    vehicle.take("status", said("status"), 1.0)
+    vehicle.receive("nav", said("nav"), 1.0)
+    vehicle.receive("status", said("status"), 1.0)
     count = vehicle.count
     assert vehicle.since(count) == {"messages": {}, "rows": {}}
-    vehicle.take("nav", said("nav", height_m=5.0), 1.1)
-    vehicle.take("nav", said("nav", height_m=6.0), 1.0 + ROW_EVERY_S)
-    assert set(heard(vehicle, count)) == {"nav"}
-    assert heard(vehicle, count)["nav"]["said"]["height_m"] == 6.0  # type: ignore[index]
+    vehicle.receive("nav", said("nav", height_m=5.0), 1.1)
+    vehicle.receive("nav", said("nav", height_m=6.0), 1.0 + ROW_EVERY_S)
+    assert set(latest(vehicle, count)) == {"nav"}
+    assert latest(vehicle, count)["nav"]["said"]["height_m"] == 6.0  # type: ignore[index]
     assert [row[5] for row in vehicle.since(count)["rows"]["nav"]] == [6.0]
 
 
 def test_what_the_broker_has_kept_has_no_age() -> None:
     vehicle = Vehicle("truck")
-    vehicle.take("status", said("status"), 100.0, kept=True)
-    vehicle.take("health", said("health"), 100.0, kept=True)
-    vehicle.take("consistency", said("consistency"), 100.0, kept=True)
-    assert heard(vehicle)["status"]["at"] is None
+    vehicle.receive("status", said("status"), 100.0, kept=True)
+    vehicle.receive("health", said("health"), 100.0, kept=True)
+    vehicle.receive("consistency", said("consistency"), 100.0, kept=True)
+    assert latest(vehicle)["status"]["at"] is None
     assert "nis" not in vehicle.since(0)["rows"]
-    vehicle.take("status", said("status"), 101.0)
-    assert heard(vehicle)["status"]["at"] == 101.0
+    vehicle.receive("status", said("status"), 101.0)
+    assert latest(vehicle)["status"]["at"] == 101.0
 
 
 @pytest.mark.parametrize(
@@ -92,36 +92,36 @@ def test_what_the_broker_has_kept_has_no_age() -> None:
 def test_a_topic_is_old_after_three_of_its_own_intervals(every_s: float, limit_s: float) -> None:
     vehicle = Vehicle("truck")
     for k in range(6):
-        vehicle.take("health", said("health"), k * every_s)
+        vehicle.receive("health", said("health"), k * every_s)
     assert vehicle.limit_s("health") == pytest.approx(limit_s)
 
 
 def test_a_long_silence_does_not_make_what_comes_later_young() -> None:
     vehicle = Vehicle("truck")
     for at_s in (0.0, 0.1, 0.2, 0.3, 600.0, 600.1, 600.2):
-        vehicle.take("nav", said("nav"), at_s)
+        vehicle.receive("nav", said("nav"), at_s)
     assert vehicle.limit_s("nav") == LIMITS_S["nav"]
 
 
 def test_what_is_no_message_is_left() -> None:
     vehicle = Vehicle("truck")
-    vehicle.take("nav", [1, 2], 0.0)
-    vehicle.take("online", "maybe", 0.0)
-    vehicle.take("cmd", {"id": "a"}, 0.0)
-    vehicle.take("event", 5, 0.0)
+    vehicle.receive("nav", [1, 2], 0.0)
+    vehicle.receive("online", "maybe", 0.0)
+    vehicle.receive("cmd", {"id": "a"}, 0.0)
+    vehicle.receive("event", 5, 0.0)
     assert vehicle.count == 0
-    vehicle.take("nav", {"lat_deg": "here", "mode": 7, "t_ms": True}, 0.0)
-    vehicle.take("health", {"sources": {"gnss": 5, "rdss": {"counters": []}}}, 0.0)
-    vehicle.take("health", {"sources": []}, 1.0)
+    vehicle.receive("nav", {"lat_deg": "here", "mode": 7, "t_ms": True}, 0.0)
+    vehicle.receive("health", {"sources": {"gnss": 5, "rdss": {"counters": []}}}, 0.0)
+    vehicle.receive("health", {"sources": []}, 1.0)
     assert vehicle.since(0)["rows"] == {"nav": [[0.0, *[None] * 12]]}
 
 
 def test_history_is_bounded_and_in_order() -> None:
     vehicle = Vehicle("truck")
     for k in range(MOST_ROWS["nav"] + 50):
-        vehicle.take("nav", said("nav"), k * ROW_EVERY_S)
+        vehicle.receive("nav", said("nav"), k * ROW_EVERY_S)
     for k in range(MOST_ROWS["event"] + 5):
-        vehicle.take("event", said("event"), k)
+        vehicle.receive("event", said("event"), k)
     rows = vehicle.since(0)["rows"]
     times = [row[0] for row in rows["nav"]]
     assert len(times) == MOST_ROWS["nav"]
@@ -140,20 +140,20 @@ def test_each_fix_of_a_terminal_has_one_delay() -> None:
         return {"sources": {"rdss": rdss, "gnss": said("health")["sources"]["gnss"]}}
 
     for k, (received, latency_s) in enumerate([(1, 1.4), (1, 1.4), (2, 0.9), (2, 0.9), (2, 0.9)]):
-        vehicle.take("health", terminal(received, latency_s), float(k))
+        vehicle.receive("health", terminal(received, latency_s), float(k))
     assert vehicle.since(0)["rows"]["delay"] == [[0.0, "rdss", 1.4], [2.0, "rdss", 0.9]]
 
 
 def test_innovations_of_a_bundle_stand_at_their_validity() -> None:
     vehicle = Vehicle("truck")
     for at_s in (10.0, 11.0):  # the same two again: a rewind
-        vehicle.take("innovations", said("innovations"), at_s)
+        vehicle.receive("innovations", said("innovations"), at_s)
     rows = vehicle.since(0)["rows"]["innovation"]
     assert [row[1:] for row in rows] == [["gnss", "fused", 2.114, 3], ["rdss", "gated", 31.9, 2]]
     assert [row[0] for row in rows] == pytest.approx([10.0 - 0.071, 10.0 - 1.42])
     count = vehicle.count
     for bad in ({}, {"innovations": 5}, {"t_ms": 1, "innovations": [3, {"source": 1}]}):
-        vehicle.take("innovations", bad, 12.0)
+        vehicle.receive("innovations", bad, 12.0)
     assert vehicle.count == count
 
 
@@ -163,18 +163,18 @@ def test_an_innovation_that_comes_again_takes_the_place_of_the_first() -> None:
     def innovation(t_ns: int, outcome: str, nis: float | None) -> dict[str, object]:
         return {"t_ns": t_ns, "source": "gnss", "outcome": outcome, "nis": nis, "degrees": 3}
 
-    vehicle.take("innovation", innovation(1, "gated", 40.0), 1.0)
-    vehicle.take("innovation", innovation(2, "fused", 3.0), 2.0)
+    vehicle.receive("innovation", innovation(1, "gated", 40.0), 1.0)
+    vehicle.receive("innovation", innovation(2, "fused", 3.0), 2.0)
     count = vehicle.count
-    vehicle.take("innovation", innovation(1, "fused", 2.5), 3.0)
-    vehicle.take("innovation", {"source": "gnss"}, 4.0)
+    vehicle.receive("innovation", innovation(1, "fused", 2.5), 3.0)
+    vehicle.receive("innovation", {"source": "gnss"}, 4.0)
     assert vehicle.since(count)["rows"]["innovation"] == [[1.0, "gnss", "fused", 2.5, 3]]
     assert vehicle.since(0)["rows"]["innovation"] == [
         [2.0, "gnss", "fused", 3.0, 3],
         [1.0, "gnss", "fused", 2.5, 3],
     ]
     for t_ns in range(MOST_INNOVATIONS + 100):
-        vehicle.take("innovation", innovation(t_ns, "fused", 1.0), float(t_ns))
+        vehicle.receive("innovation", innovation(t_ns, "fused", 1.0), float(t_ns))
     assert len(vehicle.since(0)["rows"]["innovation"]) == MOST_INNOVATIONS
 
 
@@ -188,7 +188,7 @@ def test_an_alarm_ends_a_minute_after_what_it_tells_of() -> None:
     told = []
     for second in range(200):
         late = 5 * min(second, 20)  # of the first 20 s
-        vehicle.take("health", {**sound, "ticks": 100 * second, "overruns": late}, float(second))
+        vehicle.receive("health", {**sound, "ticks": 100 * second, "overruns": late}, float(second))
         told.append(_told_late(vehicle))
     assert told[15]
     assert told[60]
@@ -199,7 +199,7 @@ def test_a_daemon_that_begins_anew_begins_without_alarms() -> None:
     vehicle = Vehicle("truck")
     for second in range(30):
         health = {**said("health"), "ticks": 100 * second, "overruns": 10 * second}
-        vehicle.take("health", health, float(second))
+        vehicle.receive("health", health, float(second))
     assert _told_late(vehicle)
-    vehicle.take("health", {**said("health"), "ticks": 50, "overruns": 0}, 31.0)
+    vehicle.receive("health", {**said("health"), "ticks": 50, "overruns": 0}, 31.0)
     assert not _told_late(vehicle)

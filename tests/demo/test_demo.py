@@ -155,8 +155,8 @@ def test_score_against_the_truth(tmp_path: Path) -> None:
             *(float(p) for p in position),
             rpy_rad=(0.0, 0.0, float(truth.rpy[0, 2]) + np.radians(0.5) - 2.0 * np.pi),
         )
-        score.take(solution, covariance)
-        score.take(replace(solution, mode=Mode.INVALID), covariance)
+        score.add(solution, covariance)
+        score.add(replace(solution, mode=Mode.INVALID), covariance)
     result = score.against(vehicle)
     assert result["horizontal_rms_m"] == pytest.approx(5.0, abs=2e-3)
     assert result["yaw_rms_deg"] == pytest.approx(0.5, abs=1e-3)
@@ -172,8 +172,8 @@ def test_score_against_the_truth(tmp_path: Path) -> None:
 def test_story_tells_the_outages_that_were_lived_through() -> None:
     t_s = np.arange(10.05, 60.0, 0.1)
     error_m = np.where((t_s > 18.0) & (t_s < 30.0), 0.5 + (t_s - 18.0) * 0.25, 0.5)
-    told = list(story(t_s, error_m, np.full_like(t_s, 1.0), [(2.0, 5.0), (18.0, 30.0)]))
-    assert told == [
+    angles_deg = list(story(t_s, error_m, np.full_like(t_s, 1.0), [(2.0, 5.0), (18.0, 30.0)]))
+    assert angles_deg == [
         "12 s without GNSS: the error grew from 0.50 to 3.49 m at most, and sigma said "
         "1.00 m there",
         "the car was within two sigma for 88 % of the 50 s that it was navigated",

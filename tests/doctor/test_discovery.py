@@ -21,7 +21,7 @@ from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.doctor.discovery import Device as Found
-from fusiond.doctor.discovery import Unheard, down_axis, on_bus, on_port, round_rate
+from fusiond.doctor.discovery import SilentPort, down_axis, on_bus, on_port, round_rate
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
@@ -159,7 +159,7 @@ async def test_what_speaks_on_a_port(
     found = await on_port(str(tmp_path / "port"), ask_terminal=False, listen_s=listen_s)
     sending.cancel()
     device.unplug()
-    assert (None if isinstance(found, Unheard) else found.driver) == driver
+    assert (None if isinstance(found, SilentPort) else found.driver) == driver
     assert said in found.text
 
 
@@ -169,11 +169,11 @@ async def test_a_silent_port_is_told_with_what_may_be_wrong(tmp_path: Path) -> N
     port = str(tmp_path / "port")
     quiet = await on_port(port, ask_terminal=False, listen_s=0.1)
     device.unplug()
-    assert isinstance(quiet, Unheard)
+    assert isinstance(quiet, SilentPort)
     for words in (f"{port}: silent", "powered", "--ask-terminal"):
         assert words in quiet.text
     gone = await on_port(str(tmp_path / "none"), ask_terminal=False, listen_s=0.1)
-    assert isinstance(gone, Unheard)
+    assert isinstance(gone, SilentPort)
     assert "cannot be opened" in gone.text
 
 

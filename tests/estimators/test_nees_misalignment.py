@@ -19,7 +19,7 @@ from fusiond.configuration.settings import ARCSEC, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.blocks import misalignment
 from fusiond.models.catalogue import make_model
-from fusiond.simulation.aid_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
+from fusiond.simulation.aiding_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from tests import runs
 from tests.estimators.monte_carlo import FIRST_FIX_S, LEVER, MATCHED, RATE_HZ, drawn_aids, interval
 

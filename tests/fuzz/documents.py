@@ -76,15 +76,15 @@ def hub(data: bytes) -> None:
     for place, payload in enumerate(payloads):
         now_s += 0.4
         topic = _TOPICS[((choice & 0xF) + place) % len(_TOPICS)]
-        taking.take(f"v{choice >> 4 & 1 & place}", topic, payload, kept=bool(choice & 0x80))
+        taking.receive(f"v{choice >> 4 & 1 & place}", topic, payload, kept=bool(choice & 0x80))
     assert sum(taking.counters[name] for name in _VIEWED) == len(payloads)
     assert taking.counters.total() == len(payloads)
     frame: dict[str, Any] = {"refused": taking.refused}
     for vehicle in taking.vehicles.values():
         frame[vehicle.name] = new = vehicle.since(0)
-        for topic, heard in new["messages"].items():
+        for topic, latest in new["messages"].items():
             if topic in SHOWN:
-                assert topics()[topic](heard["said"]) == heard["said"]
+                assert topics()[topic](latest["said"]) == latest["said"]
     json.dumps(frame, allow_nan=False)
 
 

@@ -55,7 +55,7 @@ class Desk:
         )
 
     def _emit(self, item: Any) -> None:
-        self.messaging.take(item)
+        self.messaging.receive(item)
 
     def send(self, text: str = "hello", **more: Any) -> str:
         command = {"id": "m1", "card": OTHER, "text": text, **more}
@@ -76,4 +76,4 @@ class Desk:
             "text": "hi",
             "minute_of_day": 615,
         }
-        self.messaging.take(MessageReceived(**{**mail, **given}))
+        self.messaging.receive(MessageReceived(**{**mail, **given}))

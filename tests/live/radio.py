@@ -89,7 +89,7 @@ class Radio:
                 for name, terminal in self.terminals.items():
                     if data := lines[name].read():
                         terminal.receive(data, t_s)
-                    if data := terminal.take(t_s):
+                    if data := terminal.read(t_s):
                         lines[name].write(data)
                 await asyncio.sleep(0.01)
 

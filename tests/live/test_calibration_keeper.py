@@ -30,7 +30,7 @@ def offered(config: Config) -> tuple[SavedCalibration | None, list[str]]:
     """What a navigator of that configuration takes up, and the events."""
     events: list[str] = []
     navigator = Navigator(config)
-    CalibrationKeeper(config, lambda code, text: events.append(code)).offer(navigator)
+    CalibrationKeeper(config, lambda code, text: events.append(code)).restore_into(navigator)
     return navigator.calibration, events
 
 

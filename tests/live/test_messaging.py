@@ -98,10 +98,10 @@ def test_reports_go_out_at_their_interval_and_the_newest_waits() -> None:
 def test_an_event_is_reported_with_the_next_solution_that_has_a_place() -> None:
     desk = Desk(card=OTHER, events=["mode_coasting"])
     t_ns = desk.clock.now_ns()
-    desk.messaging.heard("mode_navigating")
+    desk.messaging.note_event("mode_navigating")
     desk.messaging.tick(t_ns, replace(SOLUTION, t_ns=t_ns))
     assert not posted(desk)
-    desk.messaging.heard("mode_coasting")
+    desk.messaging.note_event("mode_coasting")
     desk.messaging.tick(t_ns, Solution(t_ns, Mode.WAITING, "no IMU data yet"))
     assert not posted(desk)
     desk.messaging.tick(t_ns, replace(SOLUTION, t_ns=t_ns, height_m=math.nan))
@@ -167,7 +167,7 @@ def test_a_report_without_a_date_is_of_the_last_day(ahead_s: float, days: int) -
 def test_a_fix_that_the_centre_passes_on_is_a_place() -> None:
     desk = Desk()
     fix = FleetFix("rdss", desk.clock.now_ns(), OTHER, 0.0, 30.0, 114.0, 40.0, 100.0)
-    desk.messaging.take(fix)
+    desk.messaging.receive(fix)
     ((path, place),) = desk.told()
     assert (path, place.by, place.sd_n_m, place.mode) == (f"fleet/{OTHER}", "centre", 100.0, None)
 
@@ -176,7 +176,7 @@ def test_more_cards_than_a_fleet_has_are_counted_and_not_told() -> None:
     desk = Desk()
     for card in range(1, MOST_CARDS + 3):
         fix = FleetFix("rdss", desk.clock.now_ns(), card, 0.0, 30.0, 114.0, 40.0, 100.0)
-        desk.messaging.take(fix)
+        desk.messaging.receive(fix)
     assert len(desk.told()) == MOST_CARDS
     assert desk.drivers["rdss"].counters["fleet_full"] == 2
 

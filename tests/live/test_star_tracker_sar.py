@@ -21,7 +21,7 @@ from fusiond.files.tables import read_attitude, read_bearing
 from fusiond.live import sources as serving
 from fusiond.live.daemon import Daemon
 from fusiond.offline.process import process
-from fusiond.simulation.aid_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
+from fusiond.simulation.aiding_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
 from fusiond.live.message_keeper import MessageKeeper
-from fusiond.live.messaging import MOST_UNTOLD
+from fusiond.live.messaging import MOST_UNCONFIRMED
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.stored_messages import KEPT_MESSAGES, KeptMessages
 from fusiond.navigator.state_file import MOST_BYTES, DamagedStateError, read_state
@@ -45,7 +45,7 @@ async def test_what_waits_and_what_nobody_was_told_goes_on(tmp_path: Path) -> No
     outbox = desk.drivers["rdss"].outbox
     outbox.written(outbox.waiting[0])
     before = [message for _, message in desk.told()]
-    desk.messaging.told(before[1])
+    desk.messaging.confirm(before[1])
     other = await again(desk, tmp_path)
     waiting = other.drivers["rdss"].outbox.waiting
     assert [(m.key, m.text, m.attempts) for m in waiting] == [("m1", "hello", 1), ("m2", "bye", 0)]
@@ -125,7 +125,7 @@ def test_the_fullest_state_fits_its_file() -> None:
     desk = Desk()
     for n in range(32):
         desk.send("x" * 203, id=f"{n:064d}", receipt=True)
-    for _ in range(3 * MOST_UNTOLD):
+    for _ in range(3 * MOST_UNCONFIRMED):
         desk.received(payload=b"\xa4" + b"\xff" * 209, text="\\u" * 100)
     assert desk.drivers["rdss"].counters["message_untold"] > 0
     from fusiond.live.message_keeper import _text  # noqa: PLC0415
@@ -175,7 +175,7 @@ async def test_a_replay_starts_from_the_messages_that_the_daemon_had_loaded(tmp_
     messages = keeper(desk, tmp_path)[0].load(daemon.messaging)
     recorded = json.dumps(RESTORED_STATE.dump_python(RestoredState(messages=messages), mode="json"))
     again = Chain(desk.config, desk.clock, Events(desk.clock))
-    RESTORED_STATE.validate_json(recorded).offer(again)
+    RESTORED_STATE.validate_json(recorded).restore_into(again)
     boxes = [c.sources.all["rdss"].driver.outbox.waiting for c in (daemon, again)]  # type: ignore[attr-defined]
     assert boxes[0] == boxes[1] != []
     assert [m for _, m in daemon.messaging.take_waiting()] == [

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix
-from fusiond.configuration.schema import Alignment, Config, Imu
+from fusiond.configuration.alignment import Alignment
+from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import DEG
 from fusiond.navigation.alignment import gyrocompass, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.geoid import geoid_separation_m
 from fusiond.outputs.gpsd import reports
 from fusiond.outputs.gpsd.requests import MOST_BYTES, Malformed, Request, RequestReader
 from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
@@ -88,7 +89,10 @@ def test_tpv_is_the_solution_in_gpsds_units() -> None:
     assert (said["epx"], said["epy"], said["epv"]) == (1.666, 1.764, 3.332)
     assert said["eph"] == pytest.approx(2.476, abs=1e-3)
     assert said["time"] == "2026-11-20T23:33:07.123Z"
-    assert "altMSL" not in reports.known_only(reports.tpv("d", nav(), None))
+    separation_m = geoid_separation_m(31.025438871, 121.441209483)
+    by_table = reports.tpv("d", nav(), None)["altMSL"]
+    assert by_table == pytest.approx(17.42 - separation_m, abs=1e-3)
+    assert "altMSL" not in reports.known_only(reports.tpv("d", nav(sd_d_m=None), None))
 
 
 def test_what_may_not_be_used_is_no_fix() -> None:

@@ -14,6 +14,7 @@ from pynmeagps import NMEAReader
 
 from fusiond.configuration.outputs import NmeaServed
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.geoid import geoid_separation_m
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.nmea import DEFAULT, NmeaServer, sentences
 from fusiond.outputs.topics import NAV
@@ -60,7 +61,9 @@ def test_dead_reckoning_and_nothing() -> None:
     assert (coasting["RMC"].status, coasting["RMC"].posMode) == ("A", "E")
     assert coasting["GGA"].quality == 6
     assert coasting["THS"].mi == "E"
-    assert coasting["GGA"].alt == coasting["GGA"].sep == ""
+    separation_m = geoid_separation_m(31.025, 121.441)  # none is configured
+    assert coasting["GGA"].sep == pytest.approx(separation_m, abs=0.01)
+    assert coasting["GGA"].alt == pytest.approx(17.42 - separation_m, abs=0.01)
     for message in (nav(mode=Mode.INVALID), nav_message(Solution(0, Mode.WAITING, ""), None)):
         epoch = sentences(message, (*ALL, "GST"), GEOID_M)
         nothing = read(epoch)

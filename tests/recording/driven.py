@@ -75,5 +75,5 @@ class Drive(Rig):
                 self.take("gnss", "read", sentences[40:])
                 self.take("gnss", "silence")
         self.take("rdss", "due")
-        if data := vehicle.terminal.take(until_s):
+        if data := vehicle.terminal.read(until_s):
             self.take("rdss", "read", data)

@@ -108,7 +108,7 @@ def test_an_hour_stays_below_5_mb(tmp_path: Path) -> None:
         status=["navigating"] * n,
         rejected=[],
     )
-    parts = LogParts(late_ms=(np.repeat(t_s, 10), random.standard_normal(10 * n)))
+    parts = LogParts(tick_delay_ms=(np.repeat(t_s, 10), random.standard_normal(10 * n)))
     for source in ("gnss", "gnss_velocity"):
         whitened = random.standard_normal((n, 3))
         nis = np.sum(whitened**2, axis=1)

@@ -213,8 +213,8 @@ def test_faults_and_service_over_time(tmp_path: Path) -> None:
     assert run.log is not None
     first, second = run.log.faults
     assert (first.source, first.kind, first.axis) == ("gnss", "velocity", "north")
-    begun_s, last_s = (t_s - EPOCH_NS * 1e-9 for t_s in (first.begun_s, first.last_s))
-    assert (begun_s, last_s) == pytest.approx((2.0, 5.0), abs=1e-3)
+    started_s, last_s = (t_s - EPOCH_NS * 1e-9 for t_s in (first.started_s, first.last_s))
+    assert (started_s, last_s) == pytest.approx((2.0, 5.0), abs=1e-3)
     assert (first.size, second.size) == pytest.approx((0.5, 0.9))
     document = read_page(tmp_path / "a.html")
     rows = item(document, "Summary", "Faults")["rows"]

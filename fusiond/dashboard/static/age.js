@@ -7,20 +7,20 @@ export function hubNow(frame, here) {
 }
 
 // Seconds since a message came; null where nobody knows (the broker had kept it).
-export function ageOf(heard, now) {
-  return heard && heard.at !== null ? Math.max(0, now - heard.at) : null;
+export function ageOf(latest, now) {
+  return latest && latest.at !== null ? Math.max(0, now - latest.at) : null;
 }
 
 // Whether it is to be grey. What does not age (`limit` null) is never old by itself.
-export function isOld(heard, now) {
-  if (!heard) return true;
-  if (heard.limit === null) return false;
-  return heard.at === null || now - heard.at > heard.limit;
+export function isOld(latest, now) {
+  if (!latest) return true;
+  if (latest.limit === null) return false;
+  return latest.at === null || now - latest.at > latest.limit;
 }
 
 // The age of a figure that was `ageThen` old when its message came.
-export function agedFurther(ageThen, heard, now) {
-  const since = ageOf(heard, now);
+export function agedFurther(ageThen, latest, now) {
+  const since = ageOf(latest, now);
   return ageThen === null || ageThen === undefined || since === null ? null : ageThen + since;
 }
 
@@ -37,7 +37,7 @@ export function sourceLimit(received, uptime) {
 export const SILENT_S = 3;
 
 // What is wrong with the way from the vehicle to this page, the nearest fault first; null: nothing.
-// `socket` open or not, `silent` s since a frame, `link` of the hub, `online` and `status` as heard.
+// `socket` open or not, `silent` s since a frame, `link` of the hub, `online` and `status` as latest.
 export function linkFault({ socket, silent, link, vehicle, online, status, now }) {
   if (!socket || silent > SILENT_S)
     return {

@@ -13,8 +13,8 @@ function showBanner(store) {
     silent: store.silent,
     link: store.link,
     vehicle: store.vehicle,
-    online: store.heard.online,
-    status: store.heard.status,
+    online: store.latest.online,
+    status: store.latest.status,
     now: store.now,
   });
   banner.hidden = fault === null;
@@ -82,7 +82,7 @@ export function showHeader(store) {
   const since = status ? sinceWhen(status, store) : "";
   put(
     byId("why"),
-    status ? [status.why, since].filter(Boolean).join(", ") : "Nothing has been heard yet",
+    status ? [status.why, since].filter(Boolean).join(", ") : "Nothing has been received yet",
   );
   mark(byId("why"), "old", lost);
   mark(todo, "old", lost);

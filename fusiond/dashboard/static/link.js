@@ -18,7 +18,7 @@ export class Socket {
       if (this.wanted) this.ask({ vehicle: this.wanted });
     };
     this.socket.onmessage = (event) => {
-      this.store.take(JSON.parse(event.data));
+      this.store.receive(JSON.parse(event.data));
       this.onFrame();
     };
     this.socket.onclose = () => {

@@ -64,10 +64,10 @@ function ages() {
   for (const card of document.querySelectorAll(".card[data-topic]")) {
     const topic = card.dataset.topic,
       lost = document.body.classList.contains("lost");
-    const heard = store.heard[topic];
-    mark(card, "stale", lost || !heard || store.old(topic));
+    const latest = store.latest[topic];
+    mark(card, "stale", lost || !latest || store.old(topic));
     const age = store.age(topic);
-    put(card.querySelector(".age"), !heard ? "" : age === null ? "from before" : stretch(age));
+    put(card.querySelector(".age"), !latest ? "" : age === null ? "from before" : stretch(age));
   }
 }
 

@@ -39,7 +39,7 @@ const MESSAGES = [
 // The power of each beam, and which of them serve.
 function beams(said) {
   const levels = said.levels.map((n, k) => (k + 1 === said.serving ? `[${n}]` : n)).join(" ");
-  if (!known(said.serving)) return `${levels}: none is heard`;
+  if (!known(said.serving)) return `${levels}: none is received`;
   const second = known(said.time_difference) ? `, with ${said.time_difference}` : "";
   return `${levels}: beam ${said.serving} serves${second}`;
 }

@@ -14,7 +14,6 @@ const HEAD = [
   ["received", "n wide-only"],
   ["used", "n"],
   ["refused", "n"],
-  ["why", "wide-only"],
 ];
 for (const [text, name] of HEAD) head.append(element("th", name, text));
 
@@ -63,14 +62,14 @@ const frequency = (hz) =>
 export function showSources(store) {
   const health = store.said("health");
   if (!health) return;
-  const heard = store.heard.health,
+  const latest = store.latest.health,
     uptime = (store.said("status") || {}).uptime_s;
   const rows = [];
   const sources = Object.entries(health.sources).sort((a, b) => derived(a[1]) - derived(b[1]));
   for (const [name, s] of sources) {
     const inside = derived(s);
-    const hz = heard.at === null ? null : rate(name, s, heard.at);
-    const seen = agedFurther(inside ? s.fused_age_s : s.age_s, heard, store.now);
+    const hz = latest.at === null ? null : rate(name, s, latest.at);
+    const seen = agedFurther(inside ? s.fused_age_s : s.age_s, latest, store.now);
     const old = seen !== null && !inside && seen > sourceLimit(s.received, uptime);
     const service = s.service && s.service !== "nominal" && s.state === "running" ? s.service : "";
     const state = service === "out" ? "left out" : service || (inside ? "derived" : s.state);
@@ -79,7 +78,7 @@ export function showSources(store) {
     const count = refused.count,
       why = wrong || refused.why,
       title = [wrong, refused.title].filter(Boolean).join("\n");
-    const used = agedFurther(s.fused_age_s, heard, store.now);
+    const used = agedFurther(s.fused_age_s, latest, store.now);
     const row = [
       { text: name, title: s.detail, className: inside ? "quiet" : "" },
       {
@@ -97,10 +96,14 @@ export function showSources(store) {
       { text: whole(s.received), className: "n wide-only" },
       { text: whole(s.fused), className: "n" },
       { text: count ? whole(count) : "\u2013", className: "n", title },
-      { text: why, className: "wide-only", title },
     ];
-    row.rowClass = old ? "old" : "";
+    row.rowClass = [old ? "old" : "", why ? "explained" : ""].filter(Boolean).join(" ");
     rows.push(row);
+    if (!why) continue;
+    // In a row of its own: a column of it would be cut on all but the widest screens.
+    const reason = [{ text: why, title, span: HEAD.length, className: wrong ? "warn" : "quiet" }];
+    reason.rowClass = old ? "reason-row old" : "reason-row";
+    rows.push(reason);
   }
   fillRows(body, rows);
 }

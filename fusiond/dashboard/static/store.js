@@ -21,12 +21,12 @@ export class Store {
   }
 
   clear() {
-    this.heard = {};
+    this.latest = {};
     this.rows = Object.fromEntries(Object.keys(MOST).map((kind) => [kind, []]));
     this.innovations = new Map(); // by source and instant: after a rewind an aid comes again
   }
 
-  take(frame) {
+  receive(frame) {
     if (frame.hello) {
       this.hello = frame.hello;
       return;
@@ -38,7 +38,7 @@ export class Store {
     this.refused = frame.refused;
     if (frame.vehicle !== this.vehicle || frame.first) this.clear();
     this.vehicle = frame.vehicle;
-    Object.assign(this.heard, frame.messages);
+    Object.assign(this.latest, frame.messages);
     for (const [kind, rows] of Object.entries(frame.rows)) this.append(kind, rows);
     if (frame.answers && frame.answers.length) this.answers = frame.answers;
   }
@@ -62,37 +62,37 @@ export class Store {
     return this.frame ? hubNow(this.frame, here()) : 0;
   }
 
-  // Seconds since the dashboard was heard; of this page's clock.
+  // Seconds since the dashboard was last heard; of this page's clock.
   get silent() {
     return here() - (this.frame ? this.frame.arrived : this.opened);
   }
 
   said(topic) {
-    const heard = this.heard[topic];
-    return heard ? heard.said : null;
+    const latest = this.latest[topic];
+    return latest ? latest.said : null;
   }
 
   // Where other vehicles are, the last of each card.
   get fleet() {
-    return Object.entries(this.heard)
+    return Object.entries(this.latest)
       .filter(([topic]) => topic.startsWith("fleet/"))
-      .map(([topic, heard]) => ({ ...heard.said, age: this.age(topic) }));
+      .map(([topic, latest]) => ({ ...latest.said, age: this.age(topic) }));
   }
 
   age(topic) {
-    return ageOf(this.heard[topic], this.now);
+    return ageOf(this.latest[topic], this.now);
   }
 
   old(topic) {
-    return isOld(this.heard[topic], this.now);
+    return isOld(this.latest[topic], this.now);
   }
 
   // UTC now in ms by the vehicle's own word; null while it knows none.
   get utcMs() {
     for (const topic of ["nav", "status", "health"]) {
-      const heard = this.heard[topic];
-      if (heard && heard.at !== null && typeof heard.said.t_ms === "number")
-        return heard.said.t_ms + 1000 * (this.now - heard.at);
+      const latest = this.latest[topic];
+      if (latest && latest.at !== null && typeof latest.said.t_ms === "number")
+        return latest.said.t_ms + 1000 * (this.now - latest.at);
     }
     return null;
   }

@@ -15,6 +15,7 @@ from typing import Any
 
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.derived_figures import TWO_SIDED_95, horizontal_rms_m, known, motion, usable
+from fusiond.outputs.geoid import sea_height
 from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 
@@ -71,9 +72,8 @@ def tpv(path: str, nav: NavMessage, geoid_separation_m: float | None) -> Report:
         return head | {"mode": _NO_FIX, "time": nav.t_utc}
     height = known(nav.height_m)
     known_height = height is not None and known(nav.sd_d_m) is not None
-    msl = None
-    if known_height and height is not None and geoid_separation_m is not None:
-        msl = round(height - geoid_separation_m, 4)
+    above_sea = sea_height(nav, geoid_separation_m)
+    msl = None if above_sea is None else round(above_sea.above_sea_m, 4)
     rms = horizontal_rms_m(nav)
     report = head | {
         "status": _STATUS[nav.mode],

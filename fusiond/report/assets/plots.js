@@ -57,7 +57,7 @@ function seriesOf(item) {
       stroke,
       width: 1.4,
       points: { show: columnsOf(item)[0].length < 60, size: 5 },
-      value: (u, v) => figure(v),
+      value: (u, v) => (v === null ? "" : figure(v)),
     };
     if (s.role === "bound")
       Object.assign(options, { dash: [5, 4], width: 1, points: { show: false }, class: "bound" });
@@ -168,7 +168,7 @@ function plot(item, run, pair, parent) {
       },
     ],
     series: [
-      { label: overTime ? "t" : item.x_label, value: (u, v) => (v === null ? "–" : overTime ? clock(v) : figure(v)) },
+      { label: overTime ? "t" : item.x_label, value: (u, v) => (v === null ? "" : overTime ? clock(v) : figure(v)) },
       ...seriesOf(item),
     ],
     cursor: { drag: { x: true, y: false } },

@@ -84,7 +84,7 @@ class ConvoyVehicle:
         self._behind_s = behind_s
         self._next_report_s, self._next_order_s = 5.0, 20.0
         self._orders = 0
-        ahead.carry = self._take
+        ahead.carry = self._receive
 
     def tick(self, t_s: float) -> None:
         """Say what is due."""
@@ -111,7 +111,7 @@ class ConvoyVehicle:
             math.degrees(math.atan2(east, north)) % 360.0,
         )
 
-    def _take(self, sender: int, message: TextRequest, t_s: float) -> None:
+    def _receive(self, sender: int, message: TextRequest, t_s: float) -> None:
         if message.receiver != self.CARD:
             return
         try:

@@ -109,7 +109,7 @@ class RdssTerminal:
         replies = self._queue[0][0] if self._queue else math.inf
         return min([replies, *(due for due, _, _ in self._periodic.values())])
 
-    def take(self, t_s: float) -> bytes:
+    def read(self, t_s: float) -> bytes:
         """Everything said until `t_s`, in order."""
         for name, (first, period, action) in list(self._periodic.items()):
             due = first

@@ -263,15 +263,19 @@ def draw(panels: Any, series: dict[str, Any]) -> None:
     for axis, values in zip(("east", "north", "up"), series["v_enu_m_s"], strict=True):
         second.plot(series["t_s"], values, label=axis)
     second.set_title("figure 2: velocity", loc="left")
-    second.set_ylabel("m/s")
+    second.set_ylabel("velocity, m/s")
     second.legend(fontsize="small")
     for panel, quantity in zip(others, ("position m", "velocity m/s", "heading deg"), strict=False):
         for name in ("ins_alone", "receiver", "tight_ukf"):
             values = np.array(series["rms"][name][quantity], dtype=np.float64)
             panel.plot(series["t_s"], values, label=name.replace("_", " "))
         panel.set_yscale("log")
-        panel.set_title(f"figure 4: error before and after, {quantity}", loc="left")
+        what, unit = quantity.split()
+        panel.set_title(f"figure 4: RMS of the {what}, before and after fusion", loc="left")
+        panel.set_ylabel(f"{what}, {unit}")
         panel.legend(fontsize="small")
     others[-1].set_visible(False)
+    for panel in (second, *others):
+        panel.set_xlabel("s")
     for panel in panels.ravel():
         panel.grid(alpha=0.3)

@@ -41,6 +41,7 @@ from fusiond.studies.bds_tight.runs import (
     in_stretch,
     monte_carlo,
 )
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.live_filter import DURATION_S
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 
@@ -330,6 +331,14 @@ def _text(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
+TITLES = {
+    "open": "open sky",
+    "canyon2": "street canyon, two satellites",
+    "canyon3": "street canyon, three satellites",
+    "canyon4": "street canyon, four satellites",
+}
+
+
 def plot(result: dict[str, Any], path: Path) -> None:
     """Horizontal RMS and mean NEES over time, one row a case, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
@@ -356,9 +365,9 @@ def plot(result: dict[str, Any], path: Path) -> None:
             ax.set_xlim(result["counted_from_s"], result["duration_s"])
             ax.set_xlabel("s")
             ax.grid(alpha=0.3)
-        axes[0].set_title(case, loc="left")
+        axes[0].set_title(TITLES[case], loc="left")
         axes[0].set_ylabel("horizontal RMS, m")
         axes[1].axhspan(low, high, alpha=0.15)
-        axes[1].set_ylabel(f"mean NEES, {result['nees_dof']} degrees")
+        axes[1].set_ylabel(f"mean NEES, {result['nees_dof']} degrees of freedom")
         axes[0].legend(fontsize="small")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

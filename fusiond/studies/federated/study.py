@@ -38,6 +38,7 @@ from fusiond.studies.federated.runs import (
     grid,
     monte_carlo,
 )
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, nees_interval, on_processes, step_counter
 
 Array = NDArray[np.float64]
@@ -278,6 +279,11 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
     return found
 
 
+def _experiment(key: str) -> str:
+    number, _, words = key.partition("_")
+    return f"experiment {number}: {words.replace('_', ' ')}"
+
+
 def plot(result: dict[str, Any], path: Path) -> None:
     """Experiments 1 to 4 as the paper's figures, and the courses of the faults, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
@@ -286,13 +292,13 @@ def plot(result: dict[str, Any], path: Path) -> None:
     axes = figure.subplots(7, 1)
     for panel, (key, live) in zip(axes[5:], result["without_imu"].items(), strict=True):
         _ways(panel, live["series"])
-        panel.set_title(f"experiment {key.replace('_', ' ')}, no inertial unit", loc="left")
+        panel.set_title(f"{_experiment(key)}, no inertial unit", loc="left")
     for panel, key in zip(axes[:2], ("1_random_truth", "2_constant_truth"), strict=True):
         for name, values in result["experiments"][key]["series"].items():
             panel.plot(values, linewidth=0.6 if name == "measured" else 1.6, label=name)
-        panel.set_title(f"experiment {key.replace('_', ' ')}", loc="left")
+        panel.set_title(_experiment(key), loc="left")
         panel.set_xlabel("step")
-        panel.set_ylabel("m")
+        panel.set_ylabel("state, m")
     for panel, fault in zip(axes[2:5], FAULTS, strict=True):
         for name, values in result["series"]["horizontal_rms_m"][fault].items():
             panel.plot(result["series"]["t_s"], values, label=name.replace("_", " "))
@@ -305,7 +311,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     for panel in axes:
         panel.grid(alpha=0.3)
         panel.legend(fontsize="small", ncols=5, loc="upper left")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
 
 
 def _ways(panel: Any, series: dict[str, Any]) -> None:

@@ -148,7 +148,7 @@ class Drawn:
 
     buffer: ImuBuffer
     drift: Array
-    aids: list[list[Linearised]]
+    measurements: list[list[Linearised]]
     model: Model
     start: Array
     sd: Array
@@ -168,7 +168,7 @@ def draw(case: Case, seed: int, number: int) -> Drawn:
     fixes = true[:, :2] + GPS_M * rng.standard_normal((len(t_s), 2)) / to_metres[:2]
     speeds = true[:, 3:5] + GPS_M_S * rng.standard_normal((len(t_s), 2))
     angles = rpy + TRACKER_RAD * rng.standard_normal(rpy.shape)
-    aids: list[list[Linearised]] = []
+    measurements: list[list[Linearised]] = []
     arm = (0.0, 0.0, 0.0)
     for t, (lat, lon), (n, e), (roll, pitch, yaw) in zip(
         np.rint(t_s * 1e9).astype(int).tolist(),
@@ -178,7 +178,7 @@ def draw(case: Case, seed: int, number: int) -> Drawn:
         strict=True,
     ):
         sd, sd_v, sd_a = (GPS_M,) * 3, (GPS_M_S,) * 2, (TRACKER_RAD,) * 3
-        aids.append(
+        measurements.append(
             [
                 PositionAid("gps", t, GATE, lat, lon, None, sd, arm),
                 VelocityAid("gps_velocity", t, GATE, (n, e), sd_v, arm),
@@ -192,7 +192,7 @@ def draw(case: Case, seed: int, number: int) -> Drawn:
     first = true_nav(flown, np.zeros(1))[0]
     start = with_error(first, rng.standard_normal(9) * sigma[:9])
     drift = out.gyro_bias[np.rint(t_s * RATE_HZ).astype(int) - 1]
-    return Drawn(buffer, drift, aids, model, start, sigma)
+    return Drawn(buffer, drift, measurements, model, start, sigma)
 
 
 def flown_imu(case: Case) -> Imu:
@@ -215,12 +215,12 @@ def fly(drawn: Drawn, make: Callable[[Model], Estimator]) -> Trace:
     count = len(true)
     trace = Trace(np.empty((count, 7)), np.empty((count, 7)), np.empty(count))
     slots = np.flatnonzero(drawn.model.active)
-    for k, aids in enumerate(drawn.aids):
-        estimator.propagate(drawn.buffer, aids[0].t_ns)
-        for aid in aids:
-            outcome = estimator.update(aid)
+    for k, measurements in enumerate(drawn.measurements):
+        estimator.propagate(drawn.buffer, measurements[0].t_ns)
+        for measurement in measurements:
+            outcome = estimator.update(measurement)
             if outcome.name != "fused":
-                raise RuntimeError(f"{aid.source} at {aid.t_ns} ns: {outcome.name}")
+                raise RuntimeError(f"{measurement.source} at {measurement.t_ns} ns: {outcome.name}")
         x = np.concatenate([nav_error(estimator.nav, true[k]), drawn.drift[k] - estimator.xi[9:]])
         x, p = x[slots], estimator.covariance[np.ix_(slots, slots)]
         trace.error[k], trace.sigma[k] = x[ALL], np.sqrt(np.diag(p))[ALL]
@@ -258,11 +258,11 @@ def times_per_step_us(case: Case, seed: int) -> dict[str, Spent]:
     for _ in range(TIMED_REPEATS):
         for name, make in filters().items():
             estimator, spent = begin(drawn, make), []
-            for aids in drawn.aids[:TIMED_S]:
+            for measurements in drawn.measurements[:TIMED_S]:
                 start = time.process_time_ns()
-                estimator.propagate(drawn.buffer, aids[0].t_ns)
-                for aid in aids:
-                    estimator.update(aid)
+                estimator.propagate(drawn.buffer, measurements[0].t_ns)
+                for measurement in measurements:
+                    estimator.update(measurement)
                 spent.append((time.process_time_ns() - start) * 1e-3)
             counted = np.array(spent[20:])
             median = float(np.median(counted))

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.multiscale.runs import (
     BIAS_MG,
@@ -319,7 +320,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
         axes.set_title(TITLES[case], loc="left")
         axes.legend(fontsize="small", ncols=3)
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
 
 
 def _velocities(panels: Any, series: dict[str, Any]) -> None:
@@ -331,7 +332,7 @@ def _velocities(panels: Any, series: dict[str, Any]) -> None:
             panels[number].plot(t_s, values, linewidth=0.9, label=axis)
         panels[number].set_ylim(-0.6, 0.6)  # the paper's greatest
         panels[number].set_title(f"figure {number + 1}: velocity error, {name}", loc="left")
-        panels[number].set_ylabel("m/s")
+        panels[number].set_ylabel("velocity error, m/s")
     for number, name in enumerate(names):
         for line, axis, values in zip(
             ("-", "--"), ("north", "east"), series["velocity"][name]["sigma_m_s"], strict=True
@@ -339,7 +340,8 @@ def _velocities(panels: Any, series: dict[str, Any]) -> None:
             panels[2].plot(t_s, values, line, color=f"C{number}", label=f"{name}, {axis}")
     panels[2].set_yscale("log")
     panels[2].set_title("figure 3: sigma of the velocity that each states", loc="left")
-    panels[2].set_ylabel("m/s")
+    panels[2].set_ylabel("sigma, m/s")
     for panel in panels:
+        panel.set_xlabel("s")
         panel.legend(fontsize="small", ncols=2)
         panel.grid(alpha=0.3)

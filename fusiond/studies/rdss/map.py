@@ -28,6 +28,7 @@ from fusiond.navigation.earth import (
     meridian_radius,
     transverse_radius,
 )
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress
 
 SATELLITE_M = 8.0
@@ -343,4 +344,4 @@ def plot(result: dict[str, Any], path: Path) -> None:
         f"slant ranges {result['sd_range_m']:.1f} m each, height {result['sd_height_m']:.0f} m. "
         f"Grey: a satellite below {result['elevation_mask_deg']:.0f} deg."
     )
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

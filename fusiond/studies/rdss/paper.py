@@ -88,12 +88,14 @@ def draw(panels: Any, result: dict[str, Any]) -> None:
             first.plot(run["t_s"], values, label=axis)
         first.set_title("figure 1: position error of run 0", loc="left")
         first.set_xlabel("s")
-        first.set_ylabel("m")
+        first.set_ylabel("error, m")
     for axis, values in zip(("latitude", "longitude"), run["innovations"], strict=True):
         second.plot(values[:55], label=axis)
     second.axhspan(-1.96, 1.96, alpha=0.1)
     number = 4 if moves else 2
-    second.set_title(f"figure {number}: innovations of 55 steps in sigma", loc="left")
+    second.set_title(f"figure {number}: innovations of 55 steps", loc="left")
+    second.set_xlabel("step")
+    second.set_ylabel("innovation, sigma")
     for panel in panels:
         panel.legend(fontsize="small")
         panel.grid(alpha=0.3)

@@ -251,11 +251,11 @@ class Navigation:
         t_ns, seen_ns = (round(t[k] * 1e9) for t in (fixes.t_s, fixes.arrival_s))
         lat, lon = (float(x) for x in fixes.position[k])
         fix = DelayedFix("rdss", seen_ns, MonotonicStamp(t_ns), lat, lon, YANTAI_DEG_M[2], CLASS_M)
-        aids = self._intake.aids(fix, t_ns, 0.0, seen_ns)
-        if isinstance(aids, str):
-            raise ValueError(f"fix refused: {aids}")
-        for aid in aids:
-            self.timeline.insert(aid)
+        found = self._intake.aids(fix, t_ns, 0.0, seen_ns)
+        if isinstance(found, str):
+            raise ValueError(f"fix refused: {found}")
+        for measurement in found:
+            self.timeline.insert(measurement)
         self.timeline.run()
 
     def nees(self, true: Array, biases: Array) -> tuple[float, float]:

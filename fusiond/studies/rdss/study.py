@@ -23,6 +23,7 @@ import numpy as np
 from scipy.stats import norm
 
 from fusiond.integrity.consistency import LAGS, Consistency, judge
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.rdss import paper
 from fusiond.studies.rdss.runs import (
@@ -287,4 +288,4 @@ def plot(result: dict[str, Any], path: Path) -> None:
         )
         axes.legend(fontsize="small", ncols=3)
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

@@ -97,7 +97,7 @@ def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
     nav = flight.true_nav(flight.truth(float(LIVE_S)))[1]
     scene = flight.scenes(float(LIVE_S), all_in_view)[0]
     state = State(nav, np.zeros(of.size), np.zeros(STEP_SIZE), of)
-    _, rows, r = flight.rows(flight.aids(scene, np.zeros(scene.rows)), state)
+    _, rows, r = flight.rows(flight.measurements(scene, np.zeros(scene.rows)), state)
     step, c = level_step(nav), np.zeros(COEFFICIENTS)
     h = 1.0 / IMU_RATE_HZ
     coefficients(nav, step, h, c)
@@ -141,10 +141,10 @@ def _live_second(of: Model, all_in_view: bool) -> Callable[[], float]:
     def timed() -> float:
         estimator = started(of, nav[0])
         start = time.process_time_ns()
-        for aids in given:
-            estimator.propagate(buffer, aids[0].t_ns)
-            for aid in aids:
-                estimator.update(aid)
+        for measurements in given:
+            estimator.propagate(buffer, measurements[0].t_ns)
+            for measurement in measurements:
+                estimator.update(measurement)
         return (time.process_time_ns() - start) * 1e-9 / len(given)
 
     return timed

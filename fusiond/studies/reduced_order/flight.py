@@ -164,7 +164,7 @@ class Scene(NamedTuple):
         return np.concatenate([drawn[self.at, 0], drawn[self.at, 1], drawn[-1]])
 
 
-Aids = tuple[PseudorangeAid, BearingAid]
+Measurements = tuple[PseudorangeAid, BearingAid]
 DRAWN = len(list(beidou_slots())) + 1
 """Pairs of noise an epoch: range and rate of each satellite, then azimuth and elevation."""
 
@@ -201,7 +201,7 @@ def _point(nav: Array, k: int) -> Vector3:
     return (float(nav[0, 0] + aside / meridian_radius(nav[0, 0])), float(lon), 0.0)
 
 
-def aids(scene: Scene, values: Array) -> Aids:
+def measurements(scene: Scene, values: Array) -> Measurements:
     """The epoch's aids with measured `values` (rows,): ranges, rates, azimuth, elevation."""
     n = len(scene.names)
     ranges = PseudorangeAid(
@@ -234,9 +234,9 @@ def aids(scene: Scene, values: Array) -> Aids:
     return ranges, bearing
 
 
-def rows(of: Aids, state: State) -> Innovation:
+def rows(of: Measurements, state: State) -> Innovation:
     """The rows of both aids, one below the other."""
-    found = [aid.innovation(state) for aid in of]
+    found = [measurement.innovation(state) for measurement in of]
     refused = [f.outcome for f in found if isinstance(f, NotApplicable)]
     if refused:
         raise ValueError(f"a measurement of the flight does not apply: {refused}")
@@ -244,10 +244,12 @@ def rows(of: Aids, state: State) -> Innovation:
     return Innovation(np.concatenate(z), np.vstack(h), np.concatenate(r))
 
 
-def measured(scene: Scene, true: State, noise: Array) -> Aids:
+def measured(scene: Scene, true: State, noise: Array) -> Measurements:
     """Measurement in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
-    z, _, r = rows(aids(scene, np.zeros(scene.rows)), true)  # of measured zeros: what is predicted
-    return aids(scene, z + np.sqrt(r) * noise)
+    z, _, r = rows(
+        measurements(scene, np.zeros(scene.rows)), true
+    )  # of measured zeros: what is predicted
+    return measurements(scene, z + np.sqrt(r) * noise)
 
 
 def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
@@ -285,5 +287,5 @@ def systems(of: Model, seconds: float) -> Iterator[System]:
     for k, scene in enumerate(scenes(seconds)):
         phi, q = transitions.over_a_second(buffer, nav[k], k)
         state = State(nav[k + 1], xi, transitions.step, of)
-        _, h, r = rows(aids(scene, np.zeros(scene.rows)), state)
+        _, h, r = rows(measurements(scene, np.zeros(scene.rows)), state)
         yield System(phi, q, h, r)

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.reduced_order.flight import ARC_SECOND
 
 Array = NDArray[np.float64]
 
 EAST_NORTH_UP = [1, 0, 2]
 AXES = ("E", "N", "U")
+AXIS_NAMES = {"E": "east", "N": "north", "U": "up"}
 HEADER = ["", *(f'phi {a} "' for a in AXES), *(f"dV {a} m/s" for a in AXES), "us/step"]
 KEYS = ("attitude_sigma_arcsec", "velocity_sigma_m_s")
 BELIEVED = ("believed_attitude_sigma_arcsec", "believed_velocity_sigma_m_s")
@@ -98,11 +100,15 @@ def picture(series: dict[str, Any], path: Path) -> None:
             for number, of in enumerate(PAPER["models"].values()):
                 panel.axhline(of[key][row], color=f"C{number}", linewidth=0.8, linestyle=":")
             panel.set_yscale("log")
-            panel.set_ylabel(f"{axis}, {unit}")
+            panel.set_ylabel(f"{AXIS_NAMES[axis]}, {unit}")
             panel.grid(alpha=0.3)
-    axes[0, 0].set_title("attitude, one sigma", loc="left")
-    axes[0, 1].set_title("velocity: dashed what is believed, dotted the paper's", loc="left")
+    axes[0, 0].set_title(
+        "attitude, one sigma: true, believed (dashed), the paper's (dotted)", loc="left"
+    )
+    axes[0, 1].set_title(
+        "velocity, one sigma: true, believed (dashed), the paper's (dotted)", loc="left"
+    )
     axes[0, 1].legend(fontsize="small")
     for panel in axes[2]:
         panel.set_xlabel("s")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

@@ -38,7 +38,7 @@ def found(seconds: float = flight.DURATION_S) -> dict[str, Any]:
     phi, _ = transitions.over_a_second(buffer, nav[0], 0)
     scene = flight.scenes(flight.CHOICE_S)[0]
     state = State(nav[1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
-    _, h, r = flight.rows(flight.aids(scene, np.zeros(scene.rows)), state)
+    _, h, r = flight.rows(flight.measurements(scene, np.zeros(scene.rows)), state)
     names, sd = state_names(of), flight.initial_sd(of)
     out: dict[str, Any] = {}
     for case, rows in (("gnss", slice(0, -2)), ("gnss_sar", slice(None))):

@@ -79,7 +79,7 @@ def fly(
     clock = _clock(rng, xi[_clock_slots(true_model)], len(scenes))
     noise = rng.standard_normal((len(scenes), flight.DRAWN, 2))
 
-    def given() -> Iterator[flight.Aids]:
+    def given() -> Iterator[flight.Measurements]:
         for k, scene in enumerate(scenes):
             xi[_clock_slots(true_model)] = clock[k]
             true = State(nav[k + 1], xi, np.zeros(STEP_SIZE), true_model)
@@ -109,7 +109,7 @@ def fly(
 def live(
     filters: Iterable[KalmanEstimator],
     samples: Array,
-    given: Iterable[flight.Aids],
+    given: Iterable[flight.Measurements],
     rate_hz: float = flight.IMU.rate_hz,
 ) -> Iterator[int]:
     """Fly started filters on the daemon's timeline; yields the seconds flown, after each.
@@ -125,11 +125,11 @@ def live(
         timelines.append(Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S))
         timelines[-1].diagnosis = Trusting()
         timelines[-1].start()
-    for k, aids in enumerate(given):
+    for k, measurements in enumerate(given):
         second = slice(k * count, (k + 1) * count)
         for timeline in timelines:
             timeline.imu.append(times[second], samples[second])
-            entries = [timeline.insert(aid) for aid in aids]
+            entries = [timeline.insert(measurement) for measurement in measurements]
             timeline.run()
             for entry in entries:
                 if entry.outcome is None or entry.outcome.name != "fused":

@@ -307,7 +307,7 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
     """Run `number` of a problem: every filter on the same errors."""
     rng = np.random.default_rng([seed, number])
     samples = drive_samples(IMU, rng)
-    aids, epoch_sd_m = _pseudoranges(rng, number) if problem.clock else _double_star(rng)
+    measurements, epoch_sd_m = _pseudoranges(rng, number) if problem.clock else _double_star(rng)
     model = _model(problem)
     sd = model.initial.copy()
     horizontal, height, velocity, tilt, heading = problem.start
@@ -321,8 +321,8 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
         estimator = live.estimator
         if isinstance(estimator, InvariantFilter):
             estimator.turns = True
-        off, nees, first = np.empty(len(aids)), [], math.nan
-        for k, epoch in enumerate(aids):
+        off, nees, first = np.empty(len(measurements)), [], math.nan
+        for k, epoch in enumerate(measurements):
             live.advance((k + 1) * problem.every_s, epoch)
             x = nav_error(estimator.nav, nav[k + 1])
             off[k] = math.hypot(x[6], x[7])

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.live_filter import DURATION_S
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.ukf.runs import (
@@ -145,6 +146,15 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
     return [(title, header, rows)]
 
 
+TITLES = {
+    "double_star": "double-star fixes",
+    "double_star_poor": "double-star fixes, poor start",
+    "pseudorange": "pseudoranges",
+    "pseudorange_poor": "pseudoranges, poor start",
+    "pseudorange_heading": "pseudoranges, heading unknown",
+}
+
+
 def plot(result: dict[str, Any], path: Path) -> None:
     """Horizontal RMS and mean NEES over time, one row a problem, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
@@ -166,11 +176,11 @@ def plot(result: dict[str, Any], path: Path) -> None:
             axes[1].plot(s["nees_t_s"], s["nees_mean"][label], **style)
         axes[0].set_yscale("log")
         axes[0].set_ylabel("horizontal RMS, m")
-        axes[0].set_title(name.replace("_", " "), loc="left")
+        axes[0].set_title(TITLES[name], loc="left")
         axes[1].axhspan(low, high, alpha=0.15)
-        axes[1].set_ylabel("mean NEES, 9 degrees")
+        axes[1].set_ylabel("mean NEES, 9 degrees of freedom")
         for ax in axes:
             ax.set_xlabel("s")
             ax.grid(alpha=0.3)
         axes[0].legend(fontsize="small")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

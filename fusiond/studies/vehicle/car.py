@@ -11,7 +11,7 @@ Every block of fusiond.models.vehicle has a true value of its own in each run:
     barometer_*           the pressure, as fusiond.simulation.barometer has it
 
 Sensors are those of `fusiond simulate`; measurements go through the daemon's own intake, so that
-blocks, sigmas and aids are those of the configuration.
+blocks, sigmas and measurements are those of the configuration.
 """
 
 from __future__ import annotations
@@ -117,12 +117,12 @@ class SlippingAid(NonHolonomicAid):
 
 @dataclass(frozen=True, slots=True)
 class Car:
-    """One run: IMU samples (n, 6), body axes; aids in order; what each block truly is at the end;
-    and the mounting as a matrix (3, 3), from the IMU's axes to the car's."""
+    """One run: IMU samples (n, 6), body axes; measurements in order; the true value of each block
+    at the end; and the mounting as a matrix (3, 3), from the IMU's axes to the car's."""
 
     truth: Truth
     samples: Array
-    aids: list[Aid]
+    measurements: list[Aid]
     true: dict[str, Array]
     turn: Array
 
@@ -150,15 +150,15 @@ def draw_car(config: Config, path: Path, seconds: float, rng: np.random.Generato
     measured += _fixes(config, truth, turn, true, rng)
     measured += _speeds(wheel, truth, true, rng)
     measured += _pressures(config.aiding["barometer"], truth, true, rng)
-    aids: list[Aid] = []
+    measurements: list[Aid] = []
     for m in measured:
         assert isinstance(m.stamp, MonotonicStamp)
         found = intake.aids(m, m.stamp.t_ns, 0.0)
         assert not isinstance(found, str), found
-        aids += found
-    aids += _slips(config, truth, true, rng)
-    aids.sort(key=lambda aid: aid.t_ns)
-    return Car(truth, np.hstack([sensed.gyro, sensed.accel]), aids, true, turn)
+        measurements += found
+    measurements += _slips(config, truth, true, rng)
+    measurements.sort(key=lambda each: each.t_ns)
+    return Car(truth, np.hstack([sensed.gyro, sensed.accel]), measurements, true, turn)
 
 
 def _walk(n: int, step_s: float, sd: float, walk: float, rng: np.random.Generator) -> Array:

@@ -104,8 +104,8 @@ def _drive(
     )
     buffer.append(times, car.samples)
     outcomes = Counter[str]()
-    for aid in car.aids:
-        estimator.propagate(buffer, aid.t_ns)
-        outcomes[f"{aid.source} {estimator.update(aid).name}"] += 1
+    for measurement in car.measurements:
+        estimator.propagate(buffer, measurement.t_ns)
+        outcomes[f"{measurement.source} {estimator.update(measurement).name}"] += 1
     estimator.propagate(buffer, math.floor(seconds * 1e9))
     return outcomes

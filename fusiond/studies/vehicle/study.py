@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, nees_interval, on_processes, step_counter
 from fusiond.studies.vehicle.car import configuration
 from fusiond.studies.vehicle.runs import Run, run_once
@@ -103,4 +104,4 @@ def plot(result: dict[str, Any], path: Path) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("NEES a degree of freedom")
     axes.legend()
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

@@ -30,8 +30,8 @@ from drivers.measurements import (
     KernelStamp,
     Measurement,
 )
-from fusiond.simulation.can.aids import SIM_SAR, SIM_STAR
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from fusiond.simulation.can.sensors import SIM_SAR, SIM_STAR
 from tests.patience import until
 
 SECOND = 1_000_000_000

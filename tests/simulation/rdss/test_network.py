@@ -49,7 +49,7 @@ class Pair:
         self.terminals[card].receive(self.codec.encode(message), t_s)
 
     def hear(self, card: int, until_s: float) -> list[Message]:
-        said = self.terminals[card].take(until_s)
+        said = self.terminals[card].read(until_s)
         heard: list[Message] = self.codec.Decoder().feed(said)
         return heard
 
@@ -133,7 +133,7 @@ def test_the_other_vehicle_reports_orders_and_confirms(truth: Truth) -> None:
     )
     for k in range(60):
         convoy.tick(float(k))
-    texts = [m for m in binary_4_0.Decoder().feed(terminal.take(70.0)) if isinstance(m, Text)]
+    texts = [m for m in binary_4_0.Decoder().feed(terminal.read(70.0)) if isinstance(m, Text)]
     found = [opened(Wording(t.payload, t.encoding, t.odd)) for t in texts]
     reports = [decode_report(e.kind, e.body) for e in found if e is not None and e.kind == REPORT]
     assert len(reports) == 6

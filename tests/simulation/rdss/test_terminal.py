@@ -59,7 +59,7 @@ class Host:
         """Everything the terminal says until then, each with its instant."""
         heard: list[tuple[float, Message]] = []
         while (due := self.terminal.next_s) <= until_s:
-            heard += [(due, m) for m in self._decoder.feed(self.terminal.take(due))]
+            heard += [(due, m) for m in self._decoder.feed(self.terminal.read(due))]
         return heard
 
 
@@ -299,7 +299,7 @@ def test_the_request_cycle_of_the_driver_is_satisfied(truth: Truth, family: Fami
         said_ns = min(host.terminal.next_s * 1e9, 1e12)
         now_ns = max(now_ns, round(min(deadline, said_ns)) + 1)
         actions = []
-        for message in decoder.feed(host.terminal.take(now_ns * 1e-9)):
+        for message in decoder.feed(host.terminal.read(now_ns * 1e-9)):
             actions += cycle.received(message, now_ns, family)
         actions += cycle.tick(now_ns)
         host.terminal.suppressed = 100e9 < now_ns < 130e9
@@ -345,6 +345,6 @@ def test_the_same_seed_gives_the_same_terminal(truth: Truth) -> None:
         terminal = RdssTerminal(truth, options, np.random.default_rng(9), UTC_START_NS)
         for k in range(10):
             terminal.receive(binary_4_0.encode(PositionRequest()), 11.0 * k)
-        said.append(terminal.take(300.0))
+        said.append(terminal.read(300.0))
     assert said[0] == said[1]
     assert len(said[0]) > 10 * 47

@@ -101,7 +101,7 @@ BEARING_COLUMNS = (
 """Columns of bearing.csv and their decimals."""
 
 
-def aid_streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+def sensor_streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Generators for star tracker and radar, independent of the other devices'."""
     star, sar = (np.random.SeedSequence(seed, spawn_key=(100 + k,)) for k in range(2))
     return np.random.default_rng(star), np.random.default_rng(sar)
@@ -228,11 +228,11 @@ def _earth_fixed(lat: Array, lon: Array, height: Array) -> Array:
     return np.column_stack((across * np.cos(lon), across * np.sin(lon), polar))
 
 
-def aid_tables(
+def sensor_tables(
     truth: Truth, star: StarTrackerOptions | None, sar: SarOptions | None, seed: int
 ) -> dict[str, tuple[tuple[tuple[str, int], ...], Array]]:
     """Columns and rows of attitude.csv and bearing.csv, of what is on board."""
-    star_rng, sar_rng = aid_streams(seed)
+    star_rng, sar_rng = sensor_streams(seed)
     tables = {}
     if star is not None:
         tables["attitude"] = (ATTITUDE_COLUMNS, StarTracker(truth, star, star_rng).rows)

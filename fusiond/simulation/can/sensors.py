@@ -14,12 +14,12 @@ from drivers.can.aids import (
 from drivers.can.decoder import CanDecoder
 from drivers.can.height import CanHeightOptions
 from drivers.can.python_can import can
-from fusiond.simulation.aid_sensors import (
+from fusiond.simulation.aiding_sensors import (
     SarOptions,
     SarRadar,
     StarTracker,
     StarTrackerOptions,
-    aid_streams,
+    sensor_streams,
 )
 from fusiond.simulation.barometer import BarometerOptions
 from fusiond.simulation.can.encoder import CanEncoder
@@ -60,7 +60,7 @@ SIM_BAROMETER = CanHeightOptions(
 """The simulation's own devices: `config/dbc/fusiond_sim_aids.dbc`, 1.3 arcsec a step."""
 
 
-class CanAid:
+class CanSensor:
     """One sensor's epochs, sent on the bus as their time comes; it has the bus for itself."""
 
     def __init__(
@@ -110,20 +110,20 @@ class CanAid:
                     counters[f"{self.name}_lost"] += 1
 
 
-def can_aids(
+def can_sensors(
     truth: Truth,
     star: StarTrackerOptions | None,
     sar: SarOptions | None,
     seed: int,
     bus: tuple[str, str],
-) -> dict[str, CanAid]:
+) -> dict[str, CanSensor]:
     """The devices on board, by name (`star_tracker`, `sar`), on the bus (interface, channel)."""
-    star_rng, sar_rng = aid_streams(seed)
+    star_rng, sar_rng = sensor_streams(seed)
     devices = {}
     if star is not None:
         tracker, decoder = StarTracker(truth, star, star_rng), CanAttitudeDecoder("star", SIM_STAR)
-        devices["star_tracker"] = CanAid("star_tracker", tracker, decoder, bus)
+        devices["star_tracker"] = CanSensor("star_tracker", tracker, decoder, bus)
     if sar is not None:
         radar = SarRadar(truth, sar, sar_rng)
-        devices["sar"] = CanAid("sar", radar, CanBearingDecoder("sar", SIM_SAR), bus)
+        devices["sar"] = CanSensor("sar", radar, CanBearingDecoder("sar", SIM_SAR), bus)
     return devices

@@ -20,12 +20,12 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 
-RATE_HZ, AIDS_HZ = 200.0, 10.0
-LATE_S = 10.0
+RATE_HZ, FIXES_HZ = 200.0, 10.0
+DELAY_S = 10.0
 AT_S, EVERY_S = 110.0, 1.0
 """Delay of the first fix after the start, and how long the drive then goes on until the next
 does."""
-SAMPLES, TICK_SAMPLES = round(RATE_HZ / AIDS_HZ), round(RATE_HZ / 100.0)
+SAMPLES, TICK_SAMPLES = round(RATE_HZ / FIXES_HZ), round(RATE_HZ / 100.0)
 
 
 class Drive:
@@ -34,7 +34,7 @@ class Drive:
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
         imu = CAR_IMU.model_copy(update={"rate_hz": RATE_HZ})
-        scenario = replace(scenario, imu=imu, gnss=replace(scenario.gnss, rate_hz=AIDS_HZ))
+        scenario = replace(scenario, imu=imu, gnss=replace(scenario.gnss, rate_hz=FIXES_HZ))
         self._truth = scenario.truth(AT_S + (repetitions + 1) * EVERY_S)
         rng = np.random.default_rng(1)
         output = scenario.imu_output(self._truth, rng)
@@ -46,10 +46,10 @@ class Drive:
         self._navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
         self._row = 0
 
-    def late(self, number: int) -> Callable[[], int]:
+    def delayed(self, number: int) -> Callable[[], int]:
         """Drive on to the next late fix; the work is the tick in which it comes."""
         self.go_on(AT_S + number * EVERY_S)
-        row = self._row - round(LATE_S * RATE_HZ)
+        row = self._row - round(DELAY_S * RATE_HZ)
         lat, lon, height = self._truth.at(self._truth.t_s[1 + row : 2 + row]).position[0].tolist()
         at, now = int(self._times[row]), int(self._times[self._row - 1])
         fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
@@ -117,7 +117,7 @@ class Drive:
         self._navigator.add(speed, t_ns)
 
 
-def late_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:
+def delayed_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:
     """Works of one drive, each the tick of a late fix; asked for in turn."""
     drive, numbers = Drive(repetitions), count()
-    return lambda _: drive.late(next(numbers))
+    return lambda _: drive.delayed(next(numbers))

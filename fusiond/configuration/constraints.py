@@ -1,0 +1,58 @@
+"""Sections `[constraints.*]`: what the motion of the vehicle itself tells, without a sensor."""
+
+from __future__ import annotations
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from fusiond.configuration.aiding import Section, Vector
+
+
+class ZeroVelocity(Section):
+    """Stationary detector: zero velocity and zero rate while the sensor is quiet."""
+
+    enabled: bool = True
+    window_s: PositiveFloat = 1.0
+    """Samples judged together, on a fixed grid of time."""
+    gyro_sd_deg_s: PositiveFloat = 0.5
+    """Quiet below this standard deviation on every axis; twice what standing with the engine
+    on shows."""
+    accel_sd_m_s2: PositiveFloat = 0.15
+    """The same for specific force."""
+    max_rate_deg_s: PositiveFloat = 2.0
+    """Quiet below this mean rate, beyond three sigma of the gyro's bias."""
+    max_speed_m_s: PositiveFloat = 0.5
+    """A quiet sensor means standstill only below this computed speed."""
+    velocity_sd_m_s: PositiveFloat = 0.05
+    """One sigma of the velocity at rest."""
+    rate_sd_deg_s: PositiveFloat = 0.1
+    """Largest rate of a standing vehicle."""
+    interval_s: PositiveFloat = 0.5
+
+
+class NonHolonomic(Section):
+    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point; see
+    `docs/vehicle.md`."""
+
+    enabled: bool = False
+    sd_m_s: PositiveFloat = 0.2
+    """Sideways, of what is new in each interval."""
+    sd_down_m_s: PositiveFloat = 0.5
+    """Downwards: heave and pitch of the suspension, which last for seconds."""
+    drift_sd_m_s: NonNegativeFloat = 0.1
+    """Sideways, of what lasts (slip angle, a road's crown): one sigma of a state; 0: none."""
+    drift_s: PositiveFloat = 5.0
+    """Correlation time of that drift."""
+    mounting_sd_deg: NonNegativeFloat = 5.0
+    """One sigma of pitch and yaw of the IMU against the vehicle beyond `imu.mounting_deg`, which
+    the filter estimates. 0: the mounting is as measured."""
+    min_speed_m_s: NonNegativeFloat = 2.0
+    interval_s: PositiveFloat = 0.1
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """From the IMU to the point that does not slide (the rear axle)."""
+    lever_arm_sd_m: NonNegativeFloat = 1.0
+    """One sigma of what its forward part is wrong by, which the filter estimates. 0: nothing."""
+
+
+class Constraints(Section):
+    zero_velocity: ZeroVelocity = Field(default_factory=ZeroVelocity.unsaid)
+    non_holonomic: NonHolonomic = Field(default_factory=NonHolonomic.unsaid)
