@@ -61,7 +61,7 @@ START_SD_M = 1000.0
 MOST_REMEMBERED = 128
 
 
-class _Heard:
+class _Received:
     """An aid that has come, and where the vehicle is by it alone: asked for once."""
 
     __slots__ = ("_asked", "_position", "aid")
@@ -108,8 +108,8 @@ class WithoutImu:
         self.estimator: Estimator | None = None
         """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
-        self._recent: deque[_Heard] = deque(maxlen=MOST_REMEMBERED)
-        self._way = WayFaced(_slips_m_s(config.constraints.non_holonomic))
+        self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
+        self._headings = WayFaced(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None
         self._silent_ns = 0
         self._located_ns = 0
@@ -122,13 +122,13 @@ class WithoutImu:
 
     def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
         """Aids have come at `seen_ns`."""
-        self._recent.extend(map(_Heard, aids))
+        self._recent.extend(map(_Received, aids))
         if self._first_ns is None and aids:
             self._first_ns = seen_ns or aids[0].t_ns
-        for aid in aids if self._way.known else ():
+        for aid in aids if self._headings.known else ():
             for candidate in aid.candidates() if not aid.locates else ():
                 if isinstance(candidate, HeadingCandidate):
-                    self._way.hear(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
+                    self._headings.add(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
         if self.estimator is not None:
             for aid in aids:
                 self._insert(aid)
@@ -137,8 +137,8 @@ class WithoutImu:
         """True if no inertial unit navigates at `t_ns`, nor will with its next sample."""
         return not imu.end or (t_ns - imu.latest_ns) * 1e-9 > BEARABLE_GAP_S
 
-    def told(self, aid: Aid, t_ns: int) -> str | None:
-        """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
+    def set_position(self, aid: Aid, t_ns: int) -> str | None:
+        """Use an operator's position at `t_ns`: its outcome, or None where a start waits for it."""
         if self.estimator is None:
             self.hear([aid], t_ns)
             return None
@@ -238,16 +238,16 @@ class WithoutImu:
         estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
         self._timeline.start()
         self.estimator = estimator
-        for heard in self._recent:
-            if heard.aid.t_ns >= fix.t_ns:
-                self._insert(heard.aid)
+        for received in self._recent:
+            if received.aid.t_ns >= fix.t_ns:
+                self._insert(received.aid)
         self._event(
             "without_imu",
             "no inertial unit: position and velocity by fixes and a constant velocity, no attitude",
         )
 
     def _insert(self, aid: Aid) -> Entry | None:
-        level = aid.unturned(self._way)
+        level = aid.unturned(self._headings)
         return None if level is None else self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:

@@ -177,7 +177,7 @@ class Guests:
 
 
 class ServerQueue:
-    """What one server has to do: descriptors of its own, and pieces of work."""
+    """Work of one server: descriptors of its own, and pieces that wait for a turn."""
 
     def __init__(self, guests: Guests) -> None:
         self._guests = guests

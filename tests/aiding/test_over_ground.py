@@ -62,7 +62,7 @@ def state(forward_m_s: float, sd_m_s: float = SD_M_S, xi: np.ndarray | None = No
 def way(*headings: Faced) -> WayFaced:
     found = WayFaced(0.2)
     for heading in headings:
-        found.hear(heading)
+        found.add(heading)
     return found
 
 
