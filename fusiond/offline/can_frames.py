@@ -37,6 +37,7 @@ from fusiond.offline.can_text import (
 )
 
 FORMATS = (".log", ".asc", ".blf", ".trc", ".mf4")
+_GZIP = b"\x1f\x8b"
 _TOLD = 20
 """Refusals that are kept in words; of the others the number."""
 _STRAY = 1000
@@ -120,10 +121,12 @@ def channels(path: Path) -> set[Any]:
 class _Log(NamedTuple):
     path: Path
     suffix: str
-    zipped: bool
 
     def open(self) -> BinaryIO:
-        opened = gzip.open if self.zipped else open
+        """Unpacked where it is a gzip file, whatever it is called."""
+        with self.path.open("rb") as file:
+            zipped = file.read(len(_GZIP)) == _GZIP
+        opened = gzip.open if zipped else open
         return cast(BinaryIO, opened(self.path, "rb"))
 
 
@@ -134,7 +137,7 @@ def _format(path: Path) -> _Log:
     suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
     if suffix not in FORMATS or (zipped and suffix == ".mf4"):
         raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
-    return _Log(path, suffix, zipped)
+    return _Log(path, suffix)
 
 
 def _channel_words(path: Path) -> Iterator[str | int]:

@@ -117,17 +117,21 @@ class TextLines:
 
 
 def _decoded(stream: BinaryIO) -> BinaryIO:
-    """The bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`)."""
+    """The bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`), and with
+    line ends that are one, where it has carriage returns alone."""
     try:
-        first = stream.read(2)
-        if first not in _BOMS:
+        first = stream.read(LONGEST)
+        encoding = _BOMS.get(first[:2])
+        if encoding is None and (b"\r" not in first or b"\n" in first):
             stream.seek(0)
             return stream
         whole = first + stream.read()
     except (EOFError, zlib.error, gzip.BadGzipFile):
         stream.seek(0)  # the first line will say so
         return stream
-    return io.BytesIO(whole.decode(_BOMS[first], "replace").encode())
+    if encoding is not None:
+        return io.BytesIO(whole.decode(encoding, "replace").encode())
+    return io.BytesIO(whole.replace(b"\r", b"\n"))
 
 
 # --------------------------------------------------------------------------- candump

@@ -138,3 +138,22 @@ def test_what_a_shell_of_windows_made_of_it(encoding: str, tmp_path: Path) -> No
     found, refused, _ = read(path)
     same(found, FRAMES)
     assert refused.all() == []
+
+
+@pytest.mark.parametrize("name", ["bus.log", "bus.log.gz"])
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_log_is_unpacked_by_what_it_is(name: str, zipped: bool, tmp_path: Path) -> None:
+    path = tmp_path / name
+    data = "\n".join(candump(FRAMES)).encode()
+    path.write_bytes(gzip.compress(data) if zipped else data)
+    found, refused, _ = read(path)
+    same(found, FRAMES)
+    assert refused.all() == []
+
+
+def test_carriage_returns_alone_end_lines(tmp_path: Path) -> None:
+    path = tmp_path / "bus.log"
+    path.write_bytes("\r".join(candump(FRAMES)).encode())
+    found, refused, _ = read(path)
+    same(found, FRAMES)
+    assert refused.all() == []
