@@ -31,8 +31,8 @@ REST_S = 60
 """The scenario `drive` stands for that long first."""
 KERNEL = """
 import numpy as np
-from fusiond.navigation.rotation import quaternion_from_rpy
-print(quaternion_from_rpy(0.1, -0.2, 2.5).tobytes().hex())
+from fusiond.navigation.rotation import rotation_vector_to_quaternion
+print(np.array(rotation_vector_to_quaternion(0.1, -0.2, 2.5)).tobytes().hex())
 """
 IMPORTS = """
 import platform
@@ -122,7 +122,7 @@ def check_kernel() -> None:
     here, there = output([sys.executable, "-c", KERNEL], None), emulated(["-c", KERNEL])
     if here != there:
         sys.exit(f"arm: a kernel gives {there.strip()}, on this machine {here.strip()}")
-    say(f"quaternion_from_rpy gives the same 32 bytes: {there.strip()[:16]}...")
+    say(f"rotation_vector_to_quaternion gives the same 32 bytes: {there.strip()[:16]}...")
 
 
 def check_drive() -> None:

@@ -25,7 +25,7 @@ from fusiond.live.chain import Chain
 from fusiond.live.front import Front
 from fusiond.live.journal import handler
 from fusiond.live.message_keeper import MessageKeeper
-from fusiond.live.process_usage import release_compiler_pages
+from fusiond.live.process_usage import release_compiler_memory
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
@@ -302,7 +302,7 @@ def run(
             for load in missing:  # links them; compiles here what could not be kept on disk
                 load()
         daemon = Daemon(config, front=front)
-        release_compiler_pages()
+        release_compiler_memory()
         reloading = asyncio.create_task(daemon.reload_when(again, read), name="reload")
         await daemon.run(stop)
         await _cancel(reloading)

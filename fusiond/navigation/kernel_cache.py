@@ -37,6 +37,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
+from weakref import WeakSet
 
 from llvmlite.binding import ObjectFileRef, add_symbol, get_host_cpu_features, parse_bitcode
 from numba.core.caching import NullCache
@@ -59,6 +60,9 @@ _known_environment: Any = lookup_environment
 _host_features: Any = get_host_cpu_features
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
+_BITCODE = 3
+"""Place of the bitcode in what a file holds (`_kept`)."""
+_libraries: WeakSet[_Linked] = WeakSet()
 
 
 # What an x86-64 processor of a level has (x86-64 psABI, 3.1.1), by LLVM's names; that of aarch64's
@@ -128,8 +132,9 @@ class KernelCache(NullCache):
         path = self._folder / self.file_name
         kept = _sound(path, _discard)
         if kept is None and self.shipped is not None:
-            kept = _sound(self.shipped, _leave)
-        return None if kept is None else _linked(target, *pickle.loads(kept))
+            path = self.shipped
+            kept = _sound(path, _leave)
+        return None if kept is None else _linked(target, path, *pickle.loads(kept))
 
     def save_overload(self, _signature: object, data: Any) -> None:
         """Write what was compiled; where that fails it is compiled again at the next start."""
@@ -223,10 +228,12 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
 class _Linked(_Library):  # type: ignore[misc]
     """A kernel from its file: native code now, bitcode when one that is compiled calls it."""
 
-    def __init__(self, codegen: Any, name: str, native: bytes, bitcode: bytes) -> None:
+    def __init__(self, codegen: Any, name: str, path: Path, native: bytes, bitcode: bytes) -> None:
         _initialise_library(self, codegen, name)
         self._linking_libraries: list[Any] = []
-        self._bitcode = bitcode
+        self._path = path
+        self._bitcode: bytes | None = bitcode
+        _libraries.add(self)
         self._shared_module: Any = None
         self._finalized = True
         codegen._engine._ee.add_object_file(_object_file(native))
@@ -234,13 +241,32 @@ class _Linked(_Library):  # type: ignore[misc]
 
     def _get_module_for_linking(self) -> Any:
         if self._shared_module is None:
-            self._shared_module = _parse_bitcode(zlib.decompress(self._bitcode))
+            self._shared_module = _parse_bitcode(zlib.decompress(self._compressed()))
             self._codegen._engine._load_defined_symbols(self._shared_module)
         return self._shared_module
+
+    def _compressed(self) -> bytes:
+        if self._bitcode is None:
+            kept = _sound(self._path, _leave)
+            if kept is None:
+                raise FileNotFoundError(f"{self._path} is gone: start again")
+            self._bitcode = pickle.loads(kept)[_BITCODE]
+        return self._bitcode
+
+    def release(self) -> None:
+        self._bitcode = None
+
+
+def release_bitcode() -> None:
+    """Let go of the bitcode of all kernels that are linked, 7 MB: for a process that has linked
+    what it needs and compiles nothing more. One that does so reads it again."""
+    for library in _libraries:
+        library.release()
 
 
 def _linked(
     target: Any,
+    path: Path,
     name: str,
     function: Any,
     native: bytes,
@@ -253,7 +279,7 @@ def _linked(
     for initialise in initialisers:
         initialise()
     codegen = target.codegen()
-    library = _Linked(codegen, name, native, bitcode)
+    library = _Linked(codegen, name, path, native, bitcode)
     codegen._engine._defined_symbols |= {
         function.llvm_func_name,
         function.llvm_cpython_wrapper_name,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.live import process_usage
-from fusiond.live.process_usage import ProcessUsage, release_compiler_pages
+from fusiond.live.process_usage import ProcessUsage, release_compiler_memory
 
 
 def test_process_usage() -> None:
@@ -30,24 +30,27 @@ def test_a_figure_that_the_kernel_does_not_show_is_missing(
     if content is not None:
         (tmp_path / "statm").write_text(content)
     monkeypatch.setattr(process_usage, "STATM", tmp_path / "statm")
-    monkeypatch.setattr(process_usage, "MAPS", tmp_path / "maps")
+    monkeypatch.setattr(process_usage, "SMAPS", tmp_path / "smaps")
     percent, resident_mb = ProcessUsage().sample()
     assert math.isfinite(percent)
     assert resident_mb is None
-    release_compiler_pages()
+    release_compiler_memory()
 
 
-def test_the_compiler_gives_its_pages_back_and_still_works() -> None:
-    """In a process of its own, since this one may have compiled anything."""
+def test_the_compiler_gives_its_memory_back_and_still_works() -> None:
+    """In a process of its own, since this one may have compiled anything. A kernel whose bitcode
+    went is inlined into one that is compiled afterwards."""
     script = """
 import numba
-from fusiond.navigation.rotation import quaternion_from_rpy
-from fusiond.live.process_usage import ProcessUsage, release_compiler_pages
+from fusiond.navigation.rotation import rotation_vector_to_quaternion as turned
+from fusiond.live.process_usage import ProcessUsage, release_compiler_memory
+turned(0.1, 0.2, 0.3)  # links it
 before = ProcessUsage().sample()[1]
-release_compiler_pages()
+release_compiler_memory()
 after = ProcessUsage().sample()[1]
-assert after < before - 20.0, (before, after)
-assert abs(quaternion_from_rpy(0.0, 0.0, 0.0)[0] - 1.0) < 1e-15
+assert after < before - 30.0, (before, after)
+assert abs(turned(0.0, 0.0, 0.0)[0] - 1.0) < 1e-15
 assert numba.njit(lambda x: x * 2.0 + 1.0)(3.0) == 7.0
+assert numba.njit(lambda: turned(0.0, 0.0, 0.0)[0] + 1.0)() == 2.0
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
