@@ -65,8 +65,8 @@ _NOTHING = 1e18
 """Share of a filter whose noise counts nothing."""
 _VELOCITY = slice(DV, DV + 3)
 _OF_SENSORS = np.array([1, 0, 1, 0, 1, 2])
-"""The axis of a velocity, forward, right or down, that shows the noise of a gyro (x, y, z) and of an
-accelerometer: gravity goes forward with a pitch and to the right with a roll."""
+"""The axis of a velocity, forward, right or down, that shows the noise of a gyro (x, y, z) and of
+an accelerometer: gravity goes forward with a pitch and to the right with a roll."""
 
 
 class _Predictor(KalmanEstimator):
@@ -102,8 +102,8 @@ class NoiseShares:
 
     @property
     def shown(self) -> tuple[float, tuple[float, ...]]:
-        """How many predictions have been judged, and the log likelihoods of `GRID` of each axis, for
-        the next start."""
+        """How many predictions have been judged, and the log likelihoods of `GRID` of each axis,
+        for the next start."""
         log = self._log - self._log.max(axis=1, keepdims=True)
         return self._count, tuple(log.ravel().tolist())
 
