@@ -90,6 +90,10 @@ FAR_SIGMAS = 4.0
     _FAR, _FAR_ACROSS, _FAR_SPEEDS, _WHITE, _COUNT,
     _NEAR, _NEAR_ACROSS, _NEAR_SPEEDS, _WALKS, _ALIKE, _STEPS, _KEPT, _SINCE, _MEAN,
 ) = range(24)  # fmt: skip
+SHOWN = _KEPT - _FAR
+"""Numbers of what fixes have shown: sums, of which a share counts as so much less of it."""
+MOST_SHOWN = 1e9
+"""A receiver that is a kilometre off has shown nothing of its noise; nor are its sums kept."""
 _POINT = 8
 _POINTS = _MEAN + _POINT
 _T, _U, _V, _OF_WALK, _OF_VARIANCE, _OF = 0, 1, 3, 5, 6, 7
@@ -326,6 +330,16 @@ class FixErrors:
         while len(known) > 1 and known[1][0] <= known[-1][0] - 2 * SETTLES_NS:
             known.popleft()
         return next((shares for at, shares in reversed(known) if at <= settled), known[0][1])
+
+    @property
+    def shown(self) -> tuple[float, ...]:
+        """Sums (`SHOWN`,) of all that has settled, for the next start."""
+        return tuple(np.clip(self._packed[_FAR:_KEPT], -MOST_SHOWN, MOST_SHOWN).tolist())
+
+    def take_up(self, shown: tuple[float, ...]) -> None:
+        """Begin with what another drive has shown."""
+        self._packed[_FAR:_KEPT] = shown
+        self._known = deque([(_BEFORE_ALL_NS, self._now())])
 
     def _now(self) -> Shares:
         _shares(self._packed, self._offset_sd_s, self._wanders, self._found)

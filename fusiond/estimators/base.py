@@ -255,6 +255,11 @@ class ErrorStateFilter:
         self.published = published
         self._memory.published[:] = published
 
+    def axes_known(self, sd_rad: float) -> None:
+        """From now on the axes of the unit in use are known to that."""
+        self.published = self.published._replace(axes_sd_rad=sd_rad)
+        self._memory.published[:] = self.published
+
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
         self.t_ns, self.sample = t_ns, sample

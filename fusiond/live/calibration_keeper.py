@@ -6,8 +6,10 @@ import asyncio
 import logging
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
+from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.state_keeper import state_file
@@ -39,12 +41,14 @@ class CalibrationKeeper:
     def __init__(
         self,
         config: Config,
+        clock: Clock,
         on_event: Callable[[str, str], None],
         environ: Mapping[str, str] = os.environ,
     ) -> None:
         beside = state_file(config, environ)
         self._path = None if beside is None else beside.with_suffix(".calibration.json")
         self._digest = mounting_digest(config)
+        self._clock = clock
         self._event = on_event
         self._due = Every(SAVE_EVERY_S * SECOND_NS)
         self._working: asyncio.Task[None] | None = None
@@ -54,14 +58,17 @@ class CalibrationKeeper:
         if self._path is None:
             return
         try:
-            navigator.calibration = load_calibration(self._path, navigator.model, self._digest)
+            found = load_calibration(self._path, navigator.model, self._digest)
         except DamagedStateError as error:
             self._event("calibration_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
         except RefusedStateError as error:
             self._event("calibration_refused", f"{self._path}: {error}")
         else:
-            found = navigator.calibration.values if navigator.calibration else ()
-            log.info("%s: %s", self._path, ", ".join(found) or "no saved calibration")
+            if found is not None and found.noise is not None:
+                found = replace(found, noise=found.noise.at(self._utc_s()))
+            navigator.calibration = found
+            names = found.names if found is not None else ()
+            log.info("%s: %s", self._path, ", ".join(names) or "no saved calibration")
 
     def keep(self, t_ns: int, navigator: Navigator) -> None:
         """Renew the file, if it is due and something has been observed."""
@@ -85,7 +92,12 @@ class CalibrationKeeper:
         spare = published_of_spare(navigator.estimator, navigator.config.imu)
         if navigator.started is None or navigator.on_trial or spare:
             return None
-        return saved_calibration(navigator.calibrating.parameters, self._digest)
+        noise = navigator.shown_noise(self._utc_s())
+        return saved_calibration(navigator.calibrating.parameters, self._digest, noise)
+
+    def _utc_s(self) -> float | None:
+        utc_ns = self._clock.utc_ns(self._clock.now_ns())
+        return None if utc_ns is None else utc_ns * 1e-9
 
 
 def _write(path: Path, saved: SavedCalibration) -> None:

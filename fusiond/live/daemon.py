@@ -78,7 +78,7 @@ class Daemon:
         navigator_event = partial(self._events.report, "navigator")
         self._state = StateKeeper(config, self.clock, navigator_event)
         self._warm = WarmKeeper(config, self.clock, navigator_event)
-        self._calibration = CalibrationKeeper(config, navigator_event)
+        self._calibration = CalibrationKeeper(config, self.clock, navigator_event)
         self._messages = MessageKeeper(config, self.clock, partial(self._events.report, "messages"))
         recording_event = partial(self._events.report, "recording")
         self.recorder = Recorder(config, self.clock, recording_event)

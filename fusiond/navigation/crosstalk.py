@@ -36,8 +36,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.from_instants import FromInstants
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 
 BEND_RAD = 0.5 * math.pi
 """Theta: a street corner."""
@@ -101,8 +103,14 @@ class Crosstalk:
             0.5 * square * WITHIN_FIXES_M_S,
         )
         self._mean = np.zeros(13)
+        self.squares = FromInstants()
+        """By what factor (1,) m^2 is another, as the unit has shown (fusiond.navigator.unit_grade)."""
 
-    def follow(self, samples: Array, densities: Array) -> None:
-        """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) to
-        `densities` (m, 6)."""
-        _follow(samples, self._gain, self._slow_gain, *self._times, self._mean, densities)
+    def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
+        """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) at `times`
+        (m,) ns to `densities` (m, 6)."""
+        found = np.zeros_like(densities)
+        _follow(samples, self._gain, self._slow_gain, *self._times, self._mean, found)
+        for rows, square in self.squares.rows(times):
+            found[rows] *= square
+        densities += found

@@ -131,7 +131,7 @@ class ImuBuffer:
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
         self._allocate(capacity)
-        self._vibration, self._crosstalk = vibration, crosstalk
+        self.vibration, self.crosstalk = vibration, crosstalk
         self.start = 0
         self.end = 0
         self.latest_ns = 0
@@ -282,12 +282,12 @@ class ImuBuffer:
         rows = slice(self.end, self.end + count)
         self.times[rows] = times
         np.matmul(samples, self._turn, out=self.samples[rows])
-        if self._vibration is not None:
-            self._vibration.follow(self.samples[rows], self.densities[rows])
+        if self.vibration is not None:
+            self.vibration.follow(times, self.samples[rows], self.densities[rows])
         else:
             self.densities[rows] = 0.0
-        if self._crosstalk is not None:
-            self._crosstalk.follow(self.samples[rows], self.densities[rows])
+        if self.crosstalk is not None:
+            self.crosstalk.follow(times, self.samples[rows], self.densities[rows])
         self.nav[rows] = np.nan
         self.end += count
         self._head[END] = self.end

@@ -38,6 +38,7 @@ from fusiond.navigator.assembly import (
 from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
+from fusiond.navigator.imu_noise import ImuNoise
 from fusiond.navigator.imu_screening import ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
@@ -46,6 +47,7 @@ from fusiond.navigator.motion_constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.protection import NO_BOUND, ProtectionWatch
 from fusiond.navigator.published_solution import publish_by_own_clock, solution_of
 from fusiond.navigator.reasons import reason
+from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.source_status import SourceService
@@ -107,6 +109,7 @@ class Navigator:
         self._service_events = ServiceEvents(self.timeline, self._event)
         self.service = SourceService(self.timeline, names)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
+        self._imu_noise = ImuNoise(self.model, imu)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self.without_imu = WithoutImu(
@@ -117,8 +120,7 @@ class Navigator:
         self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
-        self.calibration: SavedCalibration | None = None
-        """Calibration of an earlier drive, taken up by each alignment until it is refuted."""
+        self._calibration: SavedCalibration | None = None
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._latency = LatencySearch(
             alignment_options(config), self._noise, self.model, self._event
@@ -133,6 +135,22 @@ class Navigator:
         return Aligner(options, self._noise, self.model, self._saved, self._event)
 
     # ------------------------------------------------------------------ arrivals
+
+    @property
+    def calibration(self) -> SavedCalibration | None:
+        """Calibration of an earlier drive, taken up by each alignment until it is refuted."""
+        return self._calibration
+
+    @calibration.setter
+    def calibration(self, saved: SavedCalibration | None) -> None:
+        self._calibration = saved
+        if saved is not None and (noise := saved.noise) is not None:
+            self._intake.take_up(noise.fixes)
+            self._imu_noise.take_up(self.imu, noise.predictions, noise.shares)
+
+    def shown_noise(self, utc_s: float | None) -> SavedNoise:
+        """What receivers and the inertial unit have shown of theirs until that time (POSIX)."""
+        return SavedNoise(utc_s, self._intake.fixes_shown, *self._imu_noise.shown)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
@@ -160,6 +178,7 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._screening.change()
         self._units.change()
+        self._imu_noise.change()
         self.calibrating.restart()  # of the first unit
         publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
@@ -217,6 +236,7 @@ class Navigator:
         self._latency.stop()
         self.timeline.clear()
         self._protection.restart()
+        self._imu_noise.restart()
         self.started, self._saved, self.warm = None, saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
@@ -290,6 +310,7 @@ class Navigator:
             return
         if self._protection.watches:
             self._protection.tell()
+        self._imu_noise.look(self.timeline, self.imu)
         if e.t_ns >= self.calibrating.due_ns or self.calibrating.turned:
             self._calibrate()
 

@@ -40,6 +40,7 @@ from fusiond.navigator.calibration import (
     Parameter,
     calibration_slots,
 )
+from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import STRICT
 from fusiond.navigator.state_file import (
     DamagedStateError,
@@ -81,11 +82,18 @@ Sigma = Annotated[float, Field(gt=0.0, le=1e3)]
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedCalibration:
     """Value and one sigma of each observed parameter by its published name; `configuration` is the
-    digest of what they lie beyond. Raises pydantic's `ValidationError` for what is none."""
+    digest of what they lie beyond; and what was shown of noise. Raises pydantic's `ValidationError`
+    for what is none."""
 
     configuration: Annotated[str, Field(max_length=64)]
     values: Annotated[dict[Name, tuple[Value, Sigma]], Field(max_length=64)]
+    noise: SavedNoise | None = None
     version: Literal[1] = 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters, and fixes whose errors are known."""
+        return (*self.values, *(self.noise.fixes if self.noise is not None else ()))
 
     def taken_up(self, start: Start, model: Model) -> Start:
         """The start with these parameters: their sigma is that of then and what may have
@@ -137,12 +145,14 @@ def mounting_digest(config: Config) -> str:
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def saved_calibration(parameters: Iterable[Parameter], digest: str) -> SavedCalibration | None:
+def saved_calibration(
+    parameters: Iterable[Parameter], digest: str, noise: SavedNoise | None = None
+) -> SavedCalibration | None:
     """Part of a calibration to save: all that has been observed; None for nothing."""
     values = {
         p.name: (p.value, p.sd) for p in parameters if p.state is not CalibrationState.NOT_OBSERVED
     }
-    return SavedCalibration(digest, values) if values else None
+    return SavedCalibration(digest, values, noise) if values or noise is not None else None
 
 
 def save_calibration(path: Path, saved: SavedCalibration) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.navigator.navigator import Navigator
@@ -30,7 +31,9 @@ def offered(config: Config) -> tuple[SavedCalibration | None, list[str]]:
     """What a navigator of that configuration takes up, and the events."""
     events: list[str] = []
     navigator = Navigator(config)
-    CalibrationKeeper(config, lambda code, text: events.append(code)).restore_into(navigator)
+    CalibrationKeeper(config, Clock(config.clock), lambda code, text: events.append(code)).restore_into(
+        navigator
+    )
     return navigator.calibration, events
 
 
@@ -85,7 +88,7 @@ def test_what_is_no_calibration_is_put_aside(tmp_path: Path, damage: dict[str, A
 
 async def test_nothing_is_kept_before_it_navigates(tmp_path: Path) -> None:
     config = vehicle(tmp_path)
-    keeper = CalibrationKeeper(config, lambda code, text: None)
+    keeper = CalibrationKeeper(config, Clock(config.clock), lambda code, text: None)
     navigator = Navigator(config)
     keeper.keep(1, navigator)
     await keeper.close(navigator)

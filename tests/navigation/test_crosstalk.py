@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fusiond.navigation.crosstalk import STOP_M_S, Crosstalk
 
@@ -14,10 +15,15 @@ MISALIGNED = math.radians(0.2)
 REST = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -G], (6000, 1))
 
 
+def stamps(samples: np.ndarray) -> NDArray[np.int64]:
+    return np.arange(len(samples)) * round(PERIOD_S * 1e9)
+
+
 def densities(samples: np.ndarray, misalignment: float = MISALIGNED) -> np.ndarray:
     """After each of `samples`, behind two minutes at rest."""
     out = np.zeros((len(REST) + len(samples), 6))
-    Crosstalk(PERIOD_S, misalignment).follow(np.vstack((REST, samples)), out)
+    said = np.vstack((REST, samples))
+    Crosstalk(PERIOD_S, misalignment).follow(stamps(said), said, out)
     return out[len(REST) :]
 
 
@@ -78,7 +84,7 @@ def test_a_bias_is_no_motion_and_square_axes_have_no_noise() -> None:
     biased = REST.copy()
     biased[:, :3] = 0.01
     out = np.zeros_like(biased)
-    Crosstalk(PERIOD_S, MISALIGNED).follow(biased, out)
+    Crosstalk(PERIOD_S, MISALIGNED).follow(stamps(biased), biased, out)
     assert out.max() < 1e-9 * G
     assert not densities(turning(2, 0.4, 4.0), 0.0).any()
 
@@ -87,8 +93,8 @@ def test_pieces_are_as_the_whole() -> None:
     rng = np.random.default_rng(3)
     samples = REST + rng.normal(0.0, 0.3, REST.shape)
     whole, parts = np.zeros_like(samples), np.zeros_like(samples)
-    Crosstalk(PERIOD_S, MISALIGNED).follow(samples, whole)
-    in_parts = Crosstalk(PERIOD_S, MISALIGNED)
+    Crosstalk(PERIOD_S, MISALIGNED).follow(stamps(samples), samples, whole)
+    in_parts, times = Crosstalk(PERIOD_S, MISALIGNED), stamps(samples)
     for begin, end in ((0, 1), (1, 700), (700, len(samples))):
-        in_parts.follow(samples[begin:end], parts[begin:end])
+        in_parts.follow(times[begin:end], samples[begin:end], parts[begin:end])
     assert np.array_equal(whole, parts)

@@ -22,13 +22,17 @@ def _noise(rate_hz: float, seconds: float, seed: int) -> Array:
     return rng.standard_normal((round(seconds * rate_hz), 6)) * np.sqrt(SHEET * rate_hz)
 
 
-def _densities(samples: Array, rate_hz: float, at_once: int = 10**6) -> Array:
+def _densities(
+    samples: Array, rate_hz: float, at_once: int = 10**6, shares: tuple[tuple[int, float], ...] = ()
+) -> Array:
     """After each of the samples (n, 6), of the sheet's (1), handed over so many at once."""
     vibration = Vibration(1.0 / rate_hz, RATE_NOISE, FORCE_NOISE)
-    found = np.zeros_like(samples)
+    for since_ns, share in shares:
+        vibration.shares.add(since_ns, np.full(6, share))
+    found, times = np.zeros_like(samples), np.arange(len(samples)) * round(1e9 / rate_hz)
     for first in range(0, len(samples), at_once):
         part = slice(first, first + at_once)
-        vibration.follow(samples[part], found[part])
+        vibration.follow(times[part], samples[part], found[part])
     densities: Array = found / SHEET
     return densities
 
@@ -78,3 +82,15 @@ def test_parts_of_a_second_may_come_in_any_number() -> None:
     assert whole.max() > 1000.0
     for at_once in (1, 7, 64):
         assert _densities(samples, 100.0, at_once).tobytes() == whole.tobytes()
+
+
+def test_a_share_counts_from_its_instant_on_and_never_less_than_the_sheet() -> None:
+    """A hundred times the sheet's density: a tenth of it is ten, a thousandth the sheet's own."""
+    samples = 10.0 * _noise(100.0, 40.0, 9)
+    shares = ((20_000_000_000, 0.1), (30_000_000_000, 0.001))
+    whole = 1.0 + _densities(samples, 100.0)
+    for at_once in (10**6, 7):
+        found = 1.0 + _densities(samples, 100.0, at_once, shares)
+        assert (found[:2000] == whole[:2000]).all()
+        assert found[2000:3000] == pytest.approx(0.1 * whole[2000:3000])
+        assert (found[3000:] == 1.0).all()

@@ -28,7 +28,7 @@ from fusiond.navigator.intake import (
     rdss,
     wheel,
 )
-from fusiond.navigator.intake.kind import Instants, Kind, Sections
+from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
 from fusiond.navigator.intake.pace import Pace
 from fusiond.navigator.intake.plausible import refusal
 
@@ -89,6 +89,15 @@ class Intake:
                     return found
                 return [replace(aid, robust=True) for aid in found]
         return "not_an_aid"
+
+    @property
+    def fixes_shown(self) -> dict[str, tuple[float, ...]]:
+        """What each receiver's fixes have shown of their errors, for the next start."""
+        return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
+
+    def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
+        """Let receivers that have not been heard begin with that."""
+        self._sections.fixes_shown = fixes_shown
 
     def extra_blocks(self) -> list[Block]:
         """Blocks that the aids need in the model beside its own blocks: errors that successive

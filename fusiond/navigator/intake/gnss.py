@@ -24,7 +24,7 @@ from fusiond.models.vehicle import (
     fix_wander,
     time_offset,
 )
-from fusiond.navigator.intake.kind import Instants, Kind, Sections
+from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
 from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
 
 # Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
@@ -254,6 +254,8 @@ def _shares(
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
         known = sections.fix_errors[m.source, by_phase] = FixErrors(offset_sd_s, not by_phase)
+        if shown := sections.fixes_shown.get(shown_as(m.source, by_phase)):
+            known.take_up(shown)
     if motion is None:
         return None
     (north, east, *_), sds = motion

@@ -35,6 +35,11 @@ def raw_receivers(aiding: Mapping[str, AnyAiding]) -> dict[str, RawGnss]:
     return {name: RawGnss(name, section) for name, section in raw.items()}
 
 
+def shown_as(source: str, by_phase: bool) -> str:
+    """Name of the fixes of a receiver that err alike."""
+    return f"{source} by {'phase' if by_phase else 'code'}"
+
+
 class Sections:
     """The configuration's `[aiding.NAME]` by source name; `receivers` are those whose raw data are
     the aid, not their fixes."""
@@ -48,6 +53,8 @@ class Sections:
         """Receivers and the qualities under which they have stated a sigma of code."""
         self.fix_errors: dict[tuple[str, bool], FixErrors] = {}
         """Of each receiver whose fixes share an error, by code or by phase."""
+        self.fixes_shown: Mapping[str, tuple[float, ...]] = {}
+        """What another drive has shown of them, by `shown_as`."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())

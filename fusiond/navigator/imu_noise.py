@@ -1,0 +1,88 @@
+"""What an inertial unit shows of its noise while it navigates, and what of it counts.
+
+Which share of what the samples show is noise (fusiond.navigator.noise_share), and how good the unit
+is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was
+`SETTLES_NS` ago, on a grid of time, and count for samples `COUNTS_NS` later: neither the order in
+which measurements come nor how many samples at once leaves a trace.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.aiding.fix_errors import SETTLES_NS
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import DEG
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.models.model import Model
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.noise_share import COUNTS_NS, EVERY_NS, NoiseShares
+from fusiond.navigator.timeline import Timeline
+from fusiond.navigator.unit_grade import UnitGrade
+
+STEP_NS = 1_000_000_000
+"""A prediction is carried on by so much at a time: no tick carries the whole of it."""
+
+
+class ImuNoise:
+    """Watches the filter of a configuration."""
+
+    def __init__(self, model: Model, imu: Imu) -> None:
+        self._shares = NoiseShares(model, imu.gap_s)
+        of_class = imu.sensor_class is not None and imu.misalignment_deg > 0.0
+        self._grade = UnitGrade(model) if of_class else None
+        self._axes_sd_rad = imu.misalignment_deg * DEG
+        self._cell = self._at_ns = -1
+
+    @property
+    def shown(self) -> tuple[float, tuple[float, ...]]:
+        """For the next start."""
+        return self._shares.shown
+
+    def take_up(
+        self, imu: ImuBuffer, predictions: float, log_likelihoods: tuple[float, ...]
+    ) -> None:
+        """Begin with what another drive has shown, before any sample has come."""
+        shares = self._shares.take_up(predictions, log_likelihoods)
+        if imu.vibration is not None:
+            imu.vibration.shares.add(0, shares)
+
+    def restart(self) -> None:
+        """The filter has been started anew."""
+        self._shares.restart()
+        self._cell = self._at_ns = -1
+
+    def change(self) -> None:
+        """The samples from now on are a spare's: nothing tells how good the one or the other is."""
+        self.restart()
+        self._grade = None
+
+    def look(self, timeline: Timeline, imu: ImuBuffer) -> None:
+        """The filter has been run."""
+        settled_ns = timeline.estimator.t_ns - SETTLES_NS
+        cell, vibration = settled_ns // STEP_NS, imu.vibration
+        if cell == self._cell or vibration is None:
+            return
+        self._cell = cell
+        at_ns = settled_ns // EVERY_NS * EVERY_NS
+        self._shares.carry(imu, at_ns if at_ns > self._at_ns else cell * STEP_NS)
+        if at_ns == self._at_ns:
+            return
+        self._at_ns = at_ns
+        if at_ns < timeline.oldest_ns:
+            self._shares.restart()
+            return
+        with timeline.past(at_ns):
+            e = timeline.estimator
+            shares = self._shares.end(e)
+            grade = 1.0 if self._grade is None else self._grade.of(e.xi, e.covariance)
+            if vibration.shaken:
+                self._shares.begin(e)
+        if shares is not None:
+            vibration.shares.add(at_ns + COUNTS_NS, shares)
+        if self._grade is not None and imu.crosstalk is not None:
+            imu.crosstalk.squares.add(at_ns + COUNTS_NS, np.array([grade]))
+            if isinstance(timeline.estimator, KalmanEstimator):
+                timeline.estimator.axes_known(math.sqrt(grade) * self._axes_sd_rad)

@@ -1,0 +1,178 @@
+r"""Share of the noise in IMU samples that attitude and velocity integrate: predictions, judged.
+
+What engine and road shake into the samples bounds the noise of a sensor (fusiond.navigation.
+vibration). A part of it is motion that the sensors measure, and vibration that averages out later
+than the longest of those means; neither the samples nor the innovations of one fix after another
+say how much, for a filter that follows its fixes hides it. So another filter carries the state on
+for `EVERY_NS` without any aid. With A its covariance then if the samples had no noise at all, A + B
+with the noise as it counts, and P of the filter, which has had the aids,
+
+    d = v_predicted - v,   var(d) = A + (g / g_0) B - P,        P' - P of estimates that are optimal
+
+g the share of the noise that counts and g_0 the one that has, forward, to the right and down each:
+a pitch gyro's shows forward, and road and springs pitch a vehicle otherwise than they roll it. The
+likelihood is summed up over predictions, none of which overlaps another, on a grid of g, each as
+likely at first as the next (nobody knows the size of it); E[g] is what counts. Noise of the data
+sheet counts in any case.
+
+A prediction tells nothing where the filter itself had no aids: P is no less than `KNOWN` of A + B
+then. It is made of what was valid `SETTLES_NS` ago, when nothing comes any more that is earlier, so
+that the order of arrival leaves no trace.
+
+Source: Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15
+(1970), for predictions over several steps; Magill, Optimal adaptive estimation of sampled
+stochastic processes, IEEE Trans. AC 10 (1965), for the weights of a grid of models.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.fix_errors import SETTLES_NS
+from fusiond.estimators.base import Estimator
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.models.model import Model
+from fusiond.navigation.error_model import DV, PHI
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.strapdown import Q0, VN
+
+Array = NDArray[np.float64]
+
+EVERY_NS = 10_000_000_000
+"""Length of a prediction. After ten seconds the noise of a shaken gyro is most of what a velocity
+is wrong by."""
+COUNTS_NS = SETTLES_NS + EVERY_NS
+"""From so long after a prediction ends what it has shown counts for the samples: when it is judged
+many of them may have come, and one share counts for the whole of another prediction."""
+GRID: Final = 2.0 ** -np.arange(0.0, 10.5, 0.5)
+"""Shares of the density: all of it, down to a thirtieth of the sigma."""
+KNOWN = 0.25
+"""Share of a predicted variance: no more may be left of the velocity's with aids."""
+HEADING_SD_RAD = math.radians(5.0)
+"""Beyond it what a velocity is wrong by is no linear function of the heading."""
+FORGETS = 60.0
+"""Predictions, ten minutes of them: streets and loads change."""
+FIRST = 2.0
+"""How many predictions it counts that all is noise, before any has been judged: a filter that has
+once been too sure of its tilt stays so."""
+RARE = 25.0
+"""Five sigma: what is beyond is no noise."""
+_NOTHING = 1e18
+"""Share of a filter whose noise counts nothing."""
+_VELOCITY = slice(DV, DV + 3)
+_OF_SENSORS = np.array([1, 0, 1, 0, 1, 2])
+"""The axis of a velocity, forward, right or down, that shows the noise of a gyro (x, y, z) and of
+an accelerometer: gravity goes forward with a pitch and to the right with a roll."""
+
+
+class _Predictor(KalmanEstimator):
+    """Two covariances along one state: without noise, and with the noise that counts."""
+
+    def __init__(self, model: Model, gap_s: float) -> None:
+        super().__init__(model, gap_s, (_NOTHING, 1.0))
+
+    def begin(self, e: Estimator) -> None:
+        """From another's state on."""
+        self.initialise(e.t_ns, e.sample, e.nav, e.xi, e.covariance)
+        self.step[:] = e.state.step
+        n = self.model.size
+        self._covs[:, :n, :n] = e.covariance
+
+    @property
+    def of_velocity(self) -> Array:
+        """Covariance of the velocity without noise and with it (2, 3, 3)."""
+        return self._covs[:, _VELOCITY, _VELOCITY]
+
+
+class NoiseShares:
+    """Of one unit, prediction by prediction; each lasts `EVERY_NS`."""
+
+    def __init__(self, model: Model, gap_s: float) -> None:
+        self._predictor = _Predictor(model, gap_s)
+        self._log = np.zeros((3, len(GRID)))
+        self._count = 0.0
+        self._counted = [(0, np.ones(3))]
+        """From when on (ns) which shares count, those that a prediction may still be made of."""
+        self._begins_ns = -1
+        """When the prediction that is under way began; -1 where none is."""
+
+    @property
+    def shown(self) -> tuple[float, tuple[float, ...]]:
+        """How many predictions have been judged, and the log likelihoods of `GRID` of each axis,
+        for the next start."""
+        log = self._log - self._log.max(axis=1, keepdims=True)
+        return self._count, tuple(log.ravel().tolist())
+
+    def take_up(self, predictions: float, log_likelihoods: tuple[float, ...]) -> Array:
+        """Begin with what another drive has shown; the shares (6,) that count."""
+        self._count = predictions
+        self._log = np.array(log_likelihoods).reshape(3, -1)
+        shares = self._shares()
+        self._counted = [(0, shares)]
+        found: Array = shares[_OF_SENSORS]
+        return found
+
+    def restart(self) -> None:
+        """The filter has been started anew: a prediction that is under way has no end."""
+        self._begins_ns = -1
+
+    def begin(self, e: Estimator) -> None:
+        """A prediction from the filter's state on, where its heading is known."""
+        known = bool(e.covariance[PHI + 2, PHI + 2] < HEADING_SD_RAD**2)
+        self._begins_ns = e.t_ns if known else -1
+        if known:
+            self._predictor.begin(e)
+
+    def carry(self, imu: ImuBuffer, t_ns: int) -> None:
+        """The prediction on to an instant."""
+        if self._begins_ns >= 0:
+            self._predictor.propagate(imu, t_ns)
+
+    def end(self, e: Estimator) -> Array | None:
+        """Judge the prediction by the filter's state at its end; the shares (6,) that count after
+        `COUNTS_NS`, None where it has told nothing."""
+        p, begun_ns = self._predictor, self._begins_ns
+        self._begins_ns = -1
+        if begun_ns < 0 or e.t_ns - begun_ns != EVERY_NS or p.t_ns != e.t_ns:
+            return None
+        level = _level_axes(e.nav)
+        apart = level @ (p.nav[VN : VN + 3] - e.nav[VN : VN + 3])
+        known, without, whole = (
+            np.diagonal(level @ each @ level.T)
+            for each in (e.covariance[_VELOCITY, _VELOCITY], *p.of_velocity)
+        )
+        if known.sum() > KNOWN * whole.sum():
+            return None
+        counted = next(shares for at, shares in reversed(self._counted) if at <= begun_ns)
+        of_noise = (whole - without) / counted
+        variance = (without - known)[:, None] + of_noise[:, None] * GRID
+        variance = np.maximum(variance, known[:, None])
+        kept = 1.0 - 1.0 / FORGETS
+        self._log *= kept
+        squares = np.minimum(apart[:, None] ** 2 / variance, RARE)
+        self._log -= 0.5 * (np.log(variance) + squares)
+        self._count = kept * self._count + 1.0
+        shares = self._shares()
+        self._counted = [*self._counted[-3:], (e.t_ns + COUNTS_NS, shares)]
+        found: Array = shares[_OF_SENSORS]
+        return found
+
+    def _shares(self) -> Array:
+        """Of noise that shows forward, to the right and down."""
+        weight = np.exp(self._log - self._log.max(axis=1, keepdims=True))
+        mean = weight @ GRID / weight.sum(axis=1)
+        found: Array = (self._count * mean + FIRST) / (self._count + FIRST)
+        return found
+
+
+def _level_axes(nav: Array) -> Array:
+    """Rows forward, right and down of a level vehicle, in north, east, down (3, 3)."""
+    w, x, y, z = nav[Q0 : Q0 + 4].tolist()
+    along, across = 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)
+    size = math.hypot(along, across)
+    c, s = (along / size, across / size) if size > 0.0 else (1.0, 0.0)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

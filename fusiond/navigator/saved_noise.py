@@ -1,0 +1,52 @@
+"""What a drive has shown of noise, for the next start: it counts less then, and less with age.
+
+Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
+divide (fusiond.aiding.fix_errors), and which share of what the samples show is noise
+(fusiond.navigator.noise_share). The next drive is through other streets, so no more than `CARRIED`
+of it counts: two of ten minutes, which two minutes of it outweigh. A week on, antenna and load may
+be others: less by e.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from fusiond.aiding.fix_errors import MOST_SHOWN, SHOWN
+from fusiond.navigator.noise_share import GRID
+from fusiond.navigator.saved_state import STRICT
+
+CARRIED = 0.2
+FADES_S = 7.0 * 86400.0
+
+Name = Annotated[str, Field(min_length=1, max_length=128)]
+Sum = Annotated[float, Field(ge=-MOST_SHOWN, le=MOST_SHOWN)]
+Sums = Annotated[tuple[Sum, ...], Field(min_length=SHOWN, max_length=SHOWN)]
+Shown = Annotated[tuple[Sum, ...], Field(min_length=3 * len(GRID), max_length=3 * len(GRID))]
+
+
+@dataclass(frozen=True, slots=True, config=STRICT)
+class SavedNoise:
+    """Sums of each receiver's fixes by name; log likelihoods of shares of the samples' noise, of
+    how many predictions; POSIX time (s), where it was known. Raises pydantic's `ValidationError`
+    for what is none."""
+
+    utc_s: Annotated[float, Field(ge=0.0, le=1e11)] | None
+    fixes: Annotated[dict[Name, Sums], Field(max_length=64)]
+    predictions: Annotated[float, Field(ge=0.0, le=1e3)]
+    shares: Shown
+
+    def at(self, now_utc_s: float | None) -> SavedNoise:
+        """What of it counts for a start at that time; where nobody knows how old it is, as much as
+        of a week."""
+        age_s = FADES_S
+        if now_utc_s is not None and self.utc_s is not None:
+            age_s = max(now_utc_s - self.utc_s, 0.0)
+        weight = CARRIED * math.exp(-age_s / FADES_S)
+        fixes = {name: tuple(weight * x for x in sums) for name, sums in self.fixes.items()}
+        shares = tuple(weight * x for x in self.shares)
+        return replace(self, fixes=fixes, predictions=weight * self.predictions, shares=shares)
