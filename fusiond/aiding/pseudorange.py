@@ -14,9 +14,10 @@ An error that all ranges share for many minutes may be a state of the model (blo
 `RANGE_BIAS`): a displacement t of the antenna that stands for orbit errors, multipath and,
 downwards, the ionosphere that is left:
 
-    rho^ = |s - p^ - a - k t^| + c_k^,    z_rho += k u . dt    (dt true minus estimated)
+    rho^ = |s - p^ - a - K t^| + c_k^,    z_rho += u . K dt    (dt true minus estimated)
 
-with k = sqrt(8 / n) of n satellites: errors of many average, t is that of eight.
+with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.displacement); where the sky has
+changed, t is in part another one (`renewal`).
 
 Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: what the
 models of ionosphere and troposphere leave, BeiDou-2's offset), with what one sigma of each adds to
@@ -69,7 +70,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, Renewal, State, Vector3
 from fusiond.aiding.range_rows import (
     BASIC,
     LEFT,
@@ -131,7 +132,8 @@ class PseudorangeAid(Aid):
     the last epoch left and this one leaves, whatever has evaluated them last. `clock` (n,): which
     of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
     satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
-    `clock_reset`: the receiver has set its clock.
+    `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept` (3, 3): what of t the
+    epoch before had, too, None for all.
     Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
@@ -148,6 +150,8 @@ class PseudorangeAid(Aid):
     clock_reset: bool = False
     before: Array = field(default_factory=nothing_left, repr=False)
     left: Array = field(default_factory=nothing_left, repr=False)
+    shape: Array = field(default_factory=lambda: np.eye(3), repr=False)
+    kept: Array | None = field(default=None, repr=False)
     _r: Array = field(init=False, repr=False)
     _ranges: int = field(init=False, repr=False)
     _clocks: int = field(init=False, repr=False)
@@ -167,6 +171,14 @@ class PseudorangeAid(Aid):
     @property
     def remembers(self) -> bool:
         return self.before.item(0) > 0.0 and bool((self.values[SPAN] > 0.0).any())
+
+    @property
+    def remembered(self) -> Array:
+        return self.before
+
+    @property
+    def renewal(self) -> Renewal | None:
+        return None if self.kept is None else Renewal(RANGE_BIAS, self.kept)
 
     @property
     def position(self) -> Array:
@@ -233,6 +245,8 @@ class PseudorangeAid(Aid):
             self.clock_reset,
             self.before,
             self.left,
+            self.shape,
+            self.kept,
         )
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
@@ -271,6 +285,7 @@ class PseudorangeAid(Aid):
             displacement,
             shared,
             carrier,
+            self.shape,
             *self.lever,
             self._ranges,
             self.before,

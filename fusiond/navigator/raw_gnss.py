@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from drivers.raw.messages import NavigationMessage, RawGnssEpoch
+from drivers.raw.messages import Ephemeris, NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
+from fusiond.gnss.displacement import Displacement
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
+from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.range_kernel import (
     AID_ROWS,
     CARRIER_VARIANCE,
@@ -49,6 +51,15 @@ REMEMBERED_NS = 12_000_000_000
 """Epochs older than that are too old for the timeline, which goes back by ten seconds."""
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """Names of screened rows in `health`; everything else is `gated`."""
+
+
+PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
+"""Of the displacement's states by their defaults, `bias_sd_m` and `bias_down_sd_m`: that is what a
+sky of eight satellites displaces, and stands for what the sky at hand does."""
+
+
+NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), np.zeros((3, 3)), np.zeros((3, 3)))
+"""Of an epoch without satellites."""
 
 
 class Seen(NamedTuple):
@@ -86,7 +97,8 @@ class _Corrected(NamedTuple):
 class _Memory:
     """Result of an epoch, and whether its refused satellites have been counted. `left` is
     what the filter's last run over it leaves to the next. `followed` is the epoch after the one
-    whose `kept` is `after`, and `kept` what is known of carriers then."""
+    whose `kept` is `after`, and `kept` what is known of carriers then; `displacement` is that of
+    its sky, once it has been corrected."""
 
     corrected: _Corrected | None = None
     counted: bool = False
@@ -95,6 +107,7 @@ class _Memory:
     followed: Followed | None = None
     after: Array | None = None
     kept: Array = field(default_factory=nothing_kept)
+    displacement: Displacement | None = None
 
     def is_after(self, before: _Memory) -> bool:
         """True if the epoch has been followed from that one."""
@@ -167,11 +180,16 @@ class RawGnss:
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
         self.recent: list[RawEpochAid] = []
+        self._forgotten: Displacement | None = None
+        """That of the last sky before them."""
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
         """Keep what a satellite has said."""
+        replaced = self._store.replaced
         self._store.add(message)
+        if self._store.replaced > replaced and isinstance(message, Ephemeris):
+            self.refused[f"{message.system}_number_of_another"] += 1
 
     def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
         """The epoch as an aid, with the ephemerides that are known by now."""
@@ -179,7 +197,10 @@ class RawGnss:
         aid = RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
         insort(self.recent, aid, key=_instant)
         oldest = self.recent[-1].t_ns - REMEMBERED_NS
-        del self.recent[: bisect_left(self.recent, oldest, key=_instant)]
+        forgotten = self.recent[: bisect_left(self.recent, oldest, key=_instant)]
+        for earlier in forgotten:
+            self._forgotten = earlier.memory.displacement or self._forgotten
+        del self.recent[: len(forgotten)]
         return aid
 
     def followed(self, aid: RawEpochAid) -> Followed:
@@ -240,6 +261,7 @@ class RawGnss:
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
+        displacement, kept = self._displaced(aid, rows)
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -251,8 +273,24 @@ class RawGnss:
             aid.epoch.clock_reset,
             aid.memory.before,
             aid.memory.left,
+            displacement.root * PER_SIGMA,
+            kept,
             robust=aid.robust,
         )
+
+    def _displaced(self, aid: RawEpochAid, rows: Rows) -> tuple[Displacement, Array | None]:
+        """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
+        if not rows.satellites:
+            return NOWHERE, None
+        recent = self.recent[: bisect_left(self.recent, aid.t_ns, key=_instant)]
+        found = (earlier.memory.displacement for earlier in reversed(recent))
+        before = next((d for d in found if d is not None), self._forgotten)
+        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
+        if before is not None and before.holds(rows, t_s):
+            aid.memory.displacement = before
+            return before, None
+        aid.memory.displacement = now = Displacement.of(rows, t_s)
+        return now, None if before is None else now.carried(before)
 
     def judged(
         self,
