@@ -93,11 +93,12 @@ class State(NamedTuple):
 
 class Renewal(NamedTuple):
     """Errors that successive measurements share become in part others at an instant: those of the
-    `blocks`, t in units of their initial sigmas, are R t + w from then on, cov(w) = I - R R^T, with
-    R `kept` (k, k)."""
+    `blocks`, t in units of their initial sigmas, are R t + w from then on, R `kept` and cov(w)
+    `new` (k, k)."""
 
     blocks: tuple[str, ...]
     kept: Array
+    new: Array
 
 
 class NotApplicable(NamedTuple):

@@ -132,8 +132,9 @@ class PseudorangeAid(Aid):
     the last epoch left and this one leaves, whatever has evaluated them last. `clock` (n,): which
     of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
     satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
-    `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept` (3, 3): what of t the
-    epoch before had, too, None for all.
+    `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
+    which t is another than that of the epoch before, None for none; `seen`, an empty list, gets z
+    and u P u^T of the ranges as the filter first looks at them.
     Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
@@ -151,7 +152,8 @@ class PseudorangeAid(Aid):
     before: Array = field(default_factory=nothing_left, repr=False)
     left: Array = field(default_factory=nothing_left, repr=False)
     shape: Array = field(default_factory=lambda: np.eye(3), repr=False)
-    kept: Array | None = field(default=None, repr=False)
+    kept: tuple[Array, Array] | None = field(default=None, repr=False)
+    seen: list[tuple[Array, Array]] | None = field(default=None, repr=False)
     _r: Array = field(init=False, repr=False)
     _ranges: int = field(init=False, repr=False)
     _clocks: int = field(init=False, repr=False)
@@ -178,7 +180,7 @@ class PseudorangeAid(Aid):
 
     @property
     def renewal(self) -> Renewal | None:
-        return None if self.kept is None else Renewal(RANGE_BIAS, self.kept)
+        return None if self.kept is None else Renewal(RANGE_BIAS, *self.kept)
 
     @property
     def position(self) -> Array:
@@ -294,4 +296,8 @@ class PseudorangeAid(Aid):
             z,
             h,
         )
+        if self.seen == [] and state.covariance is not None:
+            sight = h[: self._ranges, 6:9]
+            place = np.einsum("ij,jk,ik->i", sight, state.covariance[6:9, 6:9], sight)
+            self.seen.append((z[: self._ranges].copy(), place))
         return Innovation(z, h, r)

@@ -1,6 +1,6 @@
 r"""Errors that successive measurements share, where in part they become others.
 
-    t <- R t + w,   cov(w) = I - R R^T       t in units of their initial sigmas
+    t <- R t + w       t in units of their initial sigmas
 
 of states with covariance P, error estimate and parameters, and of the sensitivities V of a bank's
 hypotheses: what of P and V belongs to t is multiplied by R, and P grows by w. Source: Groves, 2nd
@@ -28,7 +28,7 @@ def transition(renewal: Renewal, model: Model) -> tuple[Array, Array, list[int]]
         return None
     sd = model.initial[slots]
     kept = sd[:, None] * renewal.kept / sd
-    return kept, np.diag(sd**2) - product(kept * sd**2, kept.T), slots
+    return kept, sd[:, None] * renewal.new * sd, slots
 
 
 def renew(renewal: Renewal, model: Model, covs: Iterable[Array], others: Iterable[Array]) -> None:

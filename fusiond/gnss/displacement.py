@@ -11,13 +11,14 @@ H = [-u 1_system], u unit vectors to the satellites north, east, down, L what el
 (30 m) and clock (1 m). So u . K t is the part of the errors that looks like a displacement: all of
 it with three satellites, whose geometry makes much of little, and little with thirty.
 
-Where the sky changes, b does: of the satellites that stay the errors stay. With a before, b after
+Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
+satellites' levels (fusiond.gnss.levels) do not know of their errors, V_k,
 
-    t_b = R t_a + w,    R = K_b^-1 cov(b_b, b_a) K_a^-1,    cov(w) = I - R R^T
-    cov(b_b, b_a) = sum over those of both G_b,k G_a,k^T v_k + (G_b S_b)(G_a S_a)^T
+    K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
 
-A filter that leaves w out, and lets K grow, solves t of how the ranges part when satellites go, and
-is sure of a place that it does not know.
+with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
+what levels know they know of what all share, too. A filter that lets K grow and adds nothing solves
+t of how the ranges part when satellites go, and is sure of a place that it does not know.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
 """
@@ -41,11 +42,13 @@ PLACE_M, CLOCK_M = 30.0, 1.0
 a crystal whose phase walks by 0.1 m by the root of a second, over a hundred."""
 LEAST_M = 1e-3
 """Of K along an axis: below it the sky displaces nothing, and nothing is carried on."""
+FLOOR_M = 0.2
+"""Noise of a range over a minute, which bounds what one satellite weighs."""
 HOLDS_S = 30.0
 """A satellite of a MEO moves by a quarter of a degree."""
 FLICKERS_S = 3.0
 """Satellites that come and go within it are of one sky: their errors are the same when they come
-again, which `R` does not know."""
+again, which the sum does not know."""
 
 
 @compiled("void(f8[:, ::1], i8)", forceinline=True)
@@ -100,11 +103,17 @@ def roots(b: Array, out: Array) -> None:
                     out[3 + i, j] += v[i, k] / root * v[j, k]
 
 
-@compiled("void(f8[:, ::1], i8[::1], i8, f8[:, ::1], f8[:, ::1])", allocates=True)
+@compiled("void(f8[:, ::1], i8[::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])", allocates=True)
 def displace(
-    values: Array, clock: npt.NDArray[np.int64], clocks: int, effect: Array, out: Array
+    values: Array,
+    clock: npt.NDArray[np.int64],
+    clocks: int,
+    variance: Array,
+    effect: Array,
+    out: Array,
 ) -> None:
-    """Write `effect` (3, n + 2), G and G S by rows' `values`, and to `out` (6, 3) K, its inverse.
+    """Write `effect` (3, n + 2), G and G S by rows' `values`, and to `out` (6, 3) K, its inverse,
+    of errors of `variance` (n,).
 
     `clock` (n,) below `clocks`: which of the clocks' offsets each has.
     """
@@ -117,7 +126,7 @@ def displace(
         row[:] = 0.0
         row[0], row[1] = -values[rk.NORTH, k], -values[rk.EAST, k]
         row[2], row[3 + clock[k]] = math.sin(values[rk.ELEVATION, k]), 1.0
-        w = 1.0 / values[rk.LASTING, k]
+        w = 1.0 / variance[k]
         for i in range(m):
             for j in range(m):
                 normal[i, j] += w * row[i] * row[j]
@@ -128,13 +137,13 @@ def displace(
         for k in range(n):
             g = -normal[i, 0] * values[rk.NORTH, k] - normal[i, 1] * values[rk.EAST, k]
             g += normal[i, 2] * math.sin(values[rk.ELEVATION, k]) + normal[i, 3 + clock[k]]
-            effect[i, k] = g / values[rk.LASTING, k]
+            effect[i, k] = g / variance[k]
             effect[i, n] += effect[i, k] * values[rk.COMMON, k]
             effect[i, n + 1] += effect[i, k] * values[rk.TROPOSPHERE_SIGMA, k]
     for i in range(3):
         for j in range(3):
             for k in range(n):
-                b[i, j] += effect[i, k] * effect[j, k] * values[rk.LASTING, k]
+                b[i, j] += effect[i, k] * effect[j, k] * variance[k]
             for k in (n, n + 1):
                 b[i, j] += effect[i, k] * effect[j, k]
     roots(b, out)
@@ -142,7 +151,8 @@ def displace(
 
 class Displacement(NamedTuple):
     """Of a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the two errors of
-    all, `variance` (n,) m^2 of what lasts, `root` (3, 3) K and `back` (3, 3) its inverse, m."""
+    all, `variance` (n,) m^2 of what is not known of what lasts, `root` (3, 3) K and `back` (3, 3)
+    its inverse, m."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -152,31 +162,41 @@ class Displacement(NamedTuple):
     back: Array
 
     @classmethod
-    def of(cls, rows: Rows, t_s: float) -> Displacement:
-        """Of the rows of an epoch."""
+    def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
+        """Of the rows of an epoch, with `variance` (n,) m^2 left of what lasts."""
         n = len(rows.satellites)
-        effect, out = np.empty((3, n + 2)), np.empty((6, 3))
-        displace(rows.values, rows.clock, int(rows.clock.max(initial=0)) + 1, effect, out)
-        return cls(t_s, rows.satellites, effect, rows.values[rk.LASTING].copy(), out[:3], out[3:])
+        effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
+        clocks = int(rows.clock.max(initial=0)) + 1
+        displace(rows.values, rows.clock, clocks, rows.values[rk.LASTING].copy(), effect, out)
+        displace(rows.values, rows.clock, clocks, variance + FLOOR_M**2, effect, left)
+        known = np.sqrt(variance / rows.values[rk.LASTING])
+        for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
+            effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
+        return cls(t_s, rows.satellites, effect, variance, out[:3], out[3:])
 
     def holds(self, rows: Rows, t_s: float) -> bool:
         """True if it is that of an epoch of these rows, too."""
         same = rows.satellites == self.satellites
         return 0.0 <= t_s - self.t_s < (HOLDS_S if same else FLICKERS_S)
 
-    def carried(self, before: Displacement) -> Array:
-        """R (3, 3) from what was `before`."""
-        at = {name: k for k, name in enumerate(before.satellites)}
+    def carried(self, before: Displacement) -> tuple[Array, Array]:
+        """R (3, 3) and cov(w) (3, 3) from what was `before`."""
         n, last = len(self.satellites), len(before.satellites)
-        across = np.zeros((3, 3))
-        pairs = [(k, at[s]) for k, s in enumerate(self.satellites) if s in at]
-        for k, j in pairs:
-            v = min(self.variance[k], before.variance[j])
-            across += v * np.multiply.outer(self.effect[:, k], before.effect[:, j])
+        moved: dict[str, Array] = {}
+        left: dict[str, float] = {}
+        for k, name in enumerate(self.satellites):
+            moved[name], left[name] = self.effect[:, k].copy(), float(self.variance[k])
+        for k, name in enumerate(before.satellites):
+            moved[name] = moved.get(name, 0.0) - before.effect[:, k]
+            left.setdefault(name, float(before.variance[k]))
+        new = np.zeros((3, 3))
+        for name, g in moved.items():
+            new += left[name] * np.multiply.outer(g, g)
         for k in range(2):
-            across += np.multiply.outer(self.effect[:, n + k], before.effect[:, last + k])
-        found: Array = _times(_times(self.back, across), before.back)
-        return found
+            g = self.effect[:, n + k] - before.effect[:, last + k]
+            new += np.multiply.outer(g, g)
+        kept: Array = _times(self.back, before.root)
+        return kept, _times(_times(self.back, new), self.back)
 
 
 def _times(a: Array, b: Array) -> Array:

@@ -104,13 +104,13 @@ NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # Columns of `first` as the receiver says them; NaN where it does not.
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
 # Results; the first seventeen are what an aid takes (fusiond.aiding.pseudorange).
-ROW_COLUMNS = 28
+ROW_COLUMNS = 29
 AID_ROWS = 17
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
     COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL,
     LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, TROPOSPHERE, IONOSPHERE, TOTAL_VARIANCE,
-    LASTING,
+    LASTING, SLOT,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -187,8 +187,9 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (28, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
-    many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
+    """Write (29, n) values, the last but `SLOT`, which is the plan's, for a receiver (3,) ECEF
+    m at GPS time `week`, `tow` of its clock; how many satellites are lower than
+    `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
     `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the

@@ -92,7 +92,7 @@ class Rows:
     `span_s` (n,) by the carrier, NaN and 0 where there is none; `troposphere_m` and
     `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
     `lasting` (n,) m^2 what of `variance` lasts for many minutes.
-    `values` (28, n) has all of them, as `range_kernel.range_rows` writes it.
+    `values` (29, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -256,6 +256,7 @@ class RangeModel:
             options.cno_mask_db_hz,
             out,
         )
+        out[rk.SLOT] = plan.followed[:, ca.SLOT]
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
         if not lost:

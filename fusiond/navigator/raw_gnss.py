@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
@@ -26,6 +26,7 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.displacement import Displacement
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
+from fusiond.gnss.levels import Levels, take_off
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.range_kernel import (
     AID_ROWS,
@@ -97,8 +98,8 @@ class _Corrected(NamedTuple):
 class _Memory:
     """Result of an epoch, and whether its refused satellites have been counted. `left` is
     what the filter's last run over it leaves to the next. `followed` is the epoch after the one
-    whose `kept` is `after`, and `kept` what is known of carriers then; `displacement` is that of
-    its sky, once it has been corrected."""
+    whose `kept` is `after`, and `kept` what is known of carriers then; `displacement` and
+    `levels` are those of its sky, once it has been corrected."""
 
     corrected: _Corrected | None = None
     counted: bool = False
@@ -108,6 +109,7 @@ class _Memory:
     after: Array | None = None
     kept: Array = field(default_factory=nothing_kept)
     displacement: Displacement | None = None
+    levels: Levels | None = None
 
     def is_after(self, before: _Memory) -> bool:
         """True if the epoch has been followed from that one."""
@@ -180,8 +182,8 @@ class RawGnss:
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
         self.recent: list[RawEpochAid] = []
-        self._forgotten: Displacement | None = None
-        """That of the last sky before them."""
+        self._forgotten: tuple[Displacement | None, Levels | None] = None, None
+        """Those of the last sky before them."""
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
@@ -199,7 +201,8 @@ class RawGnss:
         oldest = self.recent[-1].t_ns - REMEMBERED_NS
         forgotten = self.recent[: bisect_left(self.recent, oldest, key=_instant)]
         for earlier in forgotten:
-            self._forgotten = earlier.memory.displacement or self._forgotten
+            memory, last = earlier.memory, self._forgotten
+            self._forgotten = memory.displacement or last[0], memory.levels or last[1]
         del self.recent[: len(forgotten)]
         return aid
 
@@ -257,11 +260,13 @@ class RawGnss:
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
+        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
+        levels = aid.memory.levels = take_off(self._last_levels(aid), rows, t_s)
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
-        displacement, kept = self._displaced(aid, rows)
+        displacement, kept = self._displaced(aid, rows, levels.variance)
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -275,21 +280,32 @@ class RawGnss:
             aid.memory.left,
             displacement.root * PER_SIGMA,
             kept,
+            levels.seen,
             robust=aid.robust,
         )
 
-    def _displaced(self, aid: RawEpochAid, rows: Rows) -> tuple[Displacement, Array | None]:
+    def _earlier(self, aid: RawEpochAid) -> Iterator[_Memory]:
+        """Epochs before one, the last first."""
+        at = bisect_left(self.recent, aid.t_ns, key=_instant)
+        return (self.recent[k].memory for k in range(at - 1, -1, -1))
+
+    def _last_levels(self, aid: RawEpochAid) -> Levels | None:
+        found = (memory.levels for memory in self._earlier(aid))
+        return next((levels for levels in found if levels is not None), self._forgotten[1])
+
+    def _displaced(
+        self, aid: RawEpochAid, rows: Rows, variance: Array
+    ) -> tuple[Displacement, tuple[Array, Array] | None]:
         """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
         if not rows.satellites:
             return NOWHERE, None
-        recent = self.recent[: bisect_left(self.recent, aid.t_ns, key=_instant)]
-        found = (earlier.memory.displacement for earlier in reversed(recent))
-        before = next((d for d in found if d is not None), self._forgotten)
+        found = (memory.displacement for memory in self._earlier(aid))
+        before = next((d for d in found if d is not None), self._forgotten[0])
         t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
         if before is not None and before.holds(rows, t_s):
             aid.memory.displacement = before
             return before, None
-        aid.memory.displacement = now = Displacement.of(rows, t_s)
+        aid.memory.displacement = now = Displacement.of(rows, t_s, variance)
         return now, None if before is None else now.carried(before)
 
     def judged(
