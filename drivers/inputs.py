@@ -8,6 +8,7 @@ measurements, requests and events.
     frame    a frame off a CAN bus
     open     the line or bus was opened            close    it went away: why, in words
     controller  a CAN controller's state           other    a timer of the driver's own, by its name
+    correction  a frame of a caster that serves fusiond itself
 """
 
 from __future__ import annotations

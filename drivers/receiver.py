@@ -95,7 +95,7 @@ class ReceiverDriver:
             self._ntrip = NtripClient(
                 options.ntrip,
                 self.counters,
-                self._line.write,
+                self._pass_on,
                 lambda: self._decoder.gga,
                 self._corrections_changed,
             )
@@ -133,6 +133,10 @@ class ReceiverDriver:
                 tasks.create_task(self._ntrip.run())
             opened = partial(self.inputs.take, "open")
             tasks.create_task(self._line.run(self._read, opened, self._closed))
+
+    def _pass_on(self, frame: bytes) -> bool:
+        """Hand a frame of the caster to the receiver; False where it cannot be."""
+        return self._line.write(frame)
 
     def _corrections_changed(self, state: str, text: str) -> None:
         self._emit(DeviceEvent(self.name, self._now_ns(), f"ntrip_{state}", text))

@@ -4,12 +4,12 @@ Every verified frame ends in exactly one of these counters:
 
     UBX     rawx, rawx_unreadable, time_unset, time_implausible; sfrbx_unreadable, one name per
             subframe; ubx_not_used
-    RTCM 3  msm, week_unknown, rtcm_ephemerides, ..._not_used, rtcm_unreadable, and the refusals of
-            an ephemeris
+    RTCM 3  msm, week_unknown, rtcm_ephemerides, rtcm_ssr, ..._not_used, rtcm_unreadable,
+            ssr_unreadable, and the refusals of an ephemeris
 
-A subframe's name is `subframes_lnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where it was
-used, a message that is not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`).
-See `docs/gnss-raw.md`.
+A subframe's name is `subframes_lnav`, `_cnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where
+it was used, a message that is not decoded (`fnav_not_used`), or the reason of its refusal
+(`parity_bad`). See `docs/gnss-raw.md`.
 """
 
 from __future__ import annotations
@@ -25,17 +25,20 @@ from drivers.measurements import UtcStamp
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.raw.bcnav import Bcnav1Decoder, Bcnav2Decoder
 from drivers.raw.beidou_words import GEO
+from drivers.raw.cnav import CnavDecoder
 from drivers.raw.d1 import D1Decoder
 from drivers.raw.d2 import D2Decoder
 from drivers.raw.inav import InavDecoder
 from drivers.raw.lnav import PREAMBLE, LnavDecoder
 from drivers.raw.messages import (
     Bdgim,
+    Correction,
     Ephemeris,
     Klobuchar,
     NavigationMessage,
     RawEvent,
     RawGnssEpoch,
+    SignalDelays,
 )
 from drivers.raw.rtcm import RtcmDecoder
 from drivers.raw.subframes import Decoded, RefusedError, Subframe
@@ -60,6 +63,7 @@ class MessageDecoder(Protocol):
 
 _DECODERS: dict[str, Callable[[], MessageDecoder]] = {
     "lnav": LnavDecoder,
+    "cnav": CnavDecoder,
     "d1": D1Decoder,
     "d2": D2Decoder,
     "bcnav1": Bcnav1Decoder,
@@ -128,6 +132,10 @@ class RawDecoder:
     def note_utc(self, utc: int) -> None:
         """UTC (POSIX ns) from another source, to be believed: it dates MSM epochs."""
         self._weeks.note_utc(utc, self.leap_seconds)
+
+    def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
+        """Result of a verified frame of RTCM 3 that did not come from the receiver."""
+        return [] if self._rtcm is None else self._rtcm.take(frame, t_seen_ns)
 
     def take(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
         """Result of a frame that `StreamSplitter` verified."""
@@ -211,6 +219,10 @@ class RawDecoder:
         if isinstance(event, Ephemeris):
             self.counters["ephemerides"] += 1
             return True
+        if isinstance(event, SignalDelays):
+            self.counters["signal_delays"] += 1
+            return True
+        assert not isinstance(event, Correction)  # of no subframe
         model = "bdgim" if isinstance(event, Bdgim) else event.system
         last = self._ionosphere.get(model)
         if last is not None and replace(last, t_seen_ns=event.t_seen_ns) == event:
@@ -229,7 +241,7 @@ def message_of(sfrbx: Sfrbx) -> str:
     if sfrbx.gnss_id == 0:
         # CNAV starts with its preamble in the top byte, LNAV two bits later.
         cnav = signal != 0 or (bool(sfrbx.words) and sfrbx.words[0] >> 24 == PREAMBLE)
-        return "gps_cnav_not_used" if cnav else "lnav"
+        return "cnav" if cnav else "lnav"
     if sfrbx.gnss_id == 2:
         if signal in _GALILEO_INAV:
             return "inav"

@@ -15,7 +15,7 @@ from drivers.nmea.reasons import wrong_checksums
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawEvent, RawGnssEpoch
-from drivers.raw.rtcm import load_pyrtcm
+from drivers.raw.rtcm import SSR, load_pyrtcm, message_number
 from drivers.receiver import ReceiverDriver
 from drivers.solution import REFUSALS
 from drivers.ubx.decoder import UbxDecoder
@@ -108,6 +108,10 @@ class GnssDecoder:
         for item in self._splitter.feed(data):
             self._take(item, found)
         return found
+
+    def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
+        """Result of a frame of a service beside the receiver."""
+        return [] if self._raw is None else self._raw.correct(frame, t_seen_ns)
 
     def silence(self) -> list[Found]:
         """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
@@ -230,6 +234,7 @@ class GnssDriver(ReceiverDriver):
             load_pyrtcm()
         self._options = options
         super().__init__(name, options, emit, now_ns)
+        self.inputs.on("correction", self._on_correction)
 
     def _make_decoder(self) -> GnssDecoder:
         options = self._options
@@ -242,6 +247,15 @@ class GnssDriver(ReceiverDriver):
             rtcm=options.rtcm,
         )
         return self._gnss
+
+    def _pass_on(self, frame: bytes) -> bool:
+        if self._options.use_raw and self._options.rtcm and message_number(frame) in SSR:
+            self.inputs.take("correction", frame)
+        return super()._pass_on(frame)
+
+    def _on_correction(self, frame: bytes, t_seen_ns: int) -> None:
+        for correction in self._gnss.correct(frame, t_seen_ns):
+            self._emit(correction)
 
     def _running_detail(self) -> str:
         useless = super()._running_detail()

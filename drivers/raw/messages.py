@@ -156,6 +156,58 @@ class Bdgim:
     alpha: tuple[float, float, float, float, float, float, float, float, float]
 
 
-NavigationMessage = Ephemeris | Klobuchar | Bdgim
-"""Navigation messages of orbits, clocks and the ionosphere: valid at no one instant."""
+@immutable()
+class SignalDelays:
+    """Group delays of a GPS satellite as CNAV has them: T_GD (s) and, by signal, its inter-signal
+    correction (s)."""
+
+    source: str
+    t_seen_ns: int
+    system: System
+    prn: int
+    group_delay_s: float
+    correction_s: tuple[tuple[str, float], ...]
+
+    @property
+    def satellite(self) -> str:
+        """Such as "G05"."""
+        return f"{self.system}{self.prn:02d}"
+
+
+CorrectionPart = Literal["orbit", "clock", "fast_clock", "bias", "accuracy"]
+
+
+@immutable()
+class Correction:
+    """A part of what a service says of a satellite beside its own ephemeris (RTCM SSR).
+
+    It holds at GPS time `week`, `tow_s`, and comes anew every `interval_s`. Parts of one `solution`
+    (provider, number, issue) belong together. `values`: of the orbit radial, along, across (m,
+    broadcast minus true) and their rates (m/s); of the clock C0, C1, C2 (m, m/s, m/s^2, true minus
+    broadcast), or what the fast one adds to C0; biases (m), added to the ranges of `signals`; the
+    accuracy as one sigma of a range (m). `issue` of the ephemeris that an orbit is of: GPS's IODE,
+    Galileo's IODnav, of BeiDou (toe / 8 s) modulo 1024; -1 of other parts.
+    """
+
+    source: str
+    t_seen_ns: int
+    system: System
+    prn: int
+    part: CorrectionPart
+    week: int
+    tow_s: float
+    interval_s: float
+    solution: tuple[int, int, int]
+    issue: int
+    values: tuple[float, ...]
+    signals: tuple[str, ...] = ()
+
+    @property
+    def satellite(self) -> str:
+        """Such as "C21"."""
+        return f"{self.system}{self.prn:02d}"
+
+
+NavigationMessage = Ephemeris | Klobuchar | Bdgim | SignalDelays | Correction
+"""Messages of orbits, clocks and the ionosphere: valid at no one instant."""
 RawEvent = RawGnssEpoch | NavigationMessage

@@ -5,8 +5,9 @@
 
 Of RINEX 3 a Galileo record says in `data sources` whether its clock is of I/NAV or F/NAV; BeiDou's
 are D1 or D2 by the satellite. RINEX 4 names the message: LNAV, INAV, FNAV, D1, D2, CNV1 and CNV2 of
-BeiDou are read, the others counted. Weeks are not read: a record's toc has a full date, and toe is
-the nearest. Source: RINEX 3.05, table A5 and following; RINEX 4.01, tables A9 to A24.
+BeiDou are read, of GPS's CNAV the delays, the others counted. Weeks are not read: a record's toc
+has a full date, and toe is the nearest. Source: RINEX 3.05, table A5 and following; RINEX 4.01,
+tables A9 to A24.
 """
 
 from __future__ import annotations
@@ -17,7 +18,15 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from drivers.raw.beidou_words import GEO
-from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
+from drivers.raw.cnav import SIGNALS as CNAV_SIGNALS
+from drivers.raw.messages import (
+    Bdgim,
+    Ephemeris,
+    Klobuchar,
+    NavigationMessage,
+    SignalDelays,
+    System,
+)
 from drivers.raw.rinex import (
     LABEL,
     OTHERS,
@@ -47,8 +56,10 @@ _ION_3: dict[str, tuple[System, int]] = {
     "BDSA": ("C", 0),
     "BDSB": ("C", 1),
 }
-_LINES, _LINES_CNAV = 8, 10
+_LINES, _LINES_CNAV, _LINES_GPS_CNAV = 8, 10, 9
 """Of a record, with its first."""
+_TGD, _ISC, _SENT = 25, 27, 31
+"""Where delays and transmission stand in a record of GPS CNAV, the clock's three before them."""
 
 # Where numbers stand, the clock's three before them; all messages share what comes first.
 _ORBIT = (
@@ -124,12 +135,16 @@ def _taken(
     if system not in SYSTEMS:
         counters[f"{OTHERS.get(system, 'unknown_system')}_not_used"] += 1
         return None
-    if message and (system, message) not in _MESSAGES:
-        counters["gps_cnav_not_used" if system == "G" else "bcnav_not_used"] += 1
-        return None
     prn = int(number)
     if not 1 <= prn <= MAX_PRN[SYSTEMS[system]]:
         raise RefusedError("satellite_unknown")
+    if (system, message) == ("G", "CNAV"):
+        delays = _signal_delays(source, prn, record)
+        counters["signal_delays"] += 1
+        return delays
+    if message and (system, message) not in _MESSAGES:
+        counters["gps_cnav_not_used" if system == "G" else "bcnav_not_used"] += 1
+        return None
     known = _MESSAGES.get((system, message), "")
     found = _ephemeris(source, SYSTEMS[system], prn, known, record)
     counters["ephemerides"] += 1
@@ -230,6 +245,23 @@ def _cnav(message: str, v: list[float]) -> dict[str, Any]:
         "healthy": v[32] == 0.0 and int(v[33]) & 0o66 == 0,
         "sent_s": v[35],
     }
+
+
+def _signal_delays(source: str, prn: int, record: list[str]) -> Broadcast:
+    """T_GD and ISC of GPS CNAV (table A14 of RINEX 4.01); a blank ISC is none."""
+    if len(record) < _LINES_GPS_CNAV:
+        raise ValueError("too few lines")
+    values = _numbers(record[:_LINES_GPS_CNAV], 23, 4 * _LINES_GPS_CNAV)
+    line = record[7].ljust(80)
+    blank = [not line[at : at + 19].strip() for at in range(4, 80, 19)]
+    isc = tuple(
+        (name, values[_ISC + k])
+        for k, names in enumerate(CNAV_SIGNALS)
+        for name in names
+        if not blank[k]
+    )
+    sent_s = gps_seconds(record[0][4:23].split())
+    return Broadcast(sent_s, SignalDelays(source, 0, "G", prn, values[_TGD], isc))
 
 
 # --------------------------------------------------------------------------- ionosphere

@@ -1,4 +1,4 @@
-"""RTCM 3: MSM4 to MSM7 of GPS, Galileo and BeiDou, ephemerides 1019, 1042, 1045, 1046, and 1013.
+"""RTCM 3: MSM4 to 7 of GPS, Galileo and BeiDou, ephemerides 1019, 1042, 1045, 1046, 1013, and SSR.
 
     pseudorange  c/1000 * (DF397 + DF398 + DF400)     DF405 in place of DF400 in MSM6 and 7; ms
     carrier      f/1000 * (DF397 + DF398 + DF401)     DF406 in MSM6 and 7; cycles
@@ -37,6 +37,7 @@ from drivers.raw.messages import (
     RawSignal,
     System,
 )
+from drivers.raw.ssr import GLONASS, MESSAGES, OTHERS, SsrDecoder
 from drivers.raw.subframes import RefusedError, check_orbit, sisa_m, ura_m
 from drivers.raw.ubx import MAX_PRN, PSEUDORANGE_M
 from drivers.raw.weeks import BDT_BEHIND_GPS_S, WEEK_S, WeekReference, leap_seconds, utc_ns
@@ -51,6 +52,8 @@ OTHER_MSM = {
     113: "navic_not_used",
 }
 SYSTEM_PARAMETERS = 1013
+SSR = frozenset((*MESSAGES, *GLONASS, *OTHERS))
+"""Corrections: fusiond reads them itself (drivers.raw.ssr)."""
 MJD_1980_01_06 = 44_244
 """Day 0 of GPS time as a modified Julian date."""
 EPHEMERIDES: dict[int, System] = {1019: "G", 1042: "C", 1045: "E", 1046: "E"}
@@ -104,6 +107,11 @@ _ANGLES = frozenset(
 Parse = Callable[[bytes], Any]
 
 
+def message_number(frame: bytes) -> int:
+    """Number of a frame's message, 0 of one that is too short for one."""
+    return int.from_bytes(frame[3:5], "big") >> 4 if len(frame) >= 8 else 0
+
+
 def load_pyrtcm() -> Parse:
     """The parser of a verified frame: it does not look at the CRC again, which takes it longer than
     all else. PermanentDriverError when pyrtcm is not installed."""
@@ -125,6 +133,7 @@ class RtcmDecoder:
         self._source = source
         self._weeks = weeks
         self._counters = counters
+        self._ssr = SsrDecoder(source, weeks, counters)
         self._parse: Parse | None = None
         self._epoch: tuple[int, float] | None = None
         self._signals: dict[tuple[str, int, str], RawSignal] = {}
@@ -148,6 +157,8 @@ class RtcmDecoder:
         if number == SYSTEM_PARAMETERS and bits.length >= 70:
             self._parameters(bits)
             return []
+        if number in SSR:
+            return list(self._ssr.take(number, bits, t_seen_ns))
         if not msm and number not in EPHEMERIDES:
             self._counters["rtcm_not_used"] += 1
             return []

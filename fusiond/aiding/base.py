@@ -32,6 +32,7 @@ Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
 """Choice of when the error estimate is fed back into the navigation state: right after the aid; not
 before an aid says so; or now, all that was held."""
+NOTHING_LEFT = np.zeros(10)
 LENT_ROWS = 3
 """Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
 
@@ -89,6 +90,16 @@ class State(NamedTuple):
     def speed(self) -> float:
         """Horizontal speed, m/s."""
         return speed_of(self.nav)
+
+
+class Renewal(NamedTuple):
+    """Errors that successive measurements share become in part others at an instant: those of the
+    `blocks`, t in units of their initial sigmas, are R t + w from then on, R `kept` and cov(w)
+    `new` (k, k)."""
+
+    blocks: tuple[str, ...]
+    kept: Array
+    new: Array
 
 
 class NotApplicable(NamedTuple):
@@ -159,6 +170,16 @@ class Aid:
         return False
 
     @property
+    def remembered(self) -> Array:
+        """(10,): what an earlier one left, where it `remembers` (fusiond.aiding.range_rows)."""
+        return NOTHING_LEFT
+
+    @property
+    def renewal(self) -> Renewal | None:
+        """What of the errors that successive ones share is new with it."""
+        return None
+
+    @property
     def feedback(self) -> Feedback:
         """Choice of when the estimate is fed back."""
         return "at_once"
@@ -225,6 +246,10 @@ class Linearised(Protocol):
     def no_slip(self) -> bool: ...
     @property
     def remembers(self) -> bool: ...
+    @property
+    def remembered(self) -> Array: ...
+    @property
+    def renewal(self) -> Renewal | None: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
 

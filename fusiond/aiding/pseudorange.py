@@ -14,9 +14,10 @@ An error that all ranges share for many minutes may be a state of the model (blo
 `RANGE_BIAS`): a displacement t of the antenna that stands for orbit errors, multipath and,
 downwards, the ionosphere that is left:
 
-    rho^ = |s - p^ - a - k t^| + c_k^,    z_rho += k u . dt    (dt true minus estimated)
+    rho^ = |s - p^ - a - K t^| + c_k^,    z_rho += u . K dt    (dt true minus estimated)
 
-with k = sqrt(8 / n) of n satellites: errors of many average, t is that of eight.
+with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.displacement); where the sky has
+changed, t is in part another one (`renewal`).
 
 Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: what the
 models of ionosphere and troposphere leave, BeiDou-2's offset), with what one sigma of each adds to
@@ -69,7 +70,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
+from fusiond.aiding.base import (
+    Aid,
+    Innovation,
+    NotApplicable,
+    Renewal,
+    State,
+    Vector3,
+    level_arm_m,
+)
 from fusiond.aiding.range_rows import (
     BASIC,
     LEFT,
@@ -133,7 +142,9 @@ class PseudorangeAid(Aid):
     the last epoch left and this one leaves, whatever has evaluated them last. `clock` (n,): which
     of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
     satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
-    `clock_reset`: the receiver has set its clock.
+    `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
+    which t is another than that of the epoch before, None for none; `seen`, an empty list, gets z
+    and u P u^T of the ranges as the filter first looks at them.
     Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
@@ -150,6 +161,9 @@ class PseudorangeAid(Aid):
     clock_reset: bool = False
     before: Array = field(default_factory=nothing_left, repr=False)
     left: Array = field(default_factory=nothing_left, repr=False)
+    shape: Array = field(default_factory=lambda: np.eye(3), repr=False)
+    kept: tuple[Array, Array] | None = field(default=None, repr=False)
+    seen: list[tuple[Array, Array]] | None = field(default=None, repr=False)
     _r: Array = field(init=False, repr=False)
     _ranges: int = field(init=False, repr=False)
     _clocks: int = field(init=False, repr=False)
@@ -169,6 +183,14 @@ class PseudorangeAid(Aid):
     @property
     def remembers(self) -> bool:
         return self.before.item(0) > 0.0 and bool((self.values[SPAN] > 0.0).any())
+
+    @property
+    def remembered(self) -> Array:
+        return self.before
+
+    @property
+    def renewal(self) -> Renewal | None:
+        return None if self.kept is None else Renewal(RANGE_BIAS, *self.kept)
 
     @property
     def position(self) -> Array:
@@ -235,6 +257,8 @@ class PseudorangeAid(Aid):
             self.clock_reset,
             self.before,
             self.left,
+            self.shape,
+            self.kept,
         )
 
     def unturned(self, way: WayFaced) -> PseudorangeAid:
@@ -246,7 +270,9 @@ class PseudorangeAid(Aid):
         values[SPAN] = 0.0
         lever = 0.0, 0.0, self.lever[2]
         about = self.source, self.t_ns, self.gate, self.satellites, values, self.clock, lever
-        return PseudorangeAid(*about, self.clock_reset, robust=self.robust)
+        return PseudorangeAid(
+            *about, self.clock_reset, shape=self.shape, kept=self.kept, robust=self.robust
+        )
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
         """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of
@@ -284,6 +310,7 @@ class PseudorangeAid(Aid):
             displacement,
             shared,
             carrier,
+            self.shape,
             *self.lever,
             self._ranges,
             self.before,
@@ -292,4 +319,8 @@ class PseudorangeAid(Aid):
             z,
             h,
         )
+        if self.seen == [] and state.covariance is not None:
+            sight = h[: self._ranges, 6:9]
+            place = np.einsum("ij,jk,ik->i", sight, state.covariance[6:9, 6:9], sight)
+            self.seen.append((z[: self._ranges].copy(), place))
         return Innovation(z, h, r)

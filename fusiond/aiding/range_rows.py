@@ -26,8 +26,6 @@ from fusiond.navigation.strapdown import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-DISPLACED_BY = 8.0
-"""Satellites, of which a displacement is as large as its block says."""
 UNUSED_VARIANCE = 1e6
 """(m/s)^2, of a rate that only a carrier gives and nothing is known of the epoch before."""
 CARRIER_CLOCK_M_S = 1.0
@@ -54,7 +52,8 @@ def _hold(active: NDArray[np.bool_], g: Array) -> None:
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
-    "i8[::1], i8[::1], i8[::1], f8, f8, f8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1])"
+    "i8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8, i8, f8[::1], f8[::1], f8[::1], f8[::1],"
+    "f8[:, ::1])"
 )
 def range_rows(
     nav: Array,
@@ -69,6 +68,7 @@ def range_rows(
     displacement: Indices,
     shared: Indices,
     carrier: Indices,
+    shape: Array,
     l0: float,
     l1: float,
     l2: float,
@@ -84,7 +84,8 @@ def range_rows(
 
     Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors and of
     the carriers' clock; none where the model has no such state. `before` and `left` (10,): what the
-    last epoch left and this one leaves; of 0 s where there is nothing.
+    last epoch left and this one leaves; of 0 s where there is nothing. `shape` (3, 3) is what a
+    unit of each of the displacement's states displaces.
     """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
     a0 = c00 * l0 + c01 * l1 + c02 * l2
@@ -116,10 +117,6 @@ def range_rows(
         if 0 <= column_of[slot] - RATE_ERROR < 3:
             begin, end = slot, max(end, slot + 1)
 
-    there = 0
-    for i in range(clock.shape[0]):
-        there += math.isfinite(values[RANGE, i])
-    several = math.sqrt(DISPLACED_BY / max(there, 1))
     # Of the carriers' clock: its weight, and weighted what carriers say more than their Dopplers.
     weight_m, more_z = 1.0 / (CARRIER_CLOCK_M_S * CARRIER_CLOCK_M_S), 0.0
     t0 = t1 = t2 = f0 = f1 = f2 = 0.0
@@ -145,8 +142,9 @@ def range_rows(
                 g[slot] = -1.0
             _hold(active, g)
             for axis in range(displacement.shape[0]):
-                g[displacement[axis]] = -several * g[6 + axis]
-                innovation -= g[displacement[axis]] * xi[displacement[axis]]
+                along = g[6] * shape[0, axis] + g[7] * shape[1, axis] + g[8] * shape[2, axis]
+                g[displacement[axis]] = -along
+                innovation += along * xi[displacement[axis]]
             r[range_row] = values[RANGE_VARIANCE, i]
             for k in range(3):
                 one = values[SHARED + k, i]

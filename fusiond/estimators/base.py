@@ -32,6 +32,7 @@ from fusiond.estimators.propagation import (
     propagate_for,
 )
 from fusiond.estimators.published_state import WIDER, Published, sigmas, speed_sigma, widen
+from fusiond.estimators.renewal import renew
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
@@ -390,6 +391,16 @@ class ErrorStateFilter:
         self.wider[:] = 0.0
         if self.hypotheses is not None:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
+
+    def _renew(self, aid: Linearised) -> None:
+        """Errors that measurements share become what they are from the aid's instant on."""
+        if not aid.screened or aid.renewal is None:
+            return
+        others = [self.xi, *self._dxs]
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
+            others.append(self.hypotheses.sensitivities)
+        renew(aid.renewal, self.model, self._covs, others)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

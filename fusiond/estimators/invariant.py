@@ -61,7 +61,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import NOTHING_LEFT, Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
@@ -239,11 +239,14 @@ class InvariantFilter(TiltAxesFilter):
         """Fold one aid in, or name why not, by an update in xi."""
         self.turned = 0.0
         outcome = self._update(aid)
+        if aid.screened:  # what it leaves to the next is of the state that it has led to
+            aid.innovation(self.state)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = False
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:
+        self._renew(aid)
         rows = aid.innovation(self.state)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -283,7 +286,7 @@ class InvariantFilter(TiltAxesFilter):
             fed_back[DV : DV + 3] = self.nav[VN : VN + 3] - nav[VN : VN + 3]
             self.hypotheses.keep_fed_back(fed_back)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
-        turn_step(self.step, self.turned)
+        turn_step(self.step, self.turned, NOTHING_LEFT)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _hypothesise(self, aid: Linearised, rows: Innovation, found: Sought, prior: float) -> None:
@@ -327,7 +330,7 @@ class InvariantFilter(TiltAxesFilter):
             if rows is None:
                 nav, xi = self.without(self.nav, self.xi, error, turning)
                 step = self.step.copy()
-                turn_step(step, float(error[PHI + 2]))
+                turn_step(step, float(error[PHI + 2]), aid.remembered)
                 found = aid.innovation(State(nav, xi, step, self.model, self.covariance))
                 if isinstance(found, NotApplicable):
                     return found

@@ -68,12 +68,13 @@ class SeparatedEstimator(KalmanEstimator):
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
+        self._renew(aid)
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         held, self._holding = self._holding, True
         try:
-            outcome = super().update(aid, noise)
+            outcome = self._fold_renewed(aid, noise)
         finally:
             self._holding = held
         self._fold_into_subsets(aid, innovation)

@@ -5,6 +5,7 @@ r"""Group delay of a signal in the satellite, against the clock of the ephemeris
 GPS (clock refers to L1/L2 P, ionosphere-free):
     L1 P: d = TGD,  L2 P: d = (f1/f2)^2 TGD;  L1 C/A, L2C: the same, and 0.3 m more of sigma
     L5: d = TGD, and 3 m more of sigma
+    each of L1 C/A, L2C, L5 with CNAV: d = TGD - ISC, and 0.1 m, L5 0.3 m
 Galileo (clock of I/NAV refers to E1/E5b, of F/NAV to E1/E5a, each ionosphere-free):
     E1:  I/NAV d = BGDb,  F/NAV d = BGDa
     E5b: I/NAV d = (f1/f5b)^2 BGDb
@@ -20,23 +21,27 @@ Without a broadcast delay, so refused by name: BeiDou B1C and B2a until B-CNAV h
 until D1 or D2 has, Galileo E5 as a whole and E6.
 
 E5a with an I/NAV clock: both clocks serve E1, so dt_F - BGDa = dt_I - BGDb there, and dt_F follows.
-L1 C/A and L2C: the inter-signal corrections, in CNAV only as well, are the differential code biases
-C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5: the inter-signal correction is in CNAV only.
+L1 C/A and L2C: the inter-signal corrections, in CNAV only, are the differential code biases
+C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5 likewise.
 IS-GPS-705J 20.3.3.3.1.2.1 has it within +-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
 
-Source: IS-GPS-200N 20.3.3.3.3.2; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0 5.2.4
-(equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none), BDS-SIS-ICD-B1C-1.0 7.6 and
-BDS-SIS-ICD-B2a-1.0 7.6 (T_GD, ISC), 4.2 of both (power of the components).
+No standard bounds what an ISC is off by: a third of what is left without it is taken, of L5 a
+tenth.
+
+Source: IS-GPS-200N 20.3.3.3.3.2 and 30.3.3.3.1.1; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0
+5.2.4 (equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none), BDS-SIS-ICD-B1C-1.0 7.6
+and BDS-SIS-ICD-B2a-1.0 7.6 (T_GD, ISC), 4.2 of both (power of the components).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.raw.messages import CARRIER_HZ, Ephemeris
+from drivers.raw.messages import CARRIER_HZ, Ephemeris, SignalDelays
 
 GPS_L5_SIGMA_M = 3.0
 GPS_CIVIL_SIGMA_M = 0.3
+ISC_SIGMA_M = {"1": 0.1, "2": 0.1, "5": 0.3}
 _P_CODES = "WPYMD"
 """Signals that the clock refers to."""
 
@@ -56,9 +61,16 @@ _DATA_BAND = {"bcnav1": "1", "bcnav2": "5"}
 _DATA_SHARE = {"1P": 0.0, "1D": 1.0, "1X": 0.25, "5P": 0.0, "5D": 1.0, "5X": 0.5}
 
 
-def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
-    """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris; None if unknown."""
+def group_delay(
+    ephemeris: Ephemeris, signal: str, told: SignalDelays | None = None
+) -> GroupDelay | None:
+    """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris, and by what CNAV
+    has `told`; None if unknown."""
     band, delays = signal[0], ephemeris.group_delay_s
+    if told is not None:
+        for name, correction_s in told.correction_s:
+            if name == signal:
+                return GroupDelay(told.group_delay_s - correction_s, ISC_SIGMA_M[band])
     if ephemeris.system == "G":
         return _gps(signal, delays)
     if ephemeris.system == "E":

@@ -17,12 +17,18 @@ Angles rad, lengths m, times s; ECEF is that of the instant of transmission (WGS
 agree to centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv);
 the relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
 
+A service's corrections (fusiond.gnss.corrections), dO of the orbit and dC of the clock, at the age
+a = t - t0 of each:
+
+    s <- s - [er ea ec] (dO + dO' a),     ea = v / |v|,  ec = s x v / |s x v|,  er = ea x ec
+    dt <- dt + (C0 + C1 a + C2 a^2) / c
+
 BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
 time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.
 
 Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4
 (ephemeris parameters, with the rotation for GEO); BDS-SIS-ICD-B1C-1.0 7.7 (Adot and n', which
-are 0 elsewhere); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
+are 0 elsewhere); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4; RTCM 10403.3 3.5.12 (corrections).
 """
 
 from __future__ import annotations
@@ -81,12 +87,13 @@ def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
 
 
 # Columns of the elements' array.
-_COLUMNS = 33
+_COLUMNS = 47
 (
     _WEEK, _TOE, _TOC, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _ROOT, _COS_I0, _SIN_I0, _NODE,
     _COS_PERIGEE, _SIN_PERIGEE, _M0, _MOTION, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC,
     _CIS, _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK, _AXIS_RATE,
-    _MOTION_RATE,
+    _MOTION_RATE, _CORRECTED, _ORBIT_WEEK, _ORBIT_TOW, _RADIAL, _ALONG, _ACROSS, _RADIAL_RATE,
+    _ALONG_RATE, _ACROSS_RATE, _CLOCK_WEEK, _CLOCK_TOW, _C0, _C1, _C2,
 ) = range(_COLUMNS)  # fmt: skip
 
 
@@ -103,13 +110,31 @@ def turned(cosine: float, sine: float, small: float) -> tuple[float, float]:
     return cosine * c - sine * s, sine * c + cosine * s
 
 
+@compiled("void(f8[::1], f8, f8[::1])")
+def _correct(q: Array, age: float, state: Array) -> None:
+    """Take an orbit's error, as it is at an `age` (s), off the position in `state` (8,)."""
+    x, y, z, vx, vy, vz = state[0], state[1], state[2], state[3], state[4], state[5]
+    speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+    ax, ay, az = vx / speed, vy / speed, vz / speed
+    cx, cy, cz = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
+    size = math.sqrt(cx * cx + cy * cy + cz * cz)
+    cx, cy, cz = cx / size, cy / size, cz / size
+    rx, ry, rz = ay * cz - az * cy, az * cx - ax * cz, ax * cy - ay * cx
+    r = q[_RADIAL] + q[_RADIAL_RATE] * age
+    a = q[_ALONG] + q[_ALONG_RATE] * age
+    c = q[_ACROSS] + q[_ACROSS_RATE] * age
+    state[0] -= rx * r + ax * a + cx * c
+    state[1] -= ry * r + ay * a + cy * c
+    state[2] -= rz * r + az * a + cz * c
+
+
 @compiled("void(f8[:, ::1], f8, f8[::1], b1, f8[:, ::1])")
 def satellite_states(
     elements: Array, week: float, tow: Array, by_satellite_clock: bool, out: Array
 ) -> None:
     """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
 
-    `elements` (n, 33) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
+    `elements` (n, 47) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
     satellite's own clock has it if `by_satellite_clock`.
     """
     for k in range(elements.shape[0]):
@@ -181,10 +206,21 @@ def satellite_states(
         relativity = q[_F] * ecc * sqrt_a
         out[k, 6] = q[_A0] + (q[_A1] + q[_A2] * since_toc) * since_toc + relativity * sin_e
         out[k, 7] = q[_A1] + 2.0 * q[_A2] * since_toc + relativity * cos_e * anomaly_rate
+        if q[_CORRECTED] > 0.0:
+            _correct(q, (week - q[_ORBIT_WEEK]) * WEEK_S + (tow[k] - q[_ORBIT_TOW]), out[k])
+            age = (week - q[_CLOCK_WEEK]) * WEEK_S + (tow[k] - q[_CLOCK_TOW])
+            out[k, 6] += (q[_C0] + (q[_C1] + q[_C2] * age) * age) / SPEED_OF_LIGHT_M_S
+            out[k, 7] += (q[_C1] + 2.0 * q[_C2] * age) / SPEED_OF_LIGHT_M_S
 
 
-def elements_row(ephemeris: Ephemeris) -> Array:
-    """One ephemeris as the row (33,) that `satellite_states` takes."""
+NOT_CORRECTED = (0.0,) * 14
+"""The last columns of a satellite by its own ephemeris alone."""
+
+
+def elements_row(ephemeris: Ephemeris, corrected: Sequence[float] = NOT_CORRECTED) -> Array:
+    """One ephemeris as the row (47,) that `satellite_states` takes. `corrected` (14,): 1; week and
+    second (GPS time) that the orbit's correction holds at, radial, along, across (m), their rates;
+    week and second of the clock's, C0, C1, C2."""
     e = ephemeris
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
@@ -201,7 +237,7 @@ def elements_row(ephemeris: Ephemeris) -> Array:
         e.mean_anomaly, motion, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
         e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
         math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week, e.semi_major_rate,
-        e.mean_motion_rate,
+        e.mean_motion_rate, *corrected,
     )  # fmt: skip
     return np.array(values, float)
 
@@ -217,14 +253,17 @@ class SatelliteStates(NamedTuple):
 
 @immutable()
 class Orbits:
-    """Ephemerides of n satellites, stacked once: `elements` (n, 33)."""
+    """Ephemerides of n satellites, stacked once: `elements` (n, 47)."""
 
     elements: Array
 
     @classmethod
-    def of(cls, ephemerides: Sequence[Ephemeris]) -> Orbits:
-        """Stack ephemerides in their order."""
-        rows = [elements_row(e) for e in ephemerides]
+    def of(
+        cls, ephemerides: Sequence[Ephemeris], corrected: Sequence[Sequence[float]] = ()
+    ) -> Orbits:
+        """Stack ephemerides in their order, with the correction of each, if there are any."""
+        given = corrected or (NOT_CORRECTED,) * len(ephemerides)
+        rows = [elements_row(e, c) for e, c in zip(ephemerides, given, strict=True)]
         return cls(np.array(rows).reshape(len(rows), _COLUMNS))
 
     def at(self, week: int, tow_s: float | Array) -> SatelliteStates:

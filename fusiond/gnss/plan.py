@@ -9,7 +9,8 @@ is the least uncertain; without a pair the first of `PREFERRED` that is there.
 s of a code, s_a and s_b what stays unknown of the group delays.
 
 Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
-its signals, or of none that is preferred).
+its signals, or of none that is preferred), `no_correction` (of a system that goes by a service's:
+fusiond.gnss.corrections).
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ from drivers.raw.messages import (
 from fusiond.gnss import carriers as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.bdgim import TERMS, bdgim_terms
-from fusiond.gnss.group_delay import GroupDelay, group_delay
-from fusiond.gnss.orbit import Orbits
+from fusiond.gnss.corrections import Applied
+from fusiond.gnss.group_delay import GroupDelay
+from fusiond.gnss.orbit import NOT_CORRECTED, Orbits
 from fusiond.gnss.store import EphemerisStore
 
 Array = npt.NDArray[np.float64]
@@ -149,6 +151,7 @@ class _Served(NamedTuple):
     group: tuple[System, bool, str]
     fixed: tuple[float, float, float, float]
     followed: tuple[float, float, float, float, float, float, float, float]
+    corrected: tuple[float, ...]
 
 
 class Planner:
@@ -166,8 +169,9 @@ class Planner:
                 by_satellite.setdefault((s.system, s.prn), {})[s.signal] = k
         chosen: list[_Served] = []
         refused: list[tuple[str, str]] = []
+        corrected = self._corrected(epoch, by_satellite)
         for found in by_satellite.values():
-            served = self._serve(epoch, found)
+            served = self._serve(epoch, found, corrected)
             if isinstance(served, str):
                 refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
             else:
@@ -192,31 +196,66 @@ class Planner:
             tuple(s.signal for s in signals),
             np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
             np.array([self.options.systems.index(s.system) for s in signals], np.int64),
-            Orbits.of([s.ephemeris for s in chosen]),
+            Orbits.of([s.ephemeris for s in chosen], [s.corrected for s in chosen]),
             np.array(groups, float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
             tuple(refused),
         )
 
-    def _serve(self, epoch: RawGnssEpoch, found: dict[str, int]) -> _Served | str:
+    def _corrected(
+        self, epoch: RawGnssEpoch, satellites: dict[tuple[System, int], dict[str, int]]
+    ) -> dict[System, dict[int, Applied]]:
+        """By system that goes by corrections, those of its satellites."""
+        found: dict[System, dict[int, Applied]] = {}
+        if not self.store.corrections:
+            return found
+        for system in {system for system, _ in satellites}:
+            numbers = [prn for s, prn in satellites if s == system]
+            given = {
+                prn: applied
+                for prn in numbers
+                if (applied := self.store.corrected(system, prn, epoch.week, epoch.tow_s))
+            }
+            if given and 2 * len(given) >= len(numbers):
+                found[system] = given
+        return found
+
+    def _serve(
+        self,
+        epoch: RawGnssEpoch,
+        found: dict[str, int],
+        corrected: dict[System, dict[int, Applied]],
+    ) -> _Served | str:
         """Of one satellite's signals those that serve."""
         first = epoch.signals[next(iter(found.values()))]
         wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
         outcome = "no_group_delay"
         candidates: list[tuple[int, Ephemeris, GroupDelay]] = []
+        applied = None
+        if first.system in corrected:
+            applied = corrected[first.system].get(first.prn)
+            wanted = [k for k in wanted if applied and epoch.signals[k].signal in applied.bias]
+            if applied is None or not wanted:
+                return "no_correction"
         for k in wanted or found.values():
             s = epoch.signals[k]
+            if applied is not None:
+                candidates.append((k, applied.ephemeris, _by_bias(applied, s.signal)))
+                continue
             e = self.store.select(s.system, s.prn, epoch.week, epoch.tow_s, s.signal[0])
             if isinstance(e, str):
                 outcome = e
-            elif (delay := group_delay(e, s.signal)) is not None:
+            elif (delay := self.store.delay(e, s.signal)) is not None:
                 candidates.append((k, e, delay))
         if not candidates:
             return outcome
         best: tuple[float, int, int, Ephemeris, GroupDelay, GroupDelay] | None = None
         for k, e, delay in candidates:
             for j in found.values():
-                other = group_delay(e, epoch.signals[j].signal)
+                name = epoch.signals[j].signal
+                other = self.store.delay(e, name)
+                if applied is not None:
+                    other = _by_bias(applied, name) if name in applied.bias else None
                 if other is None:
                     continue
                 gamma = _gamma(epoch.signals[k], epoch.signals[j])
@@ -229,9 +268,9 @@ class Planner:
                     best = variance, k, j, e, delay, other
         if best is None:
             k, e, delay = candidates[0]
-            return self._served(epoch, k, e, delay, None, None)
+            return self._served(epoch, k, e, delay, None, None, applied)
         _, k, j, e, delay, other = best
-        return self._served(epoch, k, e, delay, j, other)
+        return self._served(epoch, k, e, delay, j, other, applied)
 
     def _served(
         self,
@@ -241,6 +280,7 @@ class Planner:
         delay: GroupDelay,
         second: int | None,
         other: GroupDelay | None,
+        applied: Applied | None,
     ) -> _Served:
         s = epoch.signals[index]
         model, scale = self._ionosphere_model(s)
@@ -248,6 +288,8 @@ class Planner:
         beidou_2 = s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN
         if beidou_2:
             in_space = max(in_space, BEIDOU_2_IN_SPACE_M)
+        if applied is not None:
+            in_space = applied.sigma_m
         variance = in_space**2 + delay.sigma_m**2
         delay_m = SPEED_OF_LIGHT_M_S * delay.delay_s
         slot = float(64 * SYSTEMS.index(s.system) + s.prn)
@@ -269,7 +311,8 @@ class Planner:
             )
         fixed = (delay_m, model, scale, variance)
         group = s.system, beidou_2, s.signal[0]
-        return _Served(index, second, ephemeris, group, fixed, followed)
+        columns = NOT_CORRECTED if applied is None else applied.columns
+        return _Served(index, second, ephemeris, group, fixed, followed, columns)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
         """Model and scale to the signal's frequency: the system's own, else whichever came. Of
@@ -293,6 +336,11 @@ class Planner:
         if self.store.bdgim is not None:
             out[2] = bdgim_terms(self.store.bdgim, epoch.week, epoch.tow_s)
         return out
+
+
+def _by_bias(applied: Applied, signal: str) -> GroupDelay:
+    """What a bias, added to the range, is as a group delay."""
+    return GroupDelay(-applied.bias[signal] / SPEED_OF_LIGHT_M_S)
 
 
 def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:

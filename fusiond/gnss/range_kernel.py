@@ -34,7 +34,9 @@ w = v - v_r, of which `PULL` has l . a, the satellite's; in the turning axes
 
 r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
 
-Variances: see `fusiond.gnss.ranges`.
+Variances: see `fusiond.gnss.ranges`. `LASTING` is what of a range's lasts for many minutes and is
+this satellite's own: orbit, clock and group delay, what is left of the ionosphere from place to
+place, and what its two carriers know of it.
 """
 
 from __future__ import annotations
@@ -102,12 +104,13 @@ NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # Columns of `first` as the receiver says them; NaN where it does not.
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
 # Results; the first seventeen are what an aid takes (fusiond.aiding.pseudorange).
-ROW_COLUMNS = 27
+ROW_COLUMNS = 29
 AID_ROWS = 17
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
     COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL,
     LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, TROPOSPHERE, IONOSPHERE, TOTAL_VARIANCE,
+    LASTING, SLOT,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -149,7 +152,11 @@ def _take_off_ionosphere(
         out[CORRECTED, k] -= out[IONOSPHERE, k]
         left = (1.0 - share) * sigma
         out[COMMON, k] = left
-        out[VARIANCE, k] += variance + ((1.0 - share) * own) ** 2
+        local_variance = ((1.0 - share) * own) ** 2
+        out[VARIANCE, k] += variance + local_variance
+        out[LASTING, k] = signals[k, FIXED_VARIANCE] + local_variance
+        if share > 0.0:
+            out[LASTING, k] += share * share * carriers[k, SLANT_VARIANCE]
         out[BEIDOU_2_SIGMA, k] = 0.0
         if signals[k, BEIDOU_2] > 0.0:
             out[BEIDOU_2_SIGMA, k] = BEIDOU_2_CODE_M + BEIDOU_2_PAIR_M * share
@@ -180,10 +187,11 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (27, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
-    many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
+    """Write (29, n) values, the last but `SLOT`, which is the plan's, for a receiver (3,) ECEF
+    m at GPS time `week`, `tow` of its clock; how many satellites are lower than
+    `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 33), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
+    `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
     terms of BDGIM; `noise` (8,).
     """

@@ -91,7 +91,8 @@ class Rows:
     BeiDou-2), `total_variance` (n,) of both; `carrier_rate_m_s` (n,) the mean rate over the last
     `span_s` (n,) by the carrier, NaN and 0 where there is none; `troposphere_m` and
     `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
-    `values` (27, n) has all of them, as `range_kernel.range_rows` writes it.
+    `lasting` (n,) m^2 what of `variance` lasts for many minutes.
+    `values` (29, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -118,6 +119,7 @@ class Rows:
     span_s = _Of(rk.CARRIER_SPAN)
     carrier_rate_m_s = _Of(rk.CARRIER_RATE)
     total_variance = _Of(rk.TOTAL_VARIANCE)
+    lasting = _Of(rk.LASTING)
 
     @property
     def azimuth_rad(self) -> Array:
@@ -254,6 +256,7 @@ class RangeModel:
             options.cno_mask_db_hz,
             out,
         )
+        out[rk.SLOT] = plan.followed[:, ca.SLOT]
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
         if not lost:

@@ -3,7 +3,9 @@
     |t - toe| <= limit        t, toe in GPS time
 
 The closest toe is taken. A satellite keeps its last issues, so at a changeover a late measurement
-still meets the older one. Health is what the satellite said last, whatever issue is used.
+still meets the older one. A number that is given to another satellite shows in an orbit that no
+satellite can go over to: what the old one sent is forgotten then. Health is what the satellite said
+last, whatever issue is used.
 
 Outcomes: `no_ephemeris`, `unhealthy`, `stale_ephemeris`.
 """
@@ -12,14 +14,30 @@ from __future__ import annotations
 
 from typing import Literal
 
-from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
-from fusiond.gnss.orbit import WEEK_S, gps_time
+import numpy as np
+
+from drivers.raw.messages import (
+    Bdgim,
+    Correction,
+    Ephemeris,
+    Klobuchar,
+    NavigationMessage,
+    SignalDelays,
+    System,
+)
+from fusiond.gnss.corrections import MESSAGES as CORRECTED
+from fusiond.gnss.corrections import Applied, Corrections, issue_of
+from fusiond.gnss.group_delay import GroupDelay, group_delay
+from fusiond.gnss.orbit import WEEK_S, Orbits, gps_time
 
 MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
 """GPS: fit interval of 4 h centred on toe (IS-GPS-200N 20.3.4.4 and table 20-XI). Galileo: 4 h
 (Galileo OS SDD: longest time a set of navigation data is valid). BeiDou: a new set each hour, for
 the hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4; toe on the hour), and one hour more for a set that
 was not received whole."""
+COMPARED_S, APART_M = 14_400.0, 1e5
+"""Four hours beyond its toe a broadcast orbit is kilometres off, after a manoeuvre tens; two
+satellites are thousands apart."""
 KEPT_ISSUES = 4
 """By message: the present issue, the next, and what measurements out of a queue may need."""
 
@@ -44,7 +62,11 @@ class EphemerisStore:
         self._kept: dict[tuple[System, int, str], list[Ephemeris]] = {}
         self.ionosphere: dict[System, Klobuchar] = {}
         self.bdgim: Bdgim | None = None
+        self.corrections = Corrections()
+        self._delays: dict[tuple[System, int], SignalDelays] = {}
         self.version = 0
+        self.replaced = 0
+        """How often a number has become another satellite's."""
 
     def __len__(self) -> int:
         """Satellites of which an ephemeris is held."""
@@ -52,6 +74,15 @@ class EphemerisStore:
 
     def add(self, message: NavigationMessage) -> None:
         """Take in what a decoder completed; the same again changes only when it was seen."""
+        if isinstance(message, Correction):
+            self.corrections.add(message)
+            self.version += 1
+            return
+        if isinstance(message, SignalDelays):
+            known = self._delays.get((message.system, message.prn))
+            self._delays[message.system, message.prn] = message
+            self.version += known is None or _delays(known) != _delays(message)
+            return
         if isinstance(message, Bdgim):
             if self.bdgim is None or self.bdgim.alpha != message.alpha:
                 self.version += 1
@@ -64,6 +95,10 @@ class EphemerisStore:
             self.ionosphere[message.system] = message
             return
         key = (message.system, message.prn, message.message)
+        if self._of_another(message):
+            for other in [k for k in self._kept if k[:2] == key[:2]]:
+                del self._kept[other]
+            self.replaced += 1
         kept = self._kept.setdefault(key, [])
         same = [e for e in kept if (e.week, e.toe_s) == (message.week, message.toe_s)]
         for e in same:
@@ -72,6 +107,35 @@ class EphemerisStore:
         del kept[:-KEPT_ISSUES]
         if not (same and _differs_only_in_time(same[-1], message)):
             self.version += 1
+
+    def _of_another(self, message: Ephemeris) -> bool:
+        """True if the last ephemeris of that number is of another orbit: of another satellite."""
+        kept = self._kept.get((message.system, message.prn, message.message))
+        if not kept or (kept[-1].week, kept[-1].toe_s) == (message.week, message.toe_s):
+            return False
+        week, toe_s = gps_time(message.system, message.week, message.toe_s)
+        if abs(seconds_from_toe(kept[-1], week, toe_s)) > COMPARED_S:
+            return False
+        old, new = Orbits.of([kept[-1], message]).at(week, toe_s).position
+        return bool(np.linalg.norm(old - new) > APART_M)
+
+    def delay(self, ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
+        """Group delay of a signal by all that its satellite has sent; None if unknown."""
+        told = self._delays.get((ephemeris.system, ephemeris.prn))
+        return group_delay(ephemeris, signal, told)
+
+    def corrected(self, system: System, prn: int, week: int, tow_s: float) -> Applied | None:
+        """The ephemeris with the correction that holds at a GPS time; None where there is none."""
+        issue = self.corrections.issue(system, prn, week, tow_s)
+        if issue is None:
+            return None
+        for message in CORRECTED[system]:
+            kept = self._kept.get((system, prn, message), [])
+            for e in reversed(kept):
+                old = abs(seconds_from_toe(e, week, tow_s)) > MAX_AGE_S[system]
+                if issue_of(e) == issue and e.healthy and kept[-1].healthy and not old:
+                    return self.corrections.applied(e, week, tow_s)
+        return None
 
     def select(
         self, system: System, prn: int, week: int, tow_s: float, band: str = ""
@@ -99,6 +163,10 @@ def seconds_from_toe(ephemeris: Ephemeris, week: int, tow_s: float) -> float:
     """t - toe in s for a GPS time."""
     toe_week, toe = gps_time(ephemeris.system, ephemeris.week, ephemeris.toe_s)
     return (week - toe_week) * WEEK_S + (tow_s - toe)
+
+
+def _delays(message: SignalDelays) -> tuple[object, ...]:
+    return message.group_delay_s, message.correction_s
 
 
 def _differs_only_in_time(a: Ephemeris, b: Ephemeris) -> bool:

@@ -28,7 +28,15 @@ from drivers.measurements import (
     TimeReport,
     WheelSpeed,
 )
-from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, RawGnssEpoch
+from drivers.raw.messages import (
+    Bdgim,
+    Correction,
+    Ephemeris,
+    Klobuchar,
+    NavigationMessage,
+    RawGnssEpoch,
+    SignalDelays,
+)
 from drivers.rdss.mail import FleetFix, Mail, MessageReceived, MessageStage
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.outputs.commands import Inject
@@ -174,7 +182,7 @@ class Fault:
                 return replace(item, azimuth_rad=item.azimuth_rad + error)
             case RawGnssEpoch() | TimeReport() | DeviceEvent():
                 return item
-            case Ephemeris() | Klobuchar() | Bdgim():
+            case Ephemeris() | Klobuchar() | Bdgim() | SignalDelays() | Correction():
                 return item
             case MessageReceived() | MessageStage() | FleetFix():
                 return item

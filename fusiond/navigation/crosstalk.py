@@ -104,7 +104,7 @@ class Crosstalk:
         )
         self._mean = np.zeros(13)
         self.squares = FromInstants()
-        """By what factor (1,) m^2 is another, as the unit has shown (fusiond.navigator.unit_grade)."""
+        """Factor (1,) of m^2 as the unit has shown it (fusiond.navigator.unit_grade)."""
 
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
         """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) at `times`

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import NotApplicable, State
 from fusiond.aiding.pseudorange import RANGE_BIAS, RANGE_SHARED
-from fusiond.aiding.range_rows import DISPLACED_BY
 from fusiond.estimators.base import Estimator
 from fusiond.gnss.ecef import ned_axes
 from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude
@@ -131,8 +130,7 @@ class EpochProtection:
             np.full(int(clocks.max(initial=-1)) + 1, CONSTELLATION_FAULT),
         )
         slots = [slot for block in RANGE_BIAS for slot in state.model.slots_of(block)]
-        several = math.sqrt(DISPLACED_BY / max(n, 1))
-        shared = several * state.xi[slots] if len(slots) == 3 else np.zeros(3)
+        shared = corrected.aid.shape @ state.xi[slots] if len(slots) == 3 else np.zeros(3)
         # Of an epoch alone nothing is known of what its ranges share.
         columns = state.model.slots_of_all(RANGE_SHARED)
         z = innovation.z[:n] + innovation.h[:n, columns] @ state.xi[columns]

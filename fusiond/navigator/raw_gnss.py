@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
@@ -18,14 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from drivers.raw.messages import NavigationMessage, RawGnssEpoch
+from drivers.raw.messages import Ephemeris, NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
 from fusiond.aiding.way_faced import WayFaced
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
+from fusiond.gnss.displacement import Displacement
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
+from fusiond.gnss.levels import Levels, take_off
+from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.range_kernel import (
     AID_ROWS,
     CARRIER_VARIANCE,
@@ -50,6 +53,15 @@ REMEMBERED_NS = 12_000_000_000
 """Epochs older than that are too old for the timeline, which goes back by ten seconds."""
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """Names of screened rows in `health`; everything else is `gated`."""
+
+
+PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
+"""Of the displacement's states by their defaults, `bias_sd_m` and `bias_down_sd_m`: that is what a
+sky of eight satellites displaces, and stands for what the sky at hand does."""
+
+
+NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), np.zeros((3, 3)), np.zeros((3, 3)))
+"""Of an epoch without satellites."""
 
 
 class Seen(NamedTuple):
@@ -87,7 +99,8 @@ class _Corrected(NamedTuple):
 class _Memory:
     """Result of an epoch, and whether its refused satellites have been counted. `left` is
     what the filter's last run over it leaves to the next. `followed` is the epoch after the one
-    whose `kept` is `after`, and `kept` what is known of carriers then."""
+    whose `kept` is `after`, and `kept` what is known of carriers then; `displacement` and
+    `levels` are those of its sky, once it has been corrected."""
 
     corrected: _Corrected | None = None
     counted: bool = False
@@ -96,6 +109,8 @@ class _Memory:
     followed: Followed | None = None
     after: Array | None = None
     kept: Array = field(default_factory=nothing_kept)
+    displacement: Displacement | None = None
+    levels: Levels | None = None
 
     def is_after(self, before: _Memory) -> bool:
         """True if the epoch has been followed from that one."""
@@ -200,11 +215,16 @@ class RawGnss:
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
         self.recent: list[RawEpochAid] = []
+        self._forgotten: tuple[Displacement | None, Levels | None] = None, None
+        """Those of the last sky before them."""
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
         """Keep what a satellite has said."""
+        replaced = self._store.replaced
         self._store.add(message)
+        if self._store.replaced > replaced and isinstance(message, Ephemeris):
+            self.refused[f"{message.system}_number_of_another"] += 1
 
     def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
         """The epoch as an aid, with the ephemerides that are known by now."""
@@ -212,7 +232,11 @@ class RawGnss:
         aid = RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
         insort(self.recent, aid, key=_instant)
         oldest = self.recent[-1].t_ns - REMEMBERED_NS
-        del self.recent[: bisect_left(self.recent, oldest, key=_instant)]
+        forgotten = self.recent[: bisect_left(self.recent, oldest, key=_instant)]
+        for earlier in forgotten:
+            memory, last = earlier.memory, self._forgotten
+            self._forgotten = memory.displacement or last[0], memory.levels or last[1]
+        del self.recent[: len(forgotten)]
         return aid
 
     def followed(self, aid: RawEpochAid) -> Followed:
@@ -269,10 +293,13 @@ class RawGnss:
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
+        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
+        levels = aid.memory.levels = take_off(self._last_levels(aid), rows, t_s)
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
+        displacement, kept = self._displaced(aid, rows, levels.variance)
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -284,8 +311,35 @@ class RawGnss:
             aid.epoch.clock_reset,
             aid.memory.before,
             aid.memory.left,
+            displacement.root * PER_SIGMA,
+            kept,
+            levels.seen,
             robust=aid.robust,
         )
+
+    def _earlier(self, aid: RawEpochAid) -> Iterator[_Memory]:
+        """Epochs before one, the last first."""
+        at = bisect_left(self.recent, aid.t_ns, key=_instant)
+        return (self.recent[k].memory for k in range(at - 1, -1, -1))
+
+    def _last_levels(self, aid: RawEpochAid) -> Levels | None:
+        found = (memory.levels for memory in self._earlier(aid))
+        return next((levels for levels in found if levels is not None), self._forgotten[1])
+
+    def _displaced(
+        self, aid: RawEpochAid, rows: Rows, variance: Array
+    ) -> tuple[Displacement, tuple[Array, Array] | None]:
+        """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
+        if not rows.satellites:
+            return NOWHERE, None
+        found = (memory.displacement for memory in self._earlier(aid))
+        before = next((d for d in found if d is not None), self._forgotten[0])
+        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
+        if before is not None and before.holds(rows, t_s):
+            aid.memory.displacement = before
+            return before, None
+        aid.memory.displacement = now = Displacement.of(rows, t_s, variance)
+        return now, None if before is None else now.carried(before)
 
     def judged(
         self,

@@ -22,7 +22,8 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
-from drivers.raw.messages import RawEvent, RawGnssEpoch
+from drivers.raw.messages import Correction, RawEvent, RawGnssEpoch
+from drivers.raw.weeks import leap_seconds, utc_ns
 from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.configuration.aiding import (
@@ -280,7 +281,11 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
         decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
+    corrections: list[Correction] = []
     for event in [*decoder.feed(log.data, 0), *decoder.flush()]:
+        if isinstance(event, Correction):
+            corrections.append(event)
+            continue
         if not isinstance(event, RawGnssEpoch):
             broadcast.append(event)
             continue
@@ -288,12 +293,24 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
         if not of_week and isinstance(event.stamp, UtcStamp):
             now = event.stamp.utc_ns
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
+    corrected = [_corrected(c, of_week) for c in corrections]
+    if not epochs and corrected:
+        return corrected, log.notes
     if not epochs:
         nothing = "no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)"
         raise TableError(f"{path}: {kind_of(log.data) or nothing}")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
-    return [*(Arrival(first_ns, event) for event in broadcast), *epochs], [*log.notes, *refused]
+    known = (Arrival(first_ns, event) for event in broadcast)
+    return [*known, *corrected, *epochs], [*log.notes, *refused]
+
+
+def _corrected(correction: Correction, of_week: bool) -> Arrival:
+    """A correction as it came: at the instant of its epoch, before half an interval."""
+    c = correction
+    tow_s = c.tow_s - (0.5 * c.interval_s if c.interval_s > 1.0 else 0.0)
+    now = _ns(tow_s) if of_week else utc_ns(c.week, tow_s, leap_seconds(c.week, tow_s))
+    return Arrival(now, replace(c, t_seen_ns=now))
 
 
 READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {

@@ -31,7 +31,14 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import (
+    Bdgim,
+    Correction,
+    Ephemeris,
+    Klobuchar,
+    RawGnssEpoch,
+    SignalDelays,
+)
 from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
@@ -304,7 +311,9 @@ class _Replay:
                     reports = self._reports.setdefault(item.source, deque(maxlen=REPORTS))
                     reports.append(self._host.stamp_ns - item.utc_ns)
                 self._clock.report(item)
-            case Ephemeris() | Klobuchar() | Bdgim() | RawGnssEpoch():
+            case (
+                Ephemeris() | Klobuchar() | Bdgim() | SignalDelays() | Correction() | RawGnssEpoch()
+            ):
                 raise AssertionError("no driver on a CAN bus has raw observations")
             case MessageReceived() | MessageStage() | FleetFix():
                 raise AssertionError("no driver on a CAN bus has short messages")

@@ -13,7 +13,14 @@ from drivers.bestpos.decoder import BestposDecoder
 from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
 from drivers.nmea.protocols import named
-from drivers.raw.messages import Bdgim, Ephemeris, NavigationMessage, RawGnssEpoch
+from drivers.raw.messages import (
+    Bdgim,
+    Correction,
+    Ephemeris,
+    NavigationMessage,
+    RawGnssEpoch,
+    SignalDelays,
+)
 from drivers.raw.rinex import (
     COMPRESSED_LABEL,
     FIRST_LABEL,
@@ -176,8 +183,12 @@ def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:
 
 def _kind(message: NavigationMessage) -> tuple[str, str]:
     """Of which one stands for the next: satellite and message, or the ionosphere's model."""
+    if isinstance(message, Correction):
+        return message.satellite, message.part
     if isinstance(message, Ephemeris):
         return message.satellite, message.message
+    if isinstance(message, SignalDelays):
+        return message.satellite, "delays"
     return ("C", "bdgim") if isinstance(message, Bdgim) else (message.system, "")
 
 

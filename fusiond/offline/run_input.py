@@ -8,7 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.measurements import ImuSample, Measurement, MonotonicStamp
-from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
+from drivers.raw.messages import (
+    Bdgim,
+    Correction,
+    Ephemeris,
+    Klobuchar,
+    RawEvent,
+    RawGnssEpoch,
+    SignalDelays,
+    System,
+)
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counts
@@ -98,7 +107,7 @@ def _read_aid(
     return READERS[kind](path, imu, source)
 
 
-BROADCAST = Ephemeris, Klobuchar, Bdgim
+BROADCAST = Ephemeris, Klobuchar, Bdgim, SignalDelays, Correction
 """Navigation messages are valid at no instant. (A union would be made anew at each question.)"""
 
 

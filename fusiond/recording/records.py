@@ -22,6 +22,7 @@ Records stand in the order in which the daemon handled them: a log is played by 
     timer       its name
     sent        bytes that the driver gave to its device: an output, which replay compares
     command     JSON: an operator's command, with its name
+    correction  bytes of a caster's frame that the driver used itself
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class Kind(IntEnum):
     TIMER = 7
     SENT = 8
     COMMAND = 9
+    CORRECTION = 10
 
 
 _KINDS = {int(kind): kind for kind in Kind}
@@ -207,6 +209,7 @@ KINDS_BY_INPUT = {
     "close": Kind.CLOSE,
     "controller": Kind.CONTROLLER,
     "sent": Kind.SENT,
+    "correction": Kind.CORRECTION,
 }
 """Of `drivers.inputs`; a kind that is not listed is a timer of the driver's own."""
 
@@ -233,7 +236,7 @@ def input_of(record: Record) -> tuple[str, bytes | str | CanFrame | None]:
     if kind is Kind.FRAME:
         return "frame", frame_of(record)
     match kind:
-        case Kind.READ | Kind.SENT:
+        case Kind.READ | Kind.SENT | Kind.CORRECTION:
             return kind.name.lower(), record.payload
         case Kind.TIMER:
             return record.payload.decode(), None

@@ -20,6 +20,7 @@ from fusiond.aiding.pseudorange import (
 from fusiond.aiding.range_rows import UNUSED_VARIANCE
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.invariant_error import turn_step
 from fusiond.models.blocks import clock_blocks, shared_error
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -214,9 +215,12 @@ SPAN_S = 0.5
 FORCE = (0.6, -0.4, -9.7)
 
 
-def _moved(error: Array, rate_b: Array, force_b: Array) -> tuple[Array, Array, Array, Array]:
-    """Navigation state and step at either end of `SPAN_S`, by an IMU of 100 Hz."""
-    nav = runs.level_nav(RPY, VELOCITY)
+def _moved(
+    error: Array, rate_b: Array, force_b: Array, turned: float = 0.0
+) -> tuple[Array, Array, Array, Array]:
+    """Navigation state and step at either end of `SPAN_S`, by an IMU of 100 Hz, of a vehicle whose
+    heading is `turned` (rad)."""
+    nav = runs.level_nav((RPY[0], RPY[1], RPY[2] + turned), VELOCITY)
     nav = runs.with_error(nav, error[:9])
     step, none = np.zeros(STEP_SIZE), np.zeros(3)
     strapdown_step(nav, rate_b, force_b, none, none, 0.01, False, step)
@@ -239,8 +243,10 @@ def _by_carrier(
     s: Array,
     s_dot: Array,
     dopplers: Array | None = None,
+    turned: tuple[float, Array] | None = None,
 ) -> Innovation:
-    """Rows of an epoch whose rates are the carriers', with what the epoch before left."""
+    """Rows of an epoch whose rates are the carriers', with what the epoch before left; at a state
+    that a filter has `turned` by psi, and its navigation state (10,) then."""
     nav_0, step_0, nav_1, step_1 = ends
     n = len(s)
     values = epoch_values(s, s_dot, np.full(n, np.nan), np.full(n, np.nan), np.ones(n), np.ones(n))
@@ -253,7 +259,29 @@ def _by_carrier(
     then = PseudorangeAid(
         "raw", 0, 0.999, names, values, clock, LEVER, before=first.left, left=nothing_left()
     )
+    if turned is not None:
+        psi, nav_1 = turned
+        step_1 = step_1.copy()
+        turn_step(step_1, psi, then.remembered)
     return _innovation(then, State(nav_1, np.zeros(model.size), step_1, model))
+
+
+@pytest.mark.parametrize("psi", [0.02, -0.5, 2.5])
+def test_a_turned_heading_turns_what_the_carriers_go_by(psi: float) -> None:
+    """A filter that asks what an epoch is were its heading another: as of a vehicle that had that
+    heading all along, lever arm and what the IMU felt since the epoch before."""
+    model = _model_with_carriers()
+    ends = _moved(np.zeros(9), RATE_SENSED, np.array(FORCE))
+    other = _moved(np.zeros(9), RATE_SENSED, np.array(FORCE), psi)
+    s, s_dot = _satellites(ends[2])
+    rates = np.zeros(len(s))
+    expected = _by_carrier(model, other, rates, s, s_dot)
+    found = _by_carrier(model, ends, rates, s, s_dot, None, (psi, other[2]))
+    assert found.z == pytest.approx(expected.z, abs=1e-3)  # Coriolis of the other way
+    assert found.h == pytest.approx(expected.h, abs=1e-3)
+    # Half a second of 0.7 m/s^2, and a lever arm of 1.4 m, are otherwise metres a second off.
+    unturned = _by_carrier(model, ends, rates, s, s_dot, None, (0.0, other[2]))
+    assert np.abs(unturned.z - expected.z).max() > 0.5 * abs(math.sin(psi))
 
 
 def test_rate_of_a_carrier_is_the_way_between_the_epochs() -> None:

@@ -17,6 +17,7 @@ from drivers.raw.messages import (
 )
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.group_delay import GPS_L5_SIGMA_M, group_delay
+from fusiond.gnss.orbit import CONSTANTS
 from fusiond.gnss.ranges import RangeModel, RangeOptions
 from fusiond.gnss.store import EphemerisStore
 from tests.gnss.examples import (
@@ -170,7 +171,15 @@ def test_preferred_signal_serves_and_the_next_if_it_is_absent() -> None:
 
 def test_store_keeps_both_issues_over_a_changeover() -> None:
     old = ephemeris("G", 3, week=WEEK, toe_s=7200.0)
-    new = replace(old, toe_s=14400.0, toc_s=14400.0, issue=8)
+    motion = math.sqrt(CONSTANTS["G"].gm) / old.sqrt_a**3 + old.mean_motion_correction
+    new = replace(
+        old,
+        toe_s=14400.0,
+        toc_s=14400.0,
+        issue=8,
+        mean_anomaly=old.mean_anomaly + 7200.0 * motion,
+        ascending_node=old.ascending_node + 7200.0 * old.ascending_node_rate,
+    )
     store = _store([old, new])
     assert store.select("G", 3, WEEK, 10000.0) is old
     assert store.select("G", 3, WEEK, 11000.0) is new

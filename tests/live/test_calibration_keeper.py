@@ -31,9 +31,9 @@ def offered(config: Config) -> tuple[SavedCalibration | None, list[str]]:
     """What a navigator of that configuration takes up, and the events."""
     events: list[str] = []
     navigator = Navigator(config)
-    CalibrationKeeper(config, Clock(config.clock), lambda code, text: events.append(code)).restore_into(
-        navigator
-    )
+    CalibrationKeeper(
+        config, Clock(config.clock), lambda code, text: events.append(code)
+    ).restore_into(navigator)
     return navigator.calibration, events
 
 

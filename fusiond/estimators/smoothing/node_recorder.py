@@ -19,6 +19,7 @@ from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import Outcome, Screened, Snapshot
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
+from fusiond.estimators.renewal import renew
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
 from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
@@ -167,6 +168,13 @@ class TapedKalman(TiltAxesFilter):
         super()._carry_over(before)
         turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
         self._keep(self._phi, before)
+
+    def _renew(self, aid: Linearised) -> None:
+        """Errors that measurements share become others: what they were has a part in it."""
+        if aid.screened and aid.renewal is not None:
+            self._close()  # with P as it was
+            renew(aid.renewal, self.model, (), (self._phi,))
+        super()._renew(aid)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -25,7 +25,8 @@ EPOCH_S = 0.01
 troposphere lasts for hours, but orbit errors last, too, and are noise to the filter: of hundreds
 of epochs it would solve for a zenith delay of 0.12 m, which differs from height and clock by the
 lowest satellites alone, and find what 0.6 m of orbits make of it, many of its sigmas, and metres of
-height. An epoch alone says little of them beyond their sigma. What lasts is in the displacement."""
+height. An epoch alone says little of them beyond their sigma. What lasts is in the displacement
+(fusiond.gnss.displacement)."""
 
 
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:

@@ -2,7 +2,7 @@ r"""Simulated raw observations of a receiver: pseudorange, range rate, carrier, 
 
     t    = t_r - b / c                               the receiver's clock shows t_r
     rho  = |Rz(we tau) p(t - tau) - r(t)|,  tau = rho / c
-    P    = rho + b + isb - c (dt - d) + T + (f1/f)^2 I + s + mp + n_P
+    P    = rho + b + isb - c (dt - d) + T + (f1/f)^2 I + s + nlos + mp + n_P
     D    = rho' + b' - c dt' + n_D
     L    = (rho + b + isb - c (dt - d) + T - (f1/f)^2 I + s + n_L) / lambda + N
     rho' = u (Rz v - v_r) / (1 - u (we x Rz p - Rz v) / c),   we x p here (y, -x, 0) we
@@ -17,6 +17,7 @@ group delay; all lengths m. What is drawn, one sigma in `GnssRawOptions`:
          a Gauss-Markov process u, s' = (u - s) / T
     T    Saastamoinen's zenith delays with the wet one off by a constant, mapped by Niell
     I    Klobuchar's GPS model; GPS broadcasts other coefficients, BeiDou its own model's
+    nlos what a satellite's ranges have more while it comes by a wall alone
     mp   multipath, Gauss-Markov for each signal: sigma_mp (0.13 + 0.53 exp(-E / 10 deg))
     n    white; its sigma is that at 45 dB Hz times 10^((45 - C/N0) / 20)
     C/N0 36 + 12 sin E dB Hz, and noise
@@ -103,6 +104,12 @@ class GnssRawOptions:
     clock_drift_correlation_s: float = 300.0
     clock_noise_m_sqrt_s: float = 0.05
     inter_system_sd_m: float = 5.0
+    reflections_per_hour: float = 0.0
+    """How often a satellite comes by a wall alone, and no longer straight."""
+    reflection_m: tuple[float, float] = (3.0, 60.0)
+    """By how much longer its way is then: uniform in the logarithm."""
+    reflection_s: float = 20.0
+    """For how long, in the mean; exponential."""
     latency_s: tuple[float, float] = (0.05, 0.1)
     """From an epoch to its last byte, uniform."""
 
@@ -165,7 +172,28 @@ class GnssRaw:
             Klobuchar("simulation", 0, "G", GPS_ALPHA, GPS_BETA),
             Klobuchar("simulation", 0, "C", BEIDOU_ALPHA, BEIDOU_BETA),
         )
+        self.reflected_m = self._draw_reflections(n, step)
+        """(n, satellites), m: what a satellite's ranges have more, satellites as `satellites`."""
         self.begin(*start)
+
+    @property
+    def satellites(self) -> tuple[str, ...]:
+        """Names of all, up or not."""
+        return tuple(f"{slot.system}{slot.prn:02d}" for slot in self._slots)
+
+    def _draw_reflections(self, n: int, step: float) -> Array:
+        o, found = self.options, np.zeros((n, len(self._slots)))
+        if o.reflections_per_hour <= 0.0:
+            return found
+        low, high = (math.log(m) for m in o.reflection_m)
+        for column in found.T:
+            t_s = float(self.rng.exponential(3600.0 / o.reflections_per_hour))
+            while t_s < n * step:
+                lasts_s = float(self.rng.exponential(o.reflection_s))
+                more = math.exp(float(self.rng.uniform(low, high)))
+                column[int(t_s / step) : int((t_s + lasts_s) / step) + 1] = more
+                t_s += lasts_s + float(self.rng.exponential(3600.0 / o.reflections_per_hour))
+        return found
 
     def _draw_clock(self, n: int, step: float) -> None:
         o, rng = self.options, self.rng
@@ -294,6 +322,7 @@ class GnssRaw:
                     signal,
                     common
                     + ionosphere
+                    + float(self.reflected_m[k, i])
                     + float(noise[0]) * code
                     + path * float(self._multipath[k, cell]),
                     float(rate[i] - clock[i, 1] + self.clock_drift_m_s[k])

@@ -17,7 +17,10 @@ from tests.places import REPOSITORY
 PAGE = (REPOSITORY / "docs" / "gnss-raw.md").read_text()
 CODE = "".join(path.read_text() for path in sorted((REPOSITORY / "drivers" / "raw").glob("*.py")))
 COMPOSED = {
-    *(f"subframes_{message}" for message in ("lnav", "d1", "d2", "bcnav1", "bcnav2", "inav")),
+    *(
+        f"subframes_{message}"
+        for message in ("lnav", "cnav", "d1", "d2", "bcnav1", "bcnav2", "inav")
+    ),
     *(f"measured_{system}" for system in "GEC"),
     *(f"measured_{system}" for system in ("sbas", "qzss", "glonass", "navic")),
     *(f"{system}_not_used" for system in ("sbas", "qzss", "glonass", "navic", "unknown_system")),

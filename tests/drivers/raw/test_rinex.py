@@ -292,7 +292,7 @@ def test_health_of_cnav() -> None:
 
 def test_records_that_are_not_used_are_counted() -> None:
     text = nav4(
-        "> EPH R01 FDMA\n", legacy("R01"), "> EPH G05 CNAV\n", legacy("G05"), cnav("CNV3"),
+        "> EPH R01 FDMA\n", legacy("R01"), "> EPH G05 CNV2\n", legacy("G05"), cnav("CNV3"),
         "> STO GAUT\n", row(1.0), "> EPH G05 LNAV\n", legacy("G05"),
         "> ION E05 IFNV\n", "    2026 12 01 02 00 00" + CLOCK + "\n", row(0.0),
     )  # fmt: skip

@@ -1,0 +1,111 @@
+r"""Corrections of a service to broadcast orbits and clocks: which hold, and what they are worth.
+
+A satellite is corrected when there are, of one solution and none too old,
+
+    its orbit, of an ephemeris that is held and healthy;  its clock;  a bias of the signal
+
+as a clock is only one with the biases that it was made with: P + bias takes the place of the
+broadcast group delay. A correction serves for three of its intervals, and for 30 s at least, 180 s
+at most: one or two may be lost. (Biases change in days: an hour.)
+
+    sigma^2 = max(0.15 m, what the service states)^2 + (1 mm/s age)^2
+
+Clocks of a service have their own zero, often metres from the broadcast one. So a system goes by
+corrections as a whole or not at all: where half of its satellites have them, the others are
+`no_correction`.
+
+Source: RTCM 10403.3, 3.5.12; quality of real-time orbits (5 cm) and clocks (0.3 ns): IGS Real-Time
+Service, products, 2013; age: a caesium clock's 1e-11 over 30 s are 0.1 m.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from drivers.raw.messages import Correction, CorrectionPart, Ephemeris, System
+from fusiond.gnss.orbit import WEEK_S
+
+CORRECTED_M = 0.15
+AGEING_M_S = 1e-3
+INTERVALS, LEAST_S, MOST_S = 3.0, 30.0, 180.0
+BIAS_LASTS_S = 3600.0
+MODULUS, STEP_S = 1024, 8.0
+"""Of BeiDou's toe, as corrections name an ephemeris."""
+MESSAGES: dict[System, tuple[str, ...]] = {"G": ("lnav",), "E": ("inav",), "C": ("d1", "d2")}
+"""Messages that corrections are of."""
+
+
+class Applied(NamedTuple):
+    """A satellite's ephemeris with its correction (14,), as `elements_row` takes them, the `bias`
+    (m) of each signal, and one sigma of its ranges (m)."""
+
+    ephemeris: Ephemeris
+    columns: tuple[float, ...]
+    bias: dict[str, float]
+    sigma_m: float
+
+
+class Corrections:
+    """The last part of each kind by satellite."""
+
+    def __init__(self) -> None:
+        self._parts: dict[tuple[System, int], dict[CorrectionPart, Correction]] = {}
+
+    def add(self, correction: Correction) -> None:
+        """Take a part in; one that holds for an earlier instant than the one that is there is
+        none."""
+        parts = self._parts.setdefault((correction.system, correction.prn), {})
+        old = parts.get(correction.part)
+        if old is None or _age_s(old, correction.week, correction.tow_s) >= 0.0:
+            parts[correction.part] = correction
+
+    def __bool__(self) -> bool:
+        """True if there have been any."""
+        return bool(self._parts)
+
+    def issue(self, system: System, prn: int, week: int, tow_s: float) -> int | None:
+        """Issue of the ephemeris that the satellite's correction is of at a GPS time; None where
+        none holds."""
+        parts = self._parts.get((system, prn), {})
+        orbit, clock, bias = (parts.get(p) for p in ("orbit", "clock", "bias"))
+        if orbit is None or clock is None or bias is None or orbit.solution != clock.solution:
+            return None
+        if orbit.solution[:2] != bias.solution[:2]:
+            return None
+        holds = (_holds(p, week, tow_s) for p in (orbit, clock, bias))
+        return orbit.issue if all(holds) else None
+
+    def applied(self, ephemeris: Ephemeris, week: int, tow_s: float) -> Applied:
+        """The correction that has an `issue`, to that ephemeris."""
+        parts = self._parts[ephemeris.system, ephemeris.prn]
+        orbit, clock, bias = parts["orbit"], parts["clock"], parts["bias"]
+        c0, c1, c2 = clock.values
+        fast = parts.get("fast_clock")
+        if fast is not None and fast.solution == clock.solution and _holds(fast, week, tow_s):
+            c0 += fast.values[0]
+        columns = (1.0, orbit.week, orbit.tow_s, *orbit.values, clock.week, clock.tow_s, c0, c1, c2)
+        stated = parts.get("accuracy")
+        sigma = CORRECTED_M if stated is None else max(CORRECTED_M, stated.values[0])
+        age = max(abs(_age_s(orbit, week, tow_s)), abs(_age_s(clock, week, tow_s)))
+        sigma = (sigma**2 + (AGEING_M_S * age) ** 2) ** 0.5
+        biases = dict(zip(bias.signals, bias.values, strict=True))
+        return Applied(ephemeris, columns, biases, sigma)
+
+
+def issue_of(ephemeris: Ephemeris) -> int:
+    """The issue of an ephemeris as corrections name it."""
+    if ephemeris.system == "C":
+        return int(ephemeris.toe_s / STEP_S) % MODULUS
+    return ephemeris.issue
+
+
+def _age_s(correction: Correction, week: int, tow_s: float) -> float:
+    """Seconds from the instant that it holds at."""
+    return (week - correction.week) * WEEK_S + (tow_s - correction.tow_s)
+
+
+def _holds(correction: Correction, week: int, tow_s: float) -> bool:
+    lasts = min(max(INTERVALS * correction.interval_s, LEAST_S), MOST_S)
+    if correction.part == "bias":
+        lasts = BIAS_LASTS_S
+    return abs(_age_s(correction, week, tow_s)) <= lasts

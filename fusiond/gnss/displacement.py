@@ -1,0 +1,205 @@
+r"""Displacement that the lasting errors of a sky's ranges make of an antenna's place.
+
+Errors of orbits, clocks, group delays and of what is left of the ionosphere last for many minutes,
+each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. Of
+all of them a place feels, with one clock offset c a system
+
+    b = G (e + S n),     G = first three rows of (H^T V^-1 H + L)^-1 H^T V^-1
+    B = cov(b) = G V G^T + (G S)(G S)^T,      b = K t,  K = B^1/2 symmetric,  t ~ N(0, I)
+
+H = [-u 1_system], u unit vectors to the satellites north, east, down, L what else knows of place
+(30 m) and clock (1 m). So u . K t is the part of the errors that looks like a displacement: all of
+it with three satellites, whose geometry makes much of little, and little with thirty.
+
+Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
+satellites' levels (fusiond.gnss.levels) do not know of their errors, V_k,
+
+    K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
+
+with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
+what levels know they know of what all share, too. A filter that lets K grow and adds nothing solves
+t of how the ranges part when satellites go, and is sure of a place that it does not know.
+
+Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.ranges import Rows
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+PLACE_M, CLOCK_M = 30.0, 1.0
+"""One sigma of what is known of place and clock but for the epoch: an inertial unit over a minute;
+a crystal whose phase walks by 0.1 m by the root of a second, over a hundred."""
+LEAST_M = 1e-3
+"""Of K along an axis: below it the sky displaces nothing, and nothing is carried on."""
+FLOOR_M = 0.2
+"""Noise of a range over a minute, which bounds what one satellite weighs."""
+HOLDS_S = 30.0
+"""A satellite of a MEO moves by a quarter of a degree."""
+FLICKERS_S = 3.0
+"""Satellites that come and go within it are of one sky: their errors are the same when they come
+again, which the sum does not know."""
+
+
+@compiled("void(f8[:, ::1], i8)", forceinline=True)
+def _invert(a: Array, m: int) -> None:
+    """Invert a positive matrix (m, m) in its place, by Gauss and Jordan."""
+    for p in range(m):
+        pivot = 1.0 / a[p, p]
+        a[p, p] = 1.0
+        for j in range(m):
+            a[p, j] *= pivot
+        for i in range(m):
+            if i != p:
+                f = a[i, p]
+                a[i, p] = 0.0
+                for j in range(m):
+                    a[i, j] -= f * a[p, j]
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1])", allocates=True)
+def roots(b: Array, out: Array) -> None:
+    """Write (6, 3): the symmetric root of B (3, 3), and its inverse where B is not nearly 0."""
+    a, v = b.copy(), np.eye(3)
+    for _ in range(12):  # Jacobi's rotations: the third round is exact to rounding
+        if a[0, 1] == 0.0 and a[0, 2] == 0.0 and a[1, 2] == 0.0:
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if a[p, q] == 0.0:
+                    continue
+                half = 0.5 * (a[q, q] - a[p, p]) / a[p, q]
+                t = 1.0 / (abs(half) + math.sqrt(1.0 + half * half))
+                if half < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(1.0 + t * t)
+                s = t * c
+                for k in range(3):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = v[k, p], v[k, q]
+                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = out[3 + i, j] = 0.0
+            for k in range(3):
+                root = math.sqrt(max(a[k, k], 0.0))
+                out[i, j] += v[i, k] * root * v[j, k]
+                if root > LEAST_M:
+                    out[3 + i, j] += v[i, k] / root * v[j, k]
+
+
+@compiled("void(f8[:, ::1], i8[::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])", allocates=True)
+def displace(
+    values: Array,
+    clock: npt.NDArray[np.int64],
+    clocks: int,
+    variance: Array,
+    effect: Array,
+    out: Array,
+) -> None:
+    """Write `effect` (3, n + 2), G and G S by rows' `values`, and to `out` (6, 3) K, its inverse,
+    of errors of `variance` (n,).
+
+    `clock` (n,) below `clocks`: which of the clocks' offsets each has.
+    """
+    n, m = clock.shape[0], 3 + clocks
+    normal, row = np.zeros((m, m)), np.zeros(m)
+    for i in range(m):
+        known = PLACE_M if i < 3 else CLOCK_M
+        normal[i, i] = 1.0 / (known * known)
+    for k in range(n):
+        row[:] = 0.0
+        row[0], row[1] = -values[rk.NORTH, k], -values[rk.EAST, k]
+        row[2], row[3 + clock[k]] = math.sin(values[rk.ELEVATION, k]), 1.0
+        w = 1.0 / variance[k]
+        for i in range(m):
+            for j in range(m):
+                normal[i, j] += w * row[i] * row[j]
+    _invert(normal, m)
+    b = np.zeros((3, 3))
+    for i in range(3):
+        effect[i, n] = effect[i, n + 1] = 0.0
+        for k in range(n):
+            g = -normal[i, 0] * values[rk.NORTH, k] - normal[i, 1] * values[rk.EAST, k]
+            g += normal[i, 2] * math.sin(values[rk.ELEVATION, k]) + normal[i, 3 + clock[k]]
+            effect[i, k] = g / variance[k]
+            effect[i, n] += effect[i, k] * values[rk.COMMON, k]
+            effect[i, n + 1] += effect[i, k] * values[rk.TROPOSPHERE_SIGMA, k]
+    for i in range(3):
+        for j in range(3):
+            for k in range(n):
+                b[i, j] += effect[i, k] * effect[j, k] * variance[k]
+            for k in (n, n + 1):
+                b[i, j] += effect[i, k] * effect[j, k]
+    roots(b, out)
+
+
+class Displacement(NamedTuple):
+    """Of a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the two errors of
+    all, `variance` (n,) m^2 of what is not known of what lasts, `root` (3, 3) K and `back` (3, 3)
+    its inverse, m."""
+
+    t_s: float
+    satellites: tuple[str, ...]
+    effect: Array
+    variance: Array
+    root: Array
+    back: Array
+
+    @classmethod
+    def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
+        """Of the rows of an epoch, with `variance` (n,) m^2 left of what lasts."""
+        n = len(rows.satellites)
+        effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
+        clocks = int(rows.clock.max(initial=0)) + 1
+        displace(rows.values, rows.clock, clocks, rows.values[rk.LASTING].copy(), effect, out)
+        displace(rows.values, rows.clock, clocks, variance + FLOOR_M**2, effect, left)
+        known = np.sqrt(variance / rows.values[rk.LASTING])
+        for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
+            effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
+        return cls(t_s, rows.satellites, effect, variance, out[:3], out[3:])
+
+    def holds(self, rows: Rows, t_s: float) -> bool:
+        """True if it is that of an epoch of these rows, too."""
+        same = rows.satellites == self.satellites
+        return 0.0 <= t_s - self.t_s < (HOLDS_S if same else FLICKERS_S)
+
+    def carried(self, before: Displacement) -> tuple[Array, Array]:
+        """R (3, 3) and cov(w) (3, 3) from what was `before`."""
+        n, last = len(self.satellites), len(before.satellites)
+        moved: dict[str, Array] = {}
+        left: dict[str, float] = {}
+        for k, name in enumerate(self.satellites):
+            moved[name], left[name] = self.effect[:, k].copy(), float(self.variance[k])
+        for k, name in enumerate(before.satellites):
+            moved[name] = moved.get(name, 0.0) - before.effect[:, k]
+            left.setdefault(name, float(before.variance[k]))
+        new = np.zeros((3, 3))
+        for name, g in moved.items():
+            new += left[name] * np.multiply.outer(g, g)
+        for k in range(2):
+            g = self.effect[:, n + k] - before.effect[:, last + k]
+            new += np.multiply.outer(g, g)
+        kept: Array = _times(self.back, before.root)
+        return kept, _times(_times(self.back, new), self.back)
+
+
+def _times(a: Array, b: Array) -> Array:
+    """A B (3, 3), in one order of operations on all machines."""
+    found: Array = (a[:, :, None] * b[None, :, :]).sum(axis=1)
+    return found
