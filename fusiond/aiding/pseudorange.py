@@ -63,7 +63,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -268,11 +268,8 @@ class PseudorangeAid(Aid):
         values[RANGE_VARIANCE] += arm**2
         values[RATE_VARIANCE] += (CORNER_RAD_S * arm) ** 2
         values[SPAN] = 0.0
-        lever = 0.0, 0.0, self.lever[2]
-        about = self.source, self.t_ns, self.gate, self.satellites, values, self.clock, lever
-        return PseudorangeAid(
-            *about, self.clock_reset, shape=self.shape, kept=self.kept, robust=self.robust
-        )
+        lever, nothing = (0.0, 0.0, self.lever[2]), nothing_left()
+        return replace(self, values=values, lever=lever, before=nothing, left=nothing)
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
         """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of
