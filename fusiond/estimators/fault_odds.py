@@ -69,6 +69,7 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
+    SIZE,
     SUSPECTS,
     THREES,
     UNEXPLAINED,
@@ -88,7 +89,8 @@ _TINY = 1e-9
 MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
-missed is as near as half the youngest period."""
+missed is as near as half the youngest period. What is lost is left unexplained: who leaves no more
+than its degrees of freedom has lost nothing."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
 MOST_OF_UNIT = 10.0
@@ -194,11 +196,13 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
-@compiled("f8(f8[::1], f8[::1], i8, i8, b1, f8[::1])", forceinline=True)
-def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
+@compiled("f8(f8[::1], f8[::1], i8, i8, b1, b1, f8[::1])", forceinline=True)
+def _larger(
+    bank: Array, numbers: Array, at: int, size: int, unit: bool, followed: bool, m: Array
+) -> float:
     """Log of the factor by which a likely fault is larger than it is expected to be; what no unit's
-    fault can be it does not explain."""
-    share = MOST_OF_UNIT**-2 if unit else _TINY
+    fault can be it does not explain, nor what was not followed that it is over."""
+    share = 1.0 if followed else MOST_OF_UNIT**-2 if unit else _TINY
     gained = solve(bank, at, size, numbers, share, m)
     bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
     bank[at + EXPLAINED], square = gained, 0.0
@@ -236,7 +240,8 @@ def _odds(
             by_rows -= numbers[kind, LOG_PRIOR + c]
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
         if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
-            by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
+            unit, over = ints[kind, CLASS] == 0, ints[kind, SIGNATURE] == FOLLOWED
+            by_size += size * _larger(bank, numbers[kind], at, int(size), unit, over, m)
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -254,17 +259,21 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
         return np.inf
     step = ints[kind, SIGNATURE] <= FOLLOWED
     alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
-    fit, ahead, same = 0.0, np.inf, False
+    fit, left, ahead, same = 0.0, 0.0, np.inf, False
     for restart in range(RESTARTS):
         other = group_at(bank, RESTARTS * kind + restart)
         if bank[other + UNEXPLAINED] > 0.0:
             continue
         ahead = min(ahead, bank[group + LOG_ODDS] - bank[other + LOG_ODDS])
         if bank[other + LOG_ODDS] > 0.0:
-            fit = max(fit, bank[other + EXPLAINED])
+            if bank[other + EXPLAINED] > fit:
+                fit = bank[other + EXPLAINED]
+                degrees = max(bank[other + N_AT] - ints[kind, SIZE], 1.0)
+                chance = UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+                left = bank[other + UNEXPLAINED] + chance
             same = same or abs(bank[other + ONSET] - bank[group + ONSET]) < ALIKE_S
     if fit > 0.0 and not alike:
-        missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
+        missed = 0.0 if same else min(MISSED * bank[group + EXPLAINED], max(left, 0.0))
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
     return ahead
 

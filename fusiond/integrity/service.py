@@ -48,10 +48,9 @@ from fusiond.integrity.noise import forget_lately, learn, unlearned
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
-LASTS_S, RETURNS, MOST_TOLD, MOST_SURE = 60.0, 2.0, 12.0, 24.0
+LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
 """A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
-to one; the most (chi-square) that one measurement tells of that; and the most (log likelihood) that
-one series does, four such measurements."""
+to one; and the most (chi-square) that one measurement tells of that."""
 REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -92,8 +91,6 @@ class Series:
     """Instant (ns) of its last exclusion."""
     proven_ns: int = 0
     """Until when (ns) it is on probation: for as long as it was out."""
-    over: float = 0.0
-    """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: object = None
     repeats: int = 0
     unchanged: bool = False
@@ -147,23 +144,14 @@ class Series:
         if t_ns > self.proven_ns and self.state is not Service.NOMINAL:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
-    def looked_at(
-        self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
-    ) -> None:
-        """One that is out was compared with what is published. `lasting`: by how much more
-        chi-square its innovation is if the fault for which it is out lasts; not a number where none
-        is known. `others`: log likelihood that it is over by what else it has spoiled.
-
-        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
-        """
+    def looked_at(self, t_ns: int, passes: bool, over: float = math.nan) -> None:
+        """One that is out was compared with what is published. `over`: log odds that the fault for
+        which it is out is over (fusiond.integrity.lasting); not a number where none is known."""
         if self.unchanged and self.reason == REPEATS:
             passes = False
         self.passed = self.passed + 1 if passes else 0
-        if math.isfinite(lasting):
-            self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
-            self.over = max(-MOST_TOLD, min(self.over, MOST_SURE))
-            prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
-            if self.over + others + prior < RETURNS:
+        if math.isfinite(over):
+            if over < RETURNS:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
                 self.reason = STILL
