@@ -196,13 +196,11 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
-@compiled("f8(f8[::1], f8[::1], i8, i8, b1, b1, f8[::1])", forceinline=True)
-def _larger(
-    bank: Array, numbers: Array, at: int, size: int, unit: bool, followed: bool, m: Array
-) -> float:
+@compiled("f8(f8[::1], f8[::1], i8, i8, b1, f8[::1])", forceinline=True)
+def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
     """Log of the factor by which a likely fault is larger than it is expected to be; what no unit's
-    fault can be it does not explain, nor what was not followed that it is over."""
-    share = 1.0 if followed else MOST_OF_UNIT**-2 if unit else _TINY
+    fault can be it does not explain."""
+    share = MOST_OF_UNIT**-2 if unit else _TINY
     gained = solve(bank, at, size, numbers, share, m)
     bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
     bank[at + EXPLAINED], square = gained, 0.0
@@ -240,8 +238,7 @@ def _odds(
             by_rows -= numbers[kind, LOG_PRIOR + c]
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
         if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
-            unit, over = ints[kind, CLASS] == 0, ints[kind, SIGNATURE] == FOLLOWED
-            by_size += size * _larger(bank, numbers[kind], at, int(size), unit, over, m)
+            by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -253,7 +250,9 @@ def _odds(
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
-    """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
+    """By how much a group is ahead of those of a kind; infinite where nobody need choose. That a
+    fault is over says the opposite of any that begins: who accuses a source has to be as sure that
+    it is not that as that anything is wrong."""
     own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
@@ -275,6 +274,8 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
     if fit > 0.0 and not alike:
         missed = 0.0 if same else min(MISSED * bank[group + EXPLAINED], max(left, 0.0))
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
+    if ints[kind, SIGNATURE] == FOLLOWED:
+        ahead -= DECIDED - APART
     return ahead
 
 
