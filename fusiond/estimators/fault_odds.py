@@ -43,6 +43,7 @@ from fusiond.estimators.fault_bank import (
     FOLLOWED,
     GROUPS,
     J_AT,
+    JUDGED_S,
     L10,
     L11,
     L20,
@@ -239,6 +240,8 @@ def _odds(
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
         if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
             by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
+            if ints[kind, SIGNATURE] == FOLLOWED and m[9] <= 0.0:
+                bank[at + UNEXPLAINED] = np.inf  # it goes on, and is not over
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -293,6 +296,7 @@ def judge(
     the source's may have lost something.
     """
     groups, m, counts = int(bank[ALL]), np.empty(12), np.zeros((RESTARTS, 2))
+    bank[JUDGED_S] = epoch_s
     _gains(bank, lanes)
     largest = 0.0
     for number in range(groups):

@@ -68,6 +68,8 @@ Indices = NDArray[np.int64]
 
 UNLIKELY = 1e-12
 """Of what is followed by no fault that counts."""
+COUNTS = 1e-3
+"""Weight of a fault below which what it has done is not looked at."""
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
@@ -75,11 +77,13 @@ def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Arra
     """Write what a source's fault has done to the filter, V (3, n) row by row, and behind it the
     weight of all of them."""
     followed[:] = 0.0
+    if not bank[ANY_FAULT] > COUNTS:
+        return
     likeliest, most = -1, 0.0
     for number in range(int(bank[ALL])):
-        if ints[number // RESTARTS, SIGNATURE] <= FOLLOWED:
-            continue
         weight = bank[group_at(bank, number) + WEIGHT]
+        if ints[number // RESTARTS, SIGNATURE] <= FOLLOWED or weight < COUNTS:
+            continue
         followed[3 * n] += weight
         explains = weight * bank[group_at(bank, number) + EXPLAINED]
         if explains > most:

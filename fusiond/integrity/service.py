@@ -10,8 +10,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
     from                  to           when
     nominal               suspected    `gate`: a measurement fails
     suspected             nominal      one passes
-    suspected             out          the third in a row fails, and no fault of the inertial unit
-                                       explains it
+    suspected             out          the third in a row fails, for a second at least, and no fault
+                                       of the inertial unit explains it
     probation             out          a measurement fails: what was wrong comes again
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
                                        itself to the bit while the vehicle moves
@@ -21,8 +21,9 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
                                        a fault is over is asked of all that it has spoiled
     probation             nominal      it has been in service for as long as it was out
 
-Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
-four sigma lasts are one case in a thousand. Time alone re-admits nothing.
+Three failures of a gate of 0.9999 in a row are 1e-12 by chance, if each errs anew; a receiver's
+errors of a second are one error, however often it sends. Five that pass while a fault of four sigma
+lasts are one case in a thousand. Time alone re-admits nothing.
 """
 
 from __future__ import annotations
@@ -43,11 +44,13 @@ from fusiond.aiding.candidates import (
     SpeedCandidate,
     VelocityCandidate,
 )
+from fusiond.estimators.fault_bank import LASTS_S as LIKELY_FOR_S
 from fusiond.integrity.noise import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
+ONE_ERROR_NS = round(LIKELY_FOR_S * 1e9)
 LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
 """A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
 to one; and the most (chi-square) that one measurement tells of that."""
@@ -86,6 +89,8 @@ class Series:
     heard_ns: int = 0
     reason: str = ""
     failed: int = 0
+    failing_ns: int = 0
+    """Instant (ns) of the first of those that have failed in a row."""
     passed: int = 0
     out_ns: int = 0
     """Instant (ns) of its last exclusion."""
@@ -127,9 +132,12 @@ class Series:
 
     def gated(self, t_ns: int, explained: bool) -> None:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
+        if self.failed == 0:
+            self.failing_ns = t_ns
         self.failed += 1
         again = self.state is Service.PROBATION
-        if again or (self.failed >= REFUSED_IN_A_ROW and not explained):
+        lasts = self.failed >= REFUSED_IN_A_ROW and t_ns - self.failing_ns >= ONE_ERROR_NS
+        if again or (lasts and not explained):
             self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
