@@ -224,7 +224,7 @@ class Diagnosis:
             self._lasting = {**self._lasting, one.source: known}
             # That it lasts for so long is as unlikely in the end as what was set aside when it was
             # identified: that the filter had followed something before.
-            lasted = (t_ns - one.out_ns) * 1e-9 / LASTS_S - APART
+            lasted = (t_ns - one.out_ns) * 1e-9 / LASTS_S
             over = max(known.log_odds + self._over_by_others(one), lasted)
         one.looked_at(t_ns, passes and one.repeats == 0, over)
         if self._goes_its_own_way(one):

@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.base import Looked
-from fusiond.estimators.fault_bank import DECIDED
 from fusiond.integrity.fault_finding import Finding
 from fusiond.integrity.service import LASTS_S, MOST_TOLD
 
@@ -92,10 +91,6 @@ class Lasting(NamedTuple):
         over = _changed(self.shared.t_ns - self.since_ns)
         return self.log_odds - math.log(max(over, _LEAST) / (1.0 - over))
 
-    def without(self, over: Lasting) -> Lasting:
-        """Less those that have turned out to be over."""
-        return self._kept([f not in over.findings for f in self.findings])
-
     def looked(
         self, t_ns: int, look: Looked, adds: Sequence[Array], noise: Array, most: float
     ) -> Lasting:
@@ -119,12 +114,11 @@ class Lasting(NamedTuple):
             total = sum(weights)
             modes = (m._replace(weight=w / total) for m, w in zip(found, weights, strict=True))
             shared = shared._replace(modes=tuple(modes))
-        after = self._replace(shared=shared)
-        lasts = [mode.weight for mode in shared.modes[:-1]]
-        return after._kept([w > max(lasts) * math.exp(-DECIDED) for w in lasts])
+        return self._replace(shared=shared)
 
-    def _kept(self, keep: list[bool]) -> Lasting:
-        """Those faults alone; a fault is none that another explains better, a thousand to one."""
+    def without(self, over: Lasting) -> Lasting:
+        """Less those that have turned out to be over."""
+        keep = [finding not in over.findings for finding in self.findings]
         if all(keep):
             return self
         at = [k for k, kept in enumerate(keep) if kept]

@@ -45,15 +45,16 @@ from fusiond.aiding.candidates import (
     VelocityCandidate,
 )
 from fusiond.estimators.fault_bank import LASTS_S as LIKELY_FOR_S
+from fusiond.estimators.fault_odds import APART
 from fusiond.integrity.noise import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
 ONE_ERROR_NS = round(LIKELY_FOR_S * 1e9)
-LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
-"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
-to one; and the most (chi-square) that one measurement tells of that."""
+LASTS_S, MOST_TOLD = 60.0, 12.0
+"""A fault's mean duration, an engineer's, and the most (chi-square) that one measurement tells of
+its end."""
 REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -154,12 +155,13 @@ class Series:
 
     def looked_at(self, t_ns: int, passes: bool, over: float = math.nan) -> None:
         """One that is out was compared with what is published. `over`: log odds that the fault for
-        which it is out is over (fusiond.integrity.lasting); not a number where none is known."""
+        which it is out is over (fusiond.integrity.lasting), `APART` of which decide as between two
+        classes; not a number where none is known."""
         if self.unchanged and self.reason == REPEATS:
             passes = False
         self.passed = self.passed + 1 if passes else 0
         if math.isfinite(over):
-            if over < RETURNS:
+            if over < APART:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
                 self.reason = STILL

@@ -6,6 +6,7 @@ import pytest
 
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
+from fusiond.estimators.fault_odds import APART
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import (
@@ -13,7 +14,6 @@ from fusiond.integrity.service import (
     FORGET_NS,
     READMIT_COUNT,
     REFUSED_IN_A_ROW,
-    RETURNS,
     STILL,
     Series,
     Service,
@@ -103,18 +103,18 @@ def test_one_that_passes_is_back_only_if_its_fault_is_over() -> None:
     one = series()
     one.exclude(0, "gnss is carried off")
     for k in range(3 * READMIT_COUNT):
-        one.looked_at((60 + k) * S, passes=True, over=RETURNS - 0.1)
+        one.looked_at((60 + k) * S, passes=True, over=APART - 0.1)
     assert one.out
-    one.looked_at(90 * S, passes=True, over=RETURNS + 0.1)
+    one.looked_at(90 * S, passes=True, over=APART + 0.1)
     assert one.state is Service.PROBATION
 
 
 def test_one_whose_fault_is_over_and_that_is_elsewhere_says_so() -> None:
     one = series()
     one.exclude(0, "gnss is carried off")
-    one.looked_at(60 * S, passes=False, over=RETURNS - 0.1)
+    one.looked_at(60 * S, passes=False, over=APART - 0.1)
     assert one.reason != STILL
-    one.looked_at(61 * S, passes=False, over=RETURNS + 0.1)
+    one.looked_at(61 * S, passes=False, over=APART + 0.1)
     assert one.reason == STILL
     assert one.out
 
