@@ -64,7 +64,7 @@ its own turn to begin anew has come: twenty to one."""
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
 attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,
-from the start on; of what a source's faults, as they are weighed, have done to the filter."""
+from the start on; of what a source's fault has done to the filter."""
 POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(4, 12)
 """Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
 positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
@@ -92,12 +92,11 @@ LOG_PRIOR = 7
 # (loops whose length is read from an array become vector code), where the transition since the last
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
 # one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, by how
-# much the unit has been found to have turned on the vehicle in pitch and yaw (rad), and what has
-# been fed back of the velocity in all (m/s).
+# much the unit has been found to have turned on the vehicle in pitch and yaw (rad), what has been
+# fed back of the velocity in all (m/s), and the epoch (s) of what was judged last.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, TURNED_BY = range(10, 19)
-FED_BACK = 20
-HEAD = 24
+FED_BACK, JUDGED_S, HEAD = 20, 23, 24
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8

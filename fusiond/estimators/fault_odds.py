@@ -43,6 +43,7 @@ from fusiond.estimators.fault_bank import (
     FOLLOWED,
     GROUPS,
     J_AT,
+    JUDGED_S,
     L10,
     L11,
     L20,
@@ -69,6 +70,7 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
+    SIZE,
     SUSPECTS,
     THREES,
     UNEXPLAINED,
@@ -88,7 +90,8 @@ _TINY = 1e-9
 MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
-missed is as near as half the youngest period."""
+missed is as near as half the youngest period. What is lost is left unexplained: who leaves no more
+than its degrees of freedom has lost nothing."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
 MOST_OF_UNIT = 10.0
@@ -237,6 +240,8 @@ def _odds(
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
         if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
             by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
+            if ints[kind, SIGNATURE] == FOLLOWED and m[9] <= 0.0:
+                bank[at + UNEXPLAINED] = np.inf  # it goes on, and is not over
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -248,24 +253,32 @@ def _odds(
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
-    """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
+    """By how much a group is ahead of those of a kind; infinite where nobody need choose. That a
+    fault is over says the opposite of any that begins: who accuses a source has to be as sure that
+    it is not that as that anything is wrong."""
     own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
     step = ints[kind, SIGNATURE] <= FOLLOWED
     alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
-    fit, ahead, same = 0.0, np.inf, False
+    fit, left, ahead, same = 0.0, 0.0, np.inf, False
     for restart in range(RESTARTS):
         other = group_at(bank, RESTARTS * kind + restart)
         if bank[other + UNEXPLAINED] > 0.0:
             continue
         ahead = min(ahead, bank[group + LOG_ODDS] - bank[other + LOG_ODDS])
         if bank[other + LOG_ODDS] > 0.0:
-            fit = max(fit, bank[other + EXPLAINED])
+            if bank[other + EXPLAINED] > fit:
+                fit = bank[other + EXPLAINED]
+                degrees = max(bank[other + N_AT] - ints[kind, SIZE], 1.0)
+                chance = UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+                left = bank[other + UNEXPLAINED] + chance
             same = same or abs(bank[other + ONSET] - bank[group + ONSET]) < ALIKE_S
     if fit > 0.0 and not alike:
-        missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
+        missed = 0.0 if same else min(MISSED * bank[group + EXPLAINED], max(left, 0.0))
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
+    if ints[kind, SIGNATURE] == FOLLOWED:
+        ahead -= DECIDED - APART
     return ahead
 
 
@@ -283,6 +296,7 @@ def judge(
     the source's may have lost something.
     """
     groups, m, counts = int(bank[ALL]), np.empty(12), np.zeros((RESTARTS, 2))
+    bank[JUDGED_S] = epoch_s
     _gains(bank, lanes)
     largest = 0.0
     for number in range(groups):

@@ -82,10 +82,10 @@ class SeparatedEstimator(KalmanEstimator):
             self._take_out()
         return outcome
 
-    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
+    def look(self, aid: Linearised) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is
         published changes. The subsets judge for themselves: there the aid may be the sound one."""
-        outcome = super().look(aid, lasting)
+        outcome = super().look(aid)
         innovation = self._linearise(aid)
         if not isinstance(innovation, NotApplicable):
             self._fold_into_subsets(aid, innovation)
