@@ -80,14 +80,14 @@ class Hypotheses:
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
         """Result of the last `judge`, as of fusiond.estimators.fault_odds."""
-        self._mounting = np.full((2, 2), -1.0)
+        self.mounting = np.full((2, 2), -1.0)
         """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
         for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
-            self._mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
+            self.mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
         self.columns = columns_of(table)
         self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
         self._judged = bank, table.ints, table.numbers, table.lanes, self.n
-        self._widened = *of, self._mounting, self.work, wider, self.found
+        self._widened = *of, self.mounting, self.work, wider, self.found
         """Arguments of `judge_and_widen` before and behind an epoch."""
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
@@ -115,7 +115,7 @@ class Hypotheses:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step: one
         that starts, or one of whose error state a fault's `mean` (n,) has been taken. Of the
         mounting that is a turn."""
-        for k, slot in enumerate(self._mounting[:, 0].astype(int).tolist()):
+        for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)

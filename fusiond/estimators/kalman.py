@@ -9,11 +9,13 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1.
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
+from fusiond.estimators.aid_run import KNOWS, NO_AXES, AidRun, Axes
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
@@ -27,6 +29,9 @@ Array = NDArray[np.float64]
 class KalmanEstimator(ErrorStateFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
+    packs: ClassVar[bool] = True
+    """True if an update is that of fusiond.estimators.aid_run, where a bank is beside it."""
+
     def __init__(
         self,
         model: Model,
@@ -36,6 +41,20 @@ class KalmanEstimator(ErrorStateFilter):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+        self._knows = np.zeros(KNOWS)
+        self._runs = self._new_run(NO_AXES)
+
+    def _new_run(self, axes: Axes) -> AidRun | None:
+        """Aids in one call, with what updates carry over; None without a bank."""
+        bank = self.hypotheses
+        if bank is None or not self.packs:
+            return None
+        return AidRun(self, self._memory, self.model, bank, axes, self._knows)
+
+    @property
+    def runs(self) -> AidRun | None:
+        """Aids in one call; None while an estimate is held."""
+        return None if self._holding else self._runs
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; `noise` (3,) times its variances."""

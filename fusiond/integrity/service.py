@@ -43,7 +43,7 @@ from fusiond.aiding.candidates import (
     SpeedCandidate,
     VelocityCandidate,
 )
-from fusiond.integrity.noise import forget_lately, learn, unlearned
+from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
 

@@ -153,6 +153,8 @@ class RateUnits:
         self.wrong: str | None = None
         self._fit = False
         self._turns: dict[str, CourseTurns] = {}
+        self.due_ns: dict[str, int] = {}
+        """By receiver with velocities, the instant before which its next one says nothing more."""
         self._ways: dict[str, WayTurns] = {}
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
@@ -206,9 +208,8 @@ class RateUnits:
         turns = self._turns.get(m.source)
         if turns is None:
             turns = self._turns[m.source] = CourseTurns()
-        if t_ns < turns.next_ns:
-            return
         turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
+        self.due_ns[m.source] = turns.next_ns
         if turns.decided:
             self._tell(turns.said())
             self._fit = self.wrong is None and (self._fit or turns.fits)

@@ -202,12 +202,18 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
-        self.without_imu.hear(aids, seen_ns)
-        aids = self._latency.hear(m.source, aids)
+        self.without_imu.recent.extend(aids)
+        if self.without_imu.estimator is not None or not self.imu.end:
+            self.without_imu.hear(aids, seen_ns)
+        if self.started is not None and m.source in self._latency.on_time:
+            self._latency.waiting.append((m.source, aids))
+        else:
+            aids = self._latency.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
-        self._units.fix(m, t_ns, self.imu, aids)
-        self._constraints.rest_evidence.hear(aids)
+        if t_ns >= self._units.due_ns.get(m.source, 0):
+            self._units.fix(m, t_ns, self.imu, aids)
+        self._constraints.rest_evidence.waiting.extend(aids)
         for aid in aids:
             self.timeline.insert(aid)
         return "accepted"
@@ -266,8 +272,10 @@ class Navigator:
             self._event("filter_not_finite", f"{what}: aligning again")
             self.reset(what)
             return
-        if self._service_events.tell():
-            self.calibrating.corrected()
+        if self.timeline.decided:
+            self.timeline.decided = False
+            if self._service_events.tell():
+                self.calibrating.corrected()
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         failure = self._status.failure(self.timeline.diagnosis)

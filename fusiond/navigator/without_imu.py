@@ -73,7 +73,8 @@ class WithoutImu:
         self.estimator: Estimator | None = None
         """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
-        self._recent: deque[Aid] = deque(maxlen=MOST_REMEMBERED)
+        self.recent: deque[Aid] = deque(maxlen=MOST_REMEMBERED)
+        """The last aids, which a start may be made of."""
         self._first_ns: int | None = None
         self._silent_ns = 0
         self._located_ns = 0
@@ -85,8 +86,7 @@ class WithoutImu:
         return self.estimator is not None
 
     def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
-        """Aids have come at `seen_ns`."""
-        self._recent.extend(aids)
+        """Aids have come at `seen_ns`, while this navigates or no sample has come yet."""
         if self._first_ns is None and aids:
             self._first_ns = seen_ns or aids[0].t_ns
         if self.estimator is not None:
@@ -113,7 +113,7 @@ class WithoutImu:
     def stop(self) -> None:
         """Another navigates from now on, or all is to begin anew."""
         self._ended, self.estimator = self.counted(), None
-        self._recent.clear()
+        self.recent.clear()
 
     def counted(self) -> dict[str, Counter[str]]:
         """Outcomes of measurements here, by source, since the daemon began."""
@@ -161,7 +161,7 @@ class WithoutImu:
         """Start at the newest fix since the samples ended, if there is one."""
         fixes = [
             candidate
-            for aid in self._recent
+            for aid in self.recent
             if aid.t_ns > since_ns and aid.unturned() is not None
             for candidate in aid.candidates()
             if isinstance(candidate, PositionCandidate)
@@ -189,7 +189,7 @@ class WithoutImu:
         estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
         self._timeline.start()
         self.estimator = estimator
-        for aid in self._recent:
+        for aid in self.recent:
             if aid.t_ns >= fix.t_ns:
                 self._insert(aid)
         self._event(
