@@ -81,7 +81,8 @@ def packed_rows(
             *(nav, xi, step, column_of),
             *(_slots(ints, a + 10), _slots(ints, a + 12), _slots(ints, a + 16)),
             *(x[a], x[a + 1], x[a + 2], x[a + 3], x[a + 4], x[a + 5], x[a + 6], x[a + 7]),
-            *(x[a + 8], x[a + 9], z, h, r),
+            *(x[a + 8], x[a + 9]),
+            *(z, h, r),
         )
     elif kind == NO_SLIP:
         if speed_of(nav) < x[a + 5]:

@@ -34,9 +34,12 @@ from fusiond.aiding.packed import (
     T_NS,
     packed_rows,
 )
-from fusiond.estimators.fault_bank import SENSITIVITIES, SUSPECTS, UNJUDGED
+from fusiond.estimators.fault_bank import PHI as BANK_PHI
+from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
+from fusiond.estimators.fault_carried import settle
 from fusiond.estimators.fault_odds import judge
 from fusiond.estimators.fault_opened import judge_and_widen
+from fusiond.estimators.fault_suspects import any_likely, judge_what_waits
 from fusiond.estimators.gated_update import fold_and_account
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import (
@@ -70,6 +73,7 @@ from fusiond.navigation.strapdown import STEP_RESTS_S
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Single = NDArray[np.float32]
 
 FUSED, GATED, NOT_FINITE = 10, 11, 12
 """Results of an aid beside those of `packed_rows`, which say why it does not apply."""
@@ -110,11 +114,13 @@ class Ran(NamedTuple):
 
 
 @compiled(
-    "void(b1, f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[::1], f8[::1], f8[::1],"
-    " f8[:, ::1], f8[::1], f8[::1], f8[::1])"
+    "void(b1, i8, i8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[::1],"
+    " f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
 )
 def conclude(
     later: bool,
+    next_: int,
+    aids: Indices,
     bank: Array,
     ints: Indices,
     numbers: Array,
@@ -129,10 +135,14 @@ def conclude(
     wider: Array,
     found: Array,
 ) -> None:
-    """Judge what waits for it; what is open of what is published is said `later`, or now."""
+    """Judge what waits for it, before the `next_` of `aids`; what is open of what is published is
+    said `later`, or now. Odds that nobody reads before they are others wait."""
+    judge_what_waits(bank, ints, numbers, lanes, found)
     epoch_s = bank[UNJUDGED]
     if epoch_s < np.inf:
-        if later:
+        if later and aids[next_, KIND] <= VELOCITY and not any_likely(bank, lanes):
+            bank[UNJUDGED], bank[UNWEIGHED] = np.inf, epoch_s
+        elif later:
             judge(bank, ints, numbers, lanes, epoch_s, found)
         else:
             judge_and_widen(
@@ -156,7 +166,7 @@ def _said_later(ints: Indices, first: int, until_ns: int) -> bool:
 @compiled(
     "i8(f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], i8[:, ::1],"
     "f8[:, ::1], f8[::1], i8[::1], b1, f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[:, ::1],"
-    "f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
+    "f8[::1], f8[::1], f8[::1], f8[::1], f4[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
     allocates=True,
 )
 def take_aid(
@@ -183,6 +193,7 @@ def take_aid(
     wider: Array,
     noise: Array,
     work: Array,
+    of_rows: Single,
     bank_work: Array,
     knows: Array,
     found: Array,
@@ -219,7 +230,7 @@ def take_aid(
         remember_estimate(nav, xi, biases, gyros, lever, before)
     nis = fold_and_account(
         *(nav, xi, step, cov, dx, z, h, r, x[GATE], y, g, bank, ints, numbers, lanes),
-        *(of[T_NS], of[MEASURES], of[OF_DEVICE], bank_work, found),
+        *(of[T_NS], of[MEASURES], of[OF_DEVICE], of_rows, found),
     )
     result[NIS] = nis
     if not nis <= x[GATE]:
@@ -233,9 +244,11 @@ def take_aid(
         kept = gyros if undoubted else gyros[:0]
         turned = carry_over_all(p, before, nav, xi, biases, kept, lever, late)
         knows[TURNED] = turned
-        v = bank[int(bank[SENSITIVITIES]) :]
-        v = v.reshape((n, v.size // n))
-        carry_over_rows(v, before, nav, xi, turned, biases, kept, lever, late)
+        at = int(bank[BANK_PHI])
+        phi = bank[at : at + width * width].reshape((width, width))
+        carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, late)
+        bank[WAITS] = 1.0
+        settle(bank, n)
     if not measured:
         judge_and_widen(
             *(bank, ints, numbers, lanes, n, t_s, False, True),
@@ -257,7 +270,7 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
     @compiled(
         "UniTuple(i8, 4)(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[:, ::1],"
         "f8[:, ::1], f8[::1], i8[::1], f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[:, ::1],"
-        "f8[::1], f8[::1], f8[::1], f8[::1], i8, i8, i8, b1, b1, i8, i8)",
+        "f8[::1], f4[::1], f8[::1], f8[::1], f8[::1], i8, i8, i8, b1, b1, i8, i8)",
         variant=width,
         allocates=True,
     )
@@ -278,6 +291,7 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
         late: Indices,
         mounting: Array,
         work: Array,
+        of_rows: Single,
         bank_work: Array,
         knows: Array,
         found: Array,
@@ -302,25 +316,28 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
         cov = rest[:square].reshape((width, width))
         bank = rest[room * square : room * square + head[BANK]]
         of_all = aids.view(np.int64)
-        given = bank, ints, numbers, lanes
-        told = n, nav, xi, step, published, mounting, bank_work, wider, found
         recorded, i = (options & RECORD) != 0, 0
         while i < aids.shape[0]:
             x, of = aids[i], of_all[i]
             later = not recorded and _said_later(of_all, i, kept_ns + every_ns)
             if of[T_NS] > now or passing:
-                conclude(later, *given, *told)
+                conclude(
+                    *(later, i, of_all, bank, ints, numbers, lanes, n, nav, xi, step, published),
+                    *(mounting, bank_work, wider, found),
+                )
                 sample, now = propagate(state, imu, sample, now, of[T_NS], options)
                 passing = False
                 if now - kept_ns >= every_ns:
                     return sample, now, i, KEEP
             if not of[ASKED] & MEASURED:
-                conclude(later, *given, *told)
+                conclude(
+                    *(later, i, of_all, bank, ints, numbers, lanes, n, nav, xi, step, published),
+                    *(mounting, bank_work, wider, found),
+                )
             how = take_aid(
-                *(x, of, nav, xi, step, cov, dx),
-                *given,
-                *(column_of, hold_height, initial, biases, gyros, lever, late, mounting),
-                *(published, wider, series[of[SERIES]], work, bank_work, knows, found, results[i]),
+                *(x, of, nav, xi, step, cov, dx, bank, ints, numbers, lanes, column_of),
+                *(hold_height, initial, biases, gyros, lever, late, mounting, published, wider),
+                *(series[of[SERIES]], work, of_rows, bank_work, knows, found, results[i]),
             )
             if how == OTHERWISE:
                 return sample, now, i, OTHERWISE
@@ -362,7 +379,7 @@ class AidRun:
         self._filter, self._memory, self._kernel = filter_, memory.array, run_for(model.width)
         self._given = (
             *(*bank.table[:3], model.column_of, model.initial, *axes),
-            *(bank.mounting, work, bank.work, knows, bank.found),
+            *(bank.mounting, work, bank.rows, bank.work, knows, bank.found),
         )
         self._hold_height, self._knows, self.bank = model.hold_height, knows, bank
 

@@ -79,12 +79,12 @@ class KalmanEstimator(ErrorStateFilter):
         else:
             of, table = bank.of_source.get(aid.source) or bank.of(aid), bank.table
             if not self._holding:
-                now = bank.bank, *table[:3], aid.t_ns, *of, bank.work, bank.found
+                now = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
                 nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
-                    told = bank.bank, *table[:2], aid.t_ns, *of, bank.work
+                    told = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
                     account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *told)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
@@ -118,9 +118,9 @@ class KalmanEstimator(ErrorStateFilter):
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
         y, g = work(count, self.model.width)
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            told = bank.bank, *bank.table[:2], aid.t_ns, *bank.of(aid)
-            space = np.empty(count * bank.columns)
-            account_for(self.nav, self.step, h, r, y, g, fused, *told, space)
+            told = bank.bank, *bank.table[:3], aid.t_ns, *bank.of(aid)
+            space = np.empty(count * bank.columns, dtype=np.float32)
+            account_for(self.nav, self.step, h, r, y, g, fused, *told, space, bank.found)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

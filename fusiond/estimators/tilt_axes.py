@@ -180,8 +180,9 @@ class TiltAxesFilter(KalmanEstimator):
         slots = self._biases, *self._kept
         self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
         if self.hypotheses is not None:
-            v = self.hypotheses.sensitivities
-            carry_over_rows(v, before, self.nav, self.xi, self.turned, *slots)
+            bank = self.hypotheses
+            carry_over_rows(bank.transition, before, self.nav, self.xi, self.turned, *slots)
+            bank.carry_over()
 
     @property
     def _keeps_turn(self) -> bool:
