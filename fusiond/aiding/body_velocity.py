@@ -361,8 +361,10 @@ class WheelSpeedAid(Aid):
     def packed(self, model: Model) -> Packed | None:
         slots = _slots(model, self.drift, self.scale, self.latency).tolist()
         measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
-        of = self.signed, *slots, *model.listed(self.rounding, 1)
-        return Packed(SPEED, 1, _SPEED_BODY.pack(*self.lever, *measured, *of))
+        names = (self.rounding,)
+        rounding = model.listed.get(names) or model.list_slots(names, (1,))
+        body = _SPEED_BODY.pack(*self.lever, *measured, self.signed, *slots, *rounding)
+        return Packed(SPEED, 1, body)
 
     def candidates(self) -> tuple[SpeedCandidate, ...]:
         own = self.sd_m_s, self.rounding_sd_m_s, self.drifts

@@ -261,11 +261,13 @@ class PositionAid(Aid):
         return rows
 
     def packed(self, model: Model) -> Packed | None:
-        height, slots = self.height_m, model.listed
+        height, names = self.height_m, (self.bias, self.time, self.rest, self.wander)
+        slots = model.listed.get(names) or model.list_slots(names, (3, 1, 3, 3))
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
-        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
-        of = *slots(self.bias, 3), *slots(self.time, 1), *slots(self.rest, 3)
-        body = _BODY.pack(*fix, *where, *of, *slots(self.wander, 3))
+        body = _BODY.pack(
+            *(*fix, *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m),
+            *slots,
+        )
         return Packed(POSITION, 2 if height is None or model.hold_height else 3, body)
 
     def candidates(self) -> tuple[PositionCandidate, ...]:

@@ -174,10 +174,10 @@ class VelocityAid(Aid):
         return rows
 
     def packed(self, model: Model) -> Packed | None:
-        slots, (north, east, *down), (sd_n, sd_e, *sd_d) = model.listed, self.v_ned, self.sd
-        measured = north, east, *(down or (0.0,)), sd_n, sd_e, *(sd_d or (0.0,))
-        of = *slots(self.time, 1), *slots(self.rest, 3), *slots(self.fix_time, 1)
-        body = _BODY.pack(*measured, *self.lever, self.sd_time_s, *of)
+        names, v, sd = (self.time, self.rest, self.fix_time), self.v_ned, self.sd
+        slots = model.listed.get(names) or model.list_slots(names, (1, 3, 1))
+        measured = (*v, *sd) if len(v) == 3 else (*v, 0.0, *sd, 0.0)
+        body = _BODY.pack(*measured, *self.lever, self.sd_time_s, *slots)
         return Packed(VELOCITY, 2 if model.hold_height else len(self.v_ned), body)
 
     def candidates(self) -> tuple[VelocityCandidate, ...]:

@@ -41,6 +41,8 @@ class KalmanEstimator(ErrorStateFilter):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+        self.turns = False
+        """True if the heading may be far off, and updates are another kind's."""
         self._knows = np.zeros(KNOWS)
         self._runs = self._new_run(NO_AXES)
 
@@ -53,8 +55,8 @@ class KalmanEstimator(ErrorStateFilter):
 
     @property
     def runs(self) -> AidRun | None:
-        """Aids in one call; None while an estimate is held."""
-        return None if self._holding else self._runs
+        """Aids in one call; None while an estimate is held, or updates turn."""
+        return None if self._holding or self.turns else self._runs
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; `noise` (3,) times its variances."""

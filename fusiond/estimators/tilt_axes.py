@@ -73,7 +73,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.estimators.aid_run import UNDOUBTED, AidRun, Axes
+from fusiond.estimators.aid_run import UNDOUBTED, Axes
 from fusiond.estimators.antenna_place import antenna_slots
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
@@ -114,8 +114,6 @@ class TiltAxesFilter(KalmanEstimator):
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
         self._runs = self._new_run(Axes(self._biases, self._gyros, self._lever, self._late))
-        self.turns = False
-        """True if the heading may be far off, and updates are another kind's."""
         self.undoubted = True
         if known:
             self.kernel_options |= TURN_TILT
@@ -131,11 +129,6 @@ class TiltAxesFilter(KalmanEstimator):
         self.undoubted = False
 
     @property
-    def runs(self) -> AidRun | None:
-        """Aids in one call; None while an estimate is held, or updates turn."""
-        return None if self.turns else super().runs
-
-    @property
     def undoubted(self) -> bool:
         """True if what gyros are wrong by is what they were wrong by when the filter started."""
         return self._knows.item(UNDOUBTED) > 0.0
@@ -149,7 +142,7 @@ class TiltAxesFilter(KalmanEstimator):
         if self.turns and not self._holding:
             return self._turn_in(aid)
         self.turned = 0.0
-        if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
+        if self._holding or not (self._astray or may_part(self.covariance, self._slots)):
             return self._fold_in(aid, noise)
         before = self._estimate()
         outcome = self._fold_in(aid, noise)
@@ -164,7 +157,7 @@ class TiltAxesFilter(KalmanEstimator):
     def release(self) -> None:
         """Feed back what was carried."""
         before = self._estimate()
-        apart = self._astray or may_part(self._covariance, self._slots)
+        apart = self._astray or may_part(self.covariance, self._slots)
         super().release()
         if apart:
             self._carry_over(before)
@@ -178,7 +171,7 @@ class TiltAxesFilter(KalmanEstimator):
     def _carry_over(self, before: Array) -> None:
         """P after an update of an `_estimate` `before`."""
         slots = self._biases, *self._kept
-        self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
+        self.turned = carry_over_all(self.covariance, before, self.nav, self.xi, *slots)
         if self.hypotheses is not None:
             bank = self.hypotheses
             carry_over_rows(bank.transition, before, self.nav, self.xi, self.turned, *slots)

@@ -43,7 +43,15 @@ from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.fault_finding import Finding, Lasting
-from fusiond.integrity.service import DISAGREES, FORGET_NS, REPEATS, STILL, Series, value_of
+from fusiond.integrity.service import (
+    DISAGREES,
+    FORGET_NS,
+    REPEATS,
+    STILL,
+    Series,
+    Service,
+    value_of,
+)
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -151,20 +159,13 @@ class Diagnosis:
 
     def plain(self, aid: Aid) -> Series | None:
         """The series of an aid of which nothing is to be judged beyond its gate and hypotheses: it
-        is in service, and no device of its is out; None of another. It may be changed."""
+        is nominal, and nothing of its device is out; None of another. It may be changed."""
         one = self._series.get(aid.source)
-        if one is None or one.out or one.device in self._agreement:
+        if one is None or one.state is not Service.NOMINAL or one.failed:
+            return None
+        if one.device in self._agreement:
             return None
         return self.own(aid) if aid.source in self._shared else one
-
-    def came(self, aid: Aid, one: Series, value: object, moving: bool) -> None:
-        """Take in that one of a plain series has come, with a `value` that repeats nothing; None of
-        a constraint. `moving`: the vehicle moved."""
-        if aid.t_ns - one.heard_ns > FORGET_NS:
-            one.hear(aid.t_ns)
-        one.heard_ns = aid.t_ns
-        if value is not None:
-            one.repeats_itself(value, moving)
 
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """The series of an aid, before it is folded in; one that repeats itself leaves service,

@@ -176,6 +176,16 @@ class Series:
         self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
         self.failed = self.passed = 0
 
+    def went_on(self, t_ns: int, value: object, moved: int) -> None:
+        """Several have come while it was nominal, the last at `t_ns`, none with the `value` of the
+        one before it; None of a constraint. The vehicle `moved` at so many of them."""
+        self.heard_ns = t_ns
+        if value is None:
+            return
+        self.value, self.repeats, self.unchanged = value, 0, False
+        for _ in range(0 if self.locates else moved):
+            self.repeating += -self.repeating / REPEATS_KEPT
+
     def repeats_itself(self, value: object, moving: bool) -> bool:
         """True if a new value makes so many alike to the bit, of a vehicle that is `moving`, that
         it is no measurement. What stands may repeat."""

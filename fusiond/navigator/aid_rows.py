@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from fusiond.estimators.aid_run import (
     FUSED,
     GATED,
     INNOVATION,
+    MOVES,
     NIS,
     NOT_FINITE,
     OF_STATE,
@@ -31,28 +33,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_BODY_BYTES = 8 * (SIZE - BODY)
+_PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZE - BODY) + 1)]
+"""By the length of a body: what makes a row of it."""
 
 
-class Batch(NamedTuple):
-    """Rows of aids in order, the series of each, and the noise scales of all series (s, .) with the
-    numbers of those that are of it."""
+@dataclass(slots=True)
+class Span:
+    """What a series has of a batch: its number, instant and value of the last, and at how many the
+    vehicle moved."""
 
-    rows: list[bytes]
-    series: list[Series]
-    noise: Array
-    of: dict[int, Series]
-
-    def arrays(self) -> tuple[Array, Array]:
-        """Aids (k, SIZE) and noise scales as kernels take them."""
-        for number, one in self.of.items():
-            self.noise[number] = one.noise
-        return np.frombuffer(bytearray().join(self.rows)).reshape(-1, SIZE), self.noise
-
-    def learned(self) -> None:
-        """Hand the noise scales back to their series."""
-        for number, one in self.of.items():
-            one.noise[:] = self.noise[number]
+    one: Series
+    number: int
+    t_ns: int = 0
+    value: object = None
+    moved: int = 0
 
 
 class AidRows:
@@ -62,50 +56,75 @@ class AidRows:
         runs = estimator.runs
         self._bank = None if runs is None else runs.bank
         self._model = estimator.model
-        self._numbers: dict[str, int] = {}
-        """Of each source."""
+        self._known: dict[str, tuple[int, int, int, int]] = {}
+        """By source: number of its series, what its rows are and its device, what is asked."""
         self._noise = np.zeros((0, NOISE_SIZE))
+        self._spans: dict[str, Span] = {}
 
     def packed(self, aid: Aid) -> tuple[bytes, object]:
         """An aid's row, empty where it has none, and what a frozen sensor would repeat of it."""
         packed = None if self._bank is None or aid.robust else aid.packed(self._model)
-        if packed is None or self._bank is None:
+        if packed is None:
             return b"", None
-        source, shown, asked = aid.source, type(aid).shown, 0
-        number = self._numbers.get(source)
-        if number is None:
-            number = self._numbers[source] = len(self._numbers)
-            self._noise = np.zeros((number + 1, NOISE_SIZE))
+        known = self._known.get(aid.source) or self._new(aid)
+        kind, rows, body = packed
+        row = HEADER.pack(kind, aid.t_ns, rows, THRESHOLDS[aid.gate, rows], *known)
+        shown = None if aid.constraint else type(aid).shown
+        return row + body + _PADDING[len(body)], None if shown is None else shown(aid)
+
+    def _new(self, aid: Aid) -> tuple[int, int, int, int]:
+        """What is known of an aid's source."""
+        assert self._bank is not None
+        number, asked = len(self._known), 0
+        self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not aid.constraint:
             asked = MEASURED if aid.locates else MEASURED | MOTION_ASKED
-        kind, rows, body = packed
-        head = kind, aid.t_ns, rows, THRESHOLDS[aid.gate, rows], number
-        of = self._bank.of_source.get(source) or self._bank.of(aid)
-        row = HEADER.pack(*head, *of, asked) + body.ljust(_BODY_BYTES, b"\0")
-        return row, None if shown is None or aid.constraint else shown(aid)
+        known = self._known[aid.source] = number, *self._bank.of(aid), asked
+        return known
 
     def batch(
         self, entries: Sequence[Entry], which: range, diagnosis: Diagnosis, until_ns: int
-    ) -> Batch:
+    ) -> tuple[Array, Array] | None:
         """The first `which` of entries up to one that has no row, or of which more is to be judged:
-        a series that is out, a value that repeats itself; or that is not before `until_ns`."""
-        rows: list[bytes] = []
-        series: list[Series] = []
-        of: dict[int, Series] = {}
-        values: dict[str, object] = {}
-        for number in which:
-            entry = entries[number]
+        a series that is not nominal, a value that repeats itself; or that is not before `until_ns`.
+        Rows (k, SIZE), and the noise scales of all series (s, .); None of none."""
+        rows, values, spans = [], {}, self._spans
+        spans.clear()
+        for k in which:
+            entry = entries[k]
+            if not entry.row:
+                break
             aid, value = entry.aid, entry.value
-            one = diagnosis.plain(aid) if entry.row else None
-            if one is None or (value is not None and value == values.get(aid.source, one.value)):
-                break
-            values[aid.source] = value
-            of[self._numbers[aid.source]] = one
+            source = aid.source
+            if source not in spans:
+                one = diagnosis.plain(aid)
+                if one is None:
+                    break
+                number = self._known[source][0]
+                spans[source], values[source] = Span(one, number), one.value
+                self._noise[number] = one.noise
+            if value is not None:
+                if value == values[source]:
+                    break
+                values[source] = value
             rows.append(entry.row)
-            series.append(one)
-            if aid.t_ns >= until_ns:
+            if entry.key[0] >= until_ns:
                 break
-        return Batch(rows, series, self._noise, of)
+        if not rows:
+            return None
+        return np.frombuffer(bytearray().join(rows)).reshape(-1, SIZE), self._noise
+
+    def went_on(self, entries: Sequence[Entry], results: Sequence[Sequence[float]]) -> None:
+        """Tell the series of a batch that so many of its aids have come, with these results."""
+        spans = self._spans
+        for entry, result in zip(entries, results, strict=True):
+            span = spans[entry.aid.source]
+            span.t_ns, span.value = entry.key[0], entry.value
+            span.moved += result[MOVES] > 0.0
+        for span in spans.values():
+            if span.t_ns:
+                span.one.went_on(span.t_ns, span.value, span.moved)
+                span.one.noise[:] = self._noise[span.number]
 
 
 def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:

@@ -19,11 +19,10 @@ import numpy as np
 
 from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.candidates import Candidate
-from fusiond.estimators.aid_run import INNOVATION, JUDGE, KEEP, MOVES, RESULT
+from fusiond.estimators.aid_run import INNOVATION, JUDGE, KEEP, RESULT
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis, Memory
-from fusiond.integrity.service import Series
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.aid_rows import AidRows, outcome_of, raw_of
@@ -228,39 +227,36 @@ class Timeline:
         runs, kept_ns = self.estimator.runs, self._checkpoints[-1].snapshot.t_ns
         if runs is None:
             return False
-        rows, until_ns = range(self._next, end), kept_ns + self._checkpoint_ns
-        batch = self._rows.batch(self._entries, rows, self.diagnosis, until_ns)
-        if not batch.series:
+        which, until_ns = range(self._next, end), kept_ns + self._checkpoint_ns
+        batch = self._rows.batch(self._entries, which, self.diagnosis, until_ns)
+        if batch is None:
             return False
-        ran = runs(self.imu, *batch.arrays(), record, (kept_ns, self._checkpoint_ns))
-        batch.learned()
+        ran = runs(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
         results = ran.results[: ran.done, : RESULT if self.keeps_raw else INNOVATION].tolist()
-        for k, (one, result) in enumerate(zip(batch.series, results, strict=False)):
-            entry = self._entries[self._next]
-            judged = ran.how == JUDGE and k == ran.done - 1
-            self._count(entry, self._ended(entry, one, result, judged))
+        entries = self._entries[self._next : self._next + ran.done]
+        self._rows.went_on(entries, results)
+        for entry, result in zip(entries, results, strict=True):
+            outcome = outcome_of(entry.row, result)
+            entry.raw = raw_of(result, outcome.degrees) if self.keeps_raw else None
             self._next += 1
+            if ran.how == JUDGE and entry is entries[-1]:
+                outcome = self._judged(entry, outcome)
+            self._count(entry, outcome)
         if ran.how == KEEP:
             self._checkpoint()
         return ran.done > 0 or ran.how == KEEP
 
-    def _ended(self, entry: Entry, one: Series, result: list[float], judged: bool) -> Outcome:
-        """Outcome of an entry of a run; `judged`: it is to be."""
-        aid, diagnosis = entry.aid, self.diagnosis
-        outcome = outcome_of(entry.row, result)
-        diagnosis.came(aid, one, entry.value, result[MOVES] > 0.0)
-        entry.raw = raw_of(result, outcome.degrees) if self.keeps_raw else None
-        if judged:
-            self.decided = True
-            try:
-                correction = diagnosis.judge(aid, one, outcome, self.estimator)
-                if correction is not None:
-                    self.estimator.adopt(correction.mean, correction.spread)
-            except RAISED_BY_NUMBERS as error:
-                entry.error = repr(error)
-                return Outcome("failed")
-        elif outcome.name == "fused":
-            one.fused(aid.t_ns, ())
+    def _judged(self, entry: Entry, outcome: Outcome) -> Outcome:
+        """Outcome of an aid that is judged."""
+        aid, self.decided = entry.aid, True
+        try:
+            one = self.diagnosis.series[aid.source]
+            correction = self.diagnosis.judge(aid, one, outcome, self.estimator)
+            if correction is not None:
+                self.estimator.adopt(correction.mean, correction.spread)
+        except RAISED_BY_NUMBERS as error:
+            entry.error = repr(error)
+            return Outcome("failed")
         return outcome
 
     def _give_up(self, count: int, name: str) -> None:
