@@ -207,10 +207,9 @@ class ErrorStateFilter:
         self.wider, self._phi, self._shares = m.wider, m.phi, m.shares
         self._covs: Array = m.covs
         self._cov: Array = self._covs[0]
-        self.covariance: Array = self._cov[: model.size, : model.size]
-        """P (n, n) of the published error state, a view."""
+        self._covariance: Array = self._cov[: model.size, : model.size]
         lent = {rows: Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1)}
-        self._view = State(self.nav, self.xi, self.step, model, self.covariance, lent)
+        self._view = State(self.nav, self.xi, self.step, model, self._covariance, lent)
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
@@ -226,6 +225,11 @@ class ErrorStateFilter:
     def gap_ns(self) -> int:
         """No sample may stand for longer."""
         return int(self._memory.head[GAP])
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of the published error state, a view."""
+        return self._covariance
 
     @property
     def isolates(self) -> bool:

@@ -142,7 +142,7 @@ class TiltAxesFilter(KalmanEstimator):
         if self.turns and not self._holding:
             return self._turn_in(aid)
         self.turned = 0.0
-        if self._holding or not (self._astray or may_part(self.covariance, self._slots)):
+        if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
             return self._fold_in(aid, noise)
         before = self._estimate()
         outcome = self._fold_in(aid, noise)
@@ -157,7 +157,7 @@ class TiltAxesFilter(KalmanEstimator):
     def release(self) -> None:
         """Feed back what was carried."""
         before = self._estimate()
-        apart = self._astray or may_part(self.covariance, self._slots)
+        apart = self._astray or may_part(self._covariance, self._slots)
         super().release()
         if apart:
             self._carry_over(before)
@@ -171,7 +171,7 @@ class TiltAxesFilter(KalmanEstimator):
     def _carry_over(self, before: Array) -> None:
         """P after an update of an `_estimate` `before`."""
         slots = self._biases, *self._kept
-        self.turned = carry_over_all(self.covariance, before, self.nav, self.xi, *slots)
+        self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
         if self.hypotheses is not None:
             bank = self.hypotheses
             carry_over_rows(bank.transition, before, self.nav, self.xi, self.turned, *slots)

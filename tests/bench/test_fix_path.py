@@ -6,7 +6,7 @@ from functools import cache
 
 from fusiond.bench.fix_path import Way, ordinary_fix
 
-FUNCTIONS, MODULES = 51, 21
+FUNCTIONS, MODULES = 52, 21
 """As they are; less is asked (docs/benchmarks.md)."""
 
 
