@@ -33,6 +33,8 @@ Feedback = Literal["at_once", "hold", "release"]
 """Choice of when the error estimate is fed back into the navigation state: right after the aid; not
 before an aid says so; or now, all that was held."""
 NOTHING_LEFT = np.zeros(10)
+POSITION, VELOCITY, NO_SLIP, SPEED = range(1, 5)
+"""Kinds of packed rows, of which positions and velocities always apply."""
 LENT_ROWS = 3
 """Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
 
@@ -100,6 +102,15 @@ class Renewal(NamedTuple):
     blocks: tuple[str, ...]
     kept: Array
     new: Array
+
+
+class Packed(NamedTuple):
+    """Kind of an aid's row, number of rows of its innovation, body of its row
+    (fusiond.aiding.packed)."""
+
+    kind: int
+    rows: int
+    body: bytes
 
 
 class NotApplicable(NamedTuple):
@@ -183,6 +194,11 @@ class Aid:
     def feedback(self) -> Feedback:
         """Choice of when the estimate is fed back."""
         return "at_once"
+
+    def packed(self, model: Model) -> Packed | None:
+        """Row of numbers of which a kernel makes the innovation (fusiond.aiding.packed); None where
+        it is made here alone."""
+        return None
 
     def at(self, nav: Array) -> Aid:
         """The aid as it is for a vehicle in the navigation state (10,), which is the filter's at

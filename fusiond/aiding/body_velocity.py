@@ -30,13 +30,23 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from operator import attrgetter
+from struct import Struct
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import (
+    NO_SLIP,
+    SPEED,
+    Aid,
+    Innovation,
+    NotApplicable,
+    Packed,
+    State,
+    Vector3,
+)
 from fusiond.aiding.candidates import STEADY, SpeedCandidate
 from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeedAid
 from fusiond.aiding.preintegration import add_of_force, turning
@@ -63,6 +73,7 @@ FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
 _UNKNOWN = np.zeros((0, 0))
+_NO_SLIP_BODY, _SPEED_BODY = Struct("<6d6q"), Struct("<6d9q")
 
 
 @lru_cache(maxsize=64)
@@ -298,6 +309,12 @@ class NonHolonomicAid(Aid):
         no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
         return rows
 
+    def packed(self, model: Model) -> Packed | None:
+        slots = _slots(model, SIDE_DRIFT).tolist()
+        sd = self.sd_m_s, self.sd_down_m_s, self.min_speed_m_s
+        body = _NO_SLIP_BODY.pack(*self.lever, *sd, *slots)
+        return Packed(NO_SLIP, 1 if model.hold_height else 2, body)
+
 
 @immutable()
 class WheelSpeedAid(Aid):
@@ -347,6 +364,14 @@ class WheelSpeedAid(Aid):
         rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        slots = _slots(model, self.drift, self.scale, self.latency).tolist()
+        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
+        names = (self.rounding,)
+        rounding = model.listed.get(names) or model.list_slots(names, (1,))
+        body = _SPEED_BODY.pack(*self.lever, *measured, self.signed, *slots, *rounding)
+        return Packed(SPEED, 1, body)
 
     def candidates(self) -> tuple[SpeedCandidate, ...]:
         own = self.sd_m_s, self.rounding_sd_m_s, self.drifts

@@ -39,6 +39,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from operator import attrgetter
+from struct import Struct
 from typing import Any, ClassVar
 
 import numpy as np
@@ -46,10 +47,20 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
+from fusiond.aiding.base import (
+    POSITION,
+    Aid,
+    Innovation,
+    NotApplicable,
+    Packed,
+    State,
+    Vector3,
+    level_arm_m,
+)
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.aiding.preintegration import add_of_force
 from fusiond.aiding.way_faced import WayFaced
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -68,6 +79,7 @@ Indices = NDArray[np.int64]
 
 
 _UNKNOWN = np.zeros((0, 0))
+_BODY = Struct("<14d14q")
 
 
 def wander_of(axis: int, wander_m: float, sd: Vector3) -> float:
@@ -248,6 +260,16 @@ class PositionAid(Aid):
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
         position_rows(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        height, names = self.height_m, (self.bias, self.time, self.rest, self.wander)
+        slots = model.listed.get(names) or model.list_slots(names, (3, 1, 3, 3))
+        fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
+        body = _BODY.pack(
+            *(*fix, *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m),
+            *slots,
+        )
+        return Packed(POSITION, 2 if height is None or model.hold_height else 3, body)
 
     def candidates(self) -> tuple[PositionCandidate, ...]:
         measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever

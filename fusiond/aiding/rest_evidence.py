@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right, insort
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,6 +33,8 @@ LEAST_SD_M_S = 0.02
 CONTRADICTION = (10.83, 13.82)
 # Kept longer than any history: a rewind asks again.
 KEEP_NS = 700_000_000_000
+# Measurements that may wait to be taken in: a tick's, and those of minutes where no sample comes.
+MOST_WAITING = 4096
 # Spans of which sums are kept: that of the standstill so far, and those of windows in it.
 MOST_SUMS = 8
 # Spans of which it is kept what they say, two a window: those of two minutes. A rewind asks for
@@ -100,6 +102,8 @@ class RestEvidence:
     """Speeds that were measured, and the quiet windows that were none of rest."""
 
     def __init__(self) -> None:
+        self.waiting: deque[Aid] = deque(maxlen=MOST_WAITING)
+        """Measurements that have come and are taken in when somebody asks."""
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
         self._told: dict[tuple[int, int], Measured] = {}
@@ -141,8 +145,16 @@ class RestEvidence:
                     self._told.clear()
                     del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
+    def catch_up(self) -> None:
+        """Take in what waits."""
+        if self.waiting:
+            waiting = tuple(self.waiting)
+            self.waiting.clear()
+            self.hear(waiting)
+
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
         """Speeds measured from `begin_ns` to `end_ns`, both included."""
+        self.catch_up()
         span = begin_ns, end_ns
         found = self._told.get(span)
         if found is None:
@@ -182,6 +194,7 @@ class RestEvidence:
     def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
         """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to
         `end_ns`, both included, and the sigma of one of its measurements."""
+        self.catch_up()
         found: list[_Speed] = []
         for speeds in self._speeds.values():
             rows = speeds[bisect_left(speeds, (begin_ns,)) : bisect_left(speeds, (end_ns + 1,))]

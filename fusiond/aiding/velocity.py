@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from operator import attrgetter
+from struct import Struct
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,10 +33,20 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
+from fusiond.aiding.base import (
+    VELOCITY,
+    Aid,
+    Innovation,
+    NotApplicable,
+    Packed,
+    State,
+    Vector3,
+    level_arm_m,
+)
 from fusiond.aiding.candidates import VelocityCandidate
 from fusiond.aiding.preintegration import add_of_force
 from fusiond.aiding.way_faced import WayFaced
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
@@ -43,6 +54,7 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOO
 
 Array = NDArray[np.float64]
 
+_BODY = Struct("<10d8q")
 SUFFIX = "_velocity"
 """Suffix that a receiver's velocity adds to its name."""
 AVERAGED = 0.5
@@ -161,6 +173,13 @@ class VelocityAid(Aid):
         measured = north, east, down, sd_n, sd_e, sd_d  # 0 where there is none down
         velocity_rows(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        names, v, sd = (self.time, self.rest, self.fix_time), self.v_ned, self.sd
+        slots = model.listed.get(names) or model.list_slots(names, (1, 3, 1))
+        measured = (*v, *sd) if len(v) == 3 else (*v, 0.0, *sd, 0.0)
+        body = _BODY.pack(*measured, *self.lever, self.sd_time_s, *slots)
+        return Packed(VELOCITY, 2 if model.hold_height else len(self.v_ned), body)
 
     def candidates(self) -> tuple[VelocityCandidate, ...]:
         return (

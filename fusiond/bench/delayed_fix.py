@@ -40,10 +40,10 @@ class Drive:
         output = scenario.imu_output(self._truth, rng)
         self._times = np.rint(self._truth.t_s[1:] * 1e9).astype(np.int64)
         self._samples = np.hstack((output.gyro, output.accel))
-        self._receiver = GnssReceiver(self._truth, scenario.gnss, rng)
+        self.receiver = GnssReceiver(self._truth, scenario.gnss, rng)
         lever = {"lever_arm_m": scenario.gnss.lever_arm_m}
         aiding = {"gnss": lever, "wheel": {"lever_arm_m": scenario.no_slip_m}, "rdss": lever}
-        self._navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
+        self.navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
         self._row = 0
 
     def delayed(self, number: int) -> Callable[[], int]:
@@ -55,10 +55,10 @@ class Drive:
         fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
 
         def work() -> int:
-            rewinds = self._navigator.timeline.counters.rewinds
-            assert self._navigator.add(fix, at, seen_ns=now) == "accepted"
+            rewinds = self.navigator.timeline.counters.rewinds
+            assert self.navigator.add(fix, at, seen_ns=now) == "accepted"
             self.tick()
-            assert self._navigator.timeline.counters.rewinds > rewinds
+            assert self.navigator.timeline.counters.rewinds > rewinds
             return 1
 
         return work
@@ -70,51 +70,51 @@ class Drive:
             self.fix()
             self._wheel()
             self._feed(SAMPLES)
-        assert self._navigator.started is not None
+        assert self.navigator.started is not None
 
     def tick(self) -> None:
         """The samples of one tick, and the solution after them."""
         self._feed(TICK_SAMPLES)
-        self._navigator.solution(int(self._times[self._row - 1]))
+        self.navigator.solution(int(self._times[self._row - 1]))
 
     def to_next_fix(self) -> None:
         """The samples until the next epoch, and of it, come; the filter has run until the tick
         before."""
         self._feed(SAMPLES - TICK_SAMPLES)
         rows = slice(self._row, self._row + TICK_SAMPLES)
-        self._navigator.add_imu(self._times[rows], self._samples[rows])
+        self.navigator.add_imu(self._times[rows], self._samples[rows])
 
     def take_fix(self) -> None:
         """The fix of that epoch comes, the filter runs, the solution is read."""
         self.fix()
         self._row += TICK_SAMPLES
-        self._navigator.advance()
-        self._navigator.solution(int(self._times[self._row - 1]))
+        self.navigator.advance()
+        self.navigator.solution(int(self._times[self._row - 1]))
 
     def _feed(self, samples: int) -> None:
         rows = slice(self._row, self._row + samples)
-        self._navigator.add_imu(self._times[rows], self._samples[rows])
-        self._navigator.advance()
+        self.navigator.add_imu(self._times[rows], self._samples[rows])
+        self.navigator.advance()
         self._row = rows.stop
 
     def fix(self) -> None:
         """Next epoch of the receiver."""
-        r, epoch = self._receiver, self._row // SAMPLES
+        r, epoch = self.receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         stamp = MonotonicStamp(t_ns)
         lat, lon, height = r.position[epoch].tolist()
         n, e, d = r.v_ned[epoch].tolist()
         fix = PositionFix("gnss", t_ns, stamp, lat, lon, height, sd_ned_m=r.sd_ned_m)
         fix = replace(fix, v_ned_m_s=(n, e, d), sd_v_ned_m_s=r.sd_v_ned_m_s)
-        self._navigator.add(fix, t_ns)
+        self.navigator.add(fix, t_ns)
 
     def _wheel(self) -> None:
         """Wheel measurement at that epoch."""
-        r, epoch = self._receiver, self._row // SAMPLES
+        r, epoch = self.receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         n, e, _ = r.v_ned[epoch].tolist()
         speed = WheelSpeed("wheel", t_ns, MonotonicStamp(t_ns), math.hypot(n, e))
-        self._navigator.add(speed, t_ns)
+        self.navigator.add(speed, t_ns)
 
 
 def delayed_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:

@@ -13,13 +13,13 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
+from fusiond.estimators.aid_run import AidRun
 from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.hypotheses import Hypotheses
@@ -31,23 +31,20 @@ from fusiond.estimators.propagation import (
     RECORD,
     propagate_for,
 )
-from fusiond.estimators.published_state import WIDER, Published, sigmas, speed_sigma, widen
+from fusiond.estimators.published_state import WIDER, Published, sigmas, surely_moves, widen
 from fusiond.estimators.renewal import renew
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
+from fusiond.estimators.screening import KEPT, Screened, screened
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
-from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN, step_before
+from fusiond.navigation.strapdown import step_before
 
 Array = NDArray[np.float64]
 
 
 AS_STATED = np.ones(3)
-MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
-"""A vehicle moves whose speed is beyond both."""
 _NO_WIDER = np.zeros(WIDER)
 
 
@@ -103,16 +100,6 @@ class Snapshot(NamedTuple):
     extra: object
 
 
-class Screened(NamedTuple):
-    """An update by rows: `codes` (m,), whitened `y` (m,), nu^T S^-1 nu, and P and dx after it."""
-
-    codes: Codes
-    y: Array
-    nis: float
-    cov: Array
-    dx: Array
-
-
 class Estimator(Protocol):
     """Interface of an estimator to timeline, navigator and studies.
 
@@ -152,6 +139,10 @@ class Estimator(Protocol):
     @property
     def isolates(self) -> bool:
         """True if it detects and leaves out faulty sources by itself."""
+
+    @property
+    def runs(self) -> AidRun | None:
+        """Aids in one call; None while it takes them one by one."""
 
     @property
     def isolated(self) -> dict[str, str]:
@@ -238,7 +229,7 @@ class ErrorStateFilter:
         self._holding = False
         self._carrying = False
         self.turned = 0.0
-        self._options = HOLD_HEIGHT if model.hold_height else 0
+        self.kernel_options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(model.width)
 
     @property
@@ -255,6 +246,11 @@ class ErrorStateFilter:
     def isolates(self) -> bool:
         """True if it detects and leaves out faulty sources by itself."""
         return False
+
+    @property
+    def runs(self) -> AidRun | None:
+        """Aids in one call; None while it takes them one by one."""
+        return None
 
     @property
     def isolated(self) -> dict[str, str]:
@@ -294,7 +290,7 @@ class ErrorStateFilter:
         `passing`, if nothing is to be folded in there."""
         if self.hypotheses is not None:
             self.hypotheses.conclude()
-        options = self._options
+        options = self.kernel_options
         if passing:
             options |= PASSING
         self.passing = passing
@@ -331,16 +327,13 @@ class ErrorStateFilter:
     def surely_moves(self, published: bool) -> bool:
         """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
         `published`, or P's alone."""
-        nav, wider = self.nav, _NO_WIDER
-        speed = math.hypot(nav.item(VN), nav.item(VE))
-        if self.step.item(STEP_RESTS_S) > 0.0 or speed <= MOVES_M_S:
+        of = self._cov, self.nav, self.step, self._memory.published
+        if not surely_moves(*of, _NO_WIDER):
             return False
-        if published:
-            wider = self.wider
-            if self.hypotheses is not None:
-                self.hypotheses.conclude()
-        sd = speed_sigma(self._cov, nav, self.step, *self.published, wider)
-        return speed > MOVES_SIGMAS * sd
+        if not published or self.hypotheses is None:
+            return True
+        self.hypotheses.conclude()
+        return bool(surely_moves(*of, self.wider))
 
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
@@ -349,27 +342,9 @@ class ErrorStateFilter:
         feed_back(self.nav, self.xi, dx)
 
     def _screen(self, aid: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
-        """Update by rows of a screened aid, without touching `cov` and `dx`.
-
-        A receiver that sets its clock moves all ranges at once: where it says so, or where the
-        better half of the ranges fails while the rates pass, the clock offset starts anew, in `cov`
-        too, and the rows are judged again.
-        """
-        z, h, r = rows
-        threshold = gate_threshold(aid.gate, 1)
-        offsets = self.model.slots_of(CLOCK_OFFSET)
-        renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
-        while True:
-            if renew:
-                cov[offsets] = 0.0
-                cov[:, offsets] = 0.0
-                cov[offsets, offsets] = self.model.initial[offsets] ** 2
-            codes, y = np.zeros(z.shape[0], dtype=np.int64), np.empty(z.shape[0])
-            cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
-            nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
-            if renew or not offsets or not jumped(codes, h, offsets):
-                return Screened(codes, y, nis, cov_out, dx_out)
-            renew = True
+        """Update by rows of a screened aid, without touching `cov` and `dx`; where its clock starts
+        anew, in `cov` too."""
+        return screened(aid, rows, self.model, gate_threshold(aid.gate, 1), cov, dx)
 
     def look(self, aid: Linearised) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded

@@ -86,17 +86,20 @@ KIND_NUMBERS = 7
 LOG_PRIOR = 7
 """Behind them in a table: logs of the prior sigmas (3)."""
 
-# The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns). The
+# The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns) in
+# single precision: what a fault of 64 s has done is known to 1e-6 of it, its prior to a digit. The
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
-# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, by how
-# much the unit has been found to have turned on the vehicle in pitch and yaw (rad), what has been
-# fed back of the velocity in all (m/s), and the epoch (s) of what was judged last.
+# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the row
+# width of the transition, by how much the unit has been found to have turned on the vehicle in
+# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
+# back of the velocity in all (m/s), and the epoch (s) of what was judged last.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
-ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, TURNED_BY = range(10, 19)
-FED_BACK, JUDGED_S, HEAD = 20, 23, 24
+ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
+UNWEIGHED, FED_BACK, JUDGED_S = 21, 22, 25
+HEAD = 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -111,8 +114,8 @@ L10, L11, L20, L21, L22, E1, E2, OF_THREE = (LANES * row for row in range(11, 19
 L_ROWS = np.array([[L_AT, L10, L20], [L10, L11, L21], [L20, L21, L22]])
 E_ROWS = np.array([E_AT, E1, E2])
 # What never changes of eight groups: the prior's precisions, its mean, and what of the log odds
-# does not depend on what has come.
-P_AT, MEAN_AT, ODDS_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5
+# does not depend on what has come, with the prior's density and without.
+P_AT, MEAN_AT, ODDS_AT, RATE_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5, LANES * 6
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
@@ -165,7 +168,7 @@ def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> Faul
             lanes[row, P_AT + LANES * c + lane] = 1.0 / (sd * sd)
         lanes[row, MEAN_AT + lane] = numbers[kind, MEAN]
         odds = numbers[kind, LOG_RATE] + math.log(PERIODS_S[level])
-        lanes[row, ODDS_AT + lane] = odds - np.log(prior).sum()
+        lanes[row, ODDS_AT + lane], lanes[row, RATE_AT + lane] = odds - np.log(prior).sum(), odds
     logs = [[math.log(sd) for sd in row] for row in numbers[:, PRIOR : PRIOR + 3].tolist()]
     known = np.hstack((numbers, np.array(logs).reshape(-1, 3)))
     return FaultTable(ints, known, lanes.ravel(), devices)
@@ -183,22 +186,23 @@ def bank_size(table: FaultTable, n: int, width: int) -> int:
         return 0
     tiles, ones = -(-threes // LANES), -(-(groups - threes) // LANES)
     size = GROUPS + tiles * OF_THREE + ones * OF_ONE
-    return size + width * width + n * columns_of(table)
+    return size + width * width + n * columns_of(table) // 2
 
 
 def columns_of(table: FaultTable) -> int:
-    """Columns of V, and of an aid's rows."""
+    """Columns of V, and of an aid's rows: whole steps of vector code, the last ones of nothing."""
     tiles, ones = -(-table.threes // LANES), -(-(table.groups - table.threes) // LANES)
-    return (3 * tiles + ones) * LANES
+    return -(-(3 * tiles + ones) // 4) * 4 * LANES
 
 
 def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
     """Write what of a new bank never changes."""
     if bank.size:
-        bank[SENSITIVITIES] = bank.size - n * columns_of(table)
+        bank[SENSITIVITIES] = bank.size - n * columns_of(table) // 2
         bank[PHI] = bank[SENSITIVITIES] - width * width
         bank[ALL], bank[THREES], bank[LENGTH] = table.groups, table.threes, LANES
-        bank[UNJUDGED] = np.inf
+        bank[WIDTH] = width
+        bank[UNJUDGED] = bank[UNWEIGHED] = np.inf
 
 
 @compiled("i8(f8[::1], i8)", forceinline=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.block_covariance import DENSITIES, STEPS
 from fusiond.estimators.covariance import transition_for
-from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS
+from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH
 from fusiond.estimators.fault_rows import add_rows, walk_path
 from fusiond.estimators.turned_axes import rest_rows
 from fusiond.navigation.compiled import compiled
@@ -76,12 +76,13 @@ def begin_transition(bank: Array, n: int, width: int) -> None:
     bank[WAITS] = 0.0
 
 
-@compiled("void(f8[::1], i8, i8)", allocates=True)
-def settle(bank: Array, n: int, width: int) -> None:
+@compiled("void(f8[::1], i8)", allocates=True)
+def settle(bank: Array, n: int) -> None:
     """V <- Phi V of all that has been carried since the last aid."""
     if bank[WAITS] == 0.0:
         return
-    phi, v = bank[int(bank[PHI]) :], bank[int(bank[SENSITIVITIES]) :]
+    width = int(bank[WIDTH])
+    phi, v = bank[int(bank[PHI]) :], bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     # Rows that take something of others, and of which.
     mixed, count = np.empty(n, dtype=np.int64), 0
@@ -89,17 +90,20 @@ def settle(bank: Array, n: int, width: int) -> None:
     alone = np.zeros(n, dtype=np.bool_)
     for i in range(n):
         begin = begins[count]
-        end = begin
+        end, row, entries = begin, phi[i * width : i * width + n], 0
+        for j in range(row.shape[0]):
+            entries += row[j] != 0.0
+        alone[i] = entries == 1 and row[i] != 0.0
+        if alone[i]:
+            continue
         for j in range(n):
-            if phi[i * width + j] != 0.0:
+            if row[j] != 0.0:
                 of[end] = j
                 end += 1
-        alone[i] = end == begin + 1 and of[begin] == i
-        if not alone[i]:
-            mixed[count] = i
-            count += 1
-            begins[count] = end
-    new = np.empty(count * CHUNK)
+        mixed[count] = i
+        count += 1
+        begins[count] = end
+    new = np.empty(count * CHUNK, dtype=np.float32)
     for first in range(0, columns, CHUNK):
         length = min(CHUNK, columns - first)
         for k in range(count):
@@ -110,7 +114,7 @@ def settle(bank: Array, n: int, width: int) -> None:
             row = phi[mixed[k] * width : (mixed[k] + 1) * width]
             add_rows(v, columns, first, those, those.shape[0], row, out)
         for i in range(n):
-            keep = phi[i * width + i]
+            keep = np.float32(phi[i * width + i])
             if alone[i] and keep != 1.0:
                 kept = v[i * columns + first : i * columns + first + length]
                 for j in range(kept.shape[0]):

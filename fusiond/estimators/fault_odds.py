@@ -350,7 +350,7 @@ def identified(found: Array) -> bool:
 def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
     """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
     q = opened.shape[0]
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     opened[:] = 0.0
     m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
@@ -386,7 +386,7 @@ def estimate(
 ) -> None:
     """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
     at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     m = np.empty(12)
     solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)

@@ -51,6 +51,7 @@ from fusiond.estimators.fault_bank import (
     THREES,
     TURNED,
     UNJUDGED,
+    UNWEIGHED,
     WEIGHT,
     column_of,
     group_at,
@@ -114,7 +115,7 @@ def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Arra
         for i in range(size):
             for j in range(size):
                 m[3 * i + j] -= of[i, c] * of[j, c]
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     for d in range(size):
         first = column_of(bank, likeliest, d)
@@ -145,7 +146,7 @@ def _begin_group(
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     if ints[kind, SIGNATURE] == FOLLOWED:
         bank[at + COUNTS_BY] = math.log(max(followed[3 * n], UNLIKELY))
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     for c in range(size):
         first = column_of(bank, number, c)
@@ -183,7 +184,7 @@ def begin_all(
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
     begin_transition(bank, n, width)
-    bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED] = 0.0, 0.0, np.inf
+    bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED], bank[UNWEIGHED] = 0.0, 0.0, np.inf, np.inf
     followed = np.zeros(3 * n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
@@ -212,7 +213,7 @@ def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> Non
     there = group_at(bank, to)
     for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
         bank[there + j] = bank[at + j]
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     for c in range(size):
         own, other = column_of(bank, number, c), column_of(bank, to, c)

@@ -53,6 +53,7 @@ from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.navigation.strapdown import STEP_DCM
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 COUNTS = 1e-3
@@ -115,9 +116,9 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
             factors[unsigned(6 * LANES) + lane] = mean + over * beyond
 
 
-@compiled("void(f8[::1], i8, i8, i8, f8[::1], i8, f8[::1])")
+@compiled("void(f4[::1], i8, i8, i8, f8[::1], i8, f8[::1])")
 def _published_rows(
-    kept: Array, columns: int, first: int, count: int, motion: Array, time_slot: int, out: Array
+    kept: Single, columns: int, first: int, count: int, motion: Array, time_slot: int, out: Array
 ) -> None:
     """Write v (9, count) of as many columns of V, of a vehicle that is `moving` (12,)."""
     for i in range(CORE_SIZE):
@@ -148,7 +149,7 @@ def widen_by_faults(
     """Write `wider` (9,): what the weighed hypotheses leave open of position, velocity, roll, pitch
     and yaw of nav (10,) with the attitude that `step` (28,) holds, published by the clock whose
     offset is parameter `time_slot` (-1: none); `work` (OPENED_WORK,)."""
-    kept, motion = bank[int(bank[SENSITIVITIES]) :], np.empty(MOVING)
+    kept, motion = bank[int(bank[SENSITIVITIES]) :].view(np.float32), np.empty(MOVING)
     moving(nav, step, motion)
     columns, length, v = kept.shape[0] // n, int(bank[LENGTH]), work[_V:OPENED_WORK]
     threes = (int(bank[THREES]) + LANES - 1) // LANES

@@ -68,6 +68,7 @@ from fusiond.navigation.error_model import DV
 from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 
@@ -140,7 +141,7 @@ def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
     return of_this
 
 
-@compiled("void(f8[::1], i8, i8, f8, f8, f8, f8[::1])")
+@compiled("void(f8[::1], i8, i8, f8, f8, f8, f4[::1])")
 def _offset_rows(
     bank: Array,
     kind: int,
@@ -148,7 +149,7 @@ def _offset_rows(
     offset: float,
     slope: float,
     t_s: float,
-    s: Array,
+    s: Single,
 ) -> None:
     """Add to s (columns,) what a kind's component makes of a row: an offset, and what has grown
     with a slope since the onset of each restart until `t_s`."""
@@ -203,7 +204,7 @@ def _of_row(
 
 
 @compiled(
-    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8, f8[::1])",
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8, f4[::1])",
 )
 def _sign(
     bank: Array,
@@ -215,7 +216,7 @@ def _sign(
     nav: Array,
     m: int,
     columns: int,
-    work: Array,
+    work: Single,
 ) -> None:
     """Add D of the m rows of an aid that a kind concerns."""
     of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
@@ -254,9 +255,9 @@ def rows_of_fault(
         out[a] = (offset + slope * age_s) * b[0 if size == 1 else a]
 
 
-@compiled("void(f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1])")
+@compiled("void(f4[::1], i8, i8, i8[::1], i8, f8[::1], f4[::1])")
 def add_rows(
-    v: Array, columns: int, first: int, of: Indices, count: int, c: Array, out: Array
+    v: Single, columns: int, first: int, of: Indices, count: int, c: Array, out: Single
 ) -> None:
     """Add to `out` c (n,) times V, from column `first` on: of its rows `count`, `of` which c is not
     zero, four in one pass."""
@@ -264,12 +265,12 @@ def add_rows(
     while at < count:
         more = at + 4 <= count
         i_0 = of[at]
-        v_0, c_0 = v[i_0 * columns + first :], c[i_0]
+        v_0, c_0 = v[i_0 * columns + first :], np.float32(c[i_0])
         if more:
             i_1, i_2, i_3 = of[at + 1], of[at + 2], of[at + 3]
-            v_1, c_1 = v[i_1 * columns + first :], c[i_1]
-            v_2, c_2 = v[i_2 * columns + first :], c[i_2]
-            v_3, c_3 = v[i_3 * columns + first :], c[i_3]
+            v_1, c_1 = v[i_1 * columns + first :], np.float32(c[i_1])
+            v_2, c_2 = v[i_2 * columns + first :], np.float32(c[i_2])
+            v_3, c_3 = v[i_3 * columns + first :], np.float32(c[i_3])
             for j in range(out.shape[0]):
                 out[j] += c_0 * v_0[j] + c_1 * v_1[j] + c_2 * v_2[j] + c_3 * v_3[j]
             at += 4
@@ -281,7 +282,7 @@ def add_rows(
 
 @compiled(
     "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
-    "f8[:, ::1], f8[::1])",
+    "f8[:, ::1], f4[::1])",
     allocates=True,
 )
 def sensitivity_rows(
@@ -296,12 +297,12 @@ def sensitivity_rows(
     h: Array,
     r: Array,
     g: Array,
-    work: Array,
+    work: Single,
 ) -> int:
     """Write L^-1 (H V + D) of an aid's rows at `t_ns` to `work`, a row of columns each; how many
     columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav (10,)."""
     m, kinds = h.shape[0], ints.shape[0]
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns: int = v.shape[0] // n
     of = np.empty(n, dtype=np.int64)
     for a in range(m):
@@ -321,20 +322,21 @@ def sensitivity_rows(
         for i in range(n):
             along += h[a, i] * g[a, i]
         # Of S = (h g) root + r, which is root^2.
-        over = 1.0 / (0.5 * (along + math.sqrt(along * along + 4.0 * r[a])))
+        over = np.float32(1.0 / (0.5 * (along + math.sqrt(along * along + 4.0 * r[a]))))
         for b in range(a):
             common, before = 0.0, work[b * columns : (b + 1) * columns]
             for i in range(n):
                 common += h[a, i] * g[b, i]
+            less = np.float32(common)
             for j in range(s.shape[0]):
-                s[j] -= common * before[j]
+                s[j] -= less * before[j]
         for j in range(s.shape[0]):
             s[j] *= over
     return columns
 
 
-@compiled("void(f8[::1], i8, f8[:, ::1], i8, i8, f8[::1])")
-def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> None:
+@compiled("void(f4[::1], i8, f8[:, ::1], i8, i8, f4[::1])")
+def _fold_in(v: Single, n: int, g: Array, m: int, columns: int, work: Single) -> None:
     """V <- V - g^T s, three rows in one pass, or one."""
     at = 0
     while at < m:
@@ -343,7 +345,8 @@ def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> N
             s_1 = work[(at + 1) * columns : (at + 2) * columns]
             s_2 = work[(at + 2) * columns : (at + 3) * columns]
             for i in range(n):
-                c_0, c_1, c_2 = g[at, i], g[at + 1, i], g[at + 2, i]
+                c_0, c_1 = np.float32(g[at, i]), np.float32(g[at + 1, i])
+                c_2 = np.float32(g[at + 2, i])
                 if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
                     continue
                 row = v[i * columns : (i + 1) * columns]
@@ -352,7 +355,7 @@ def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> N
             at += 3
         else:
             for i in range(n):
-                c_0 = g[at, i]
+                c_0 = np.float32(g[at, i])
                 if c_0 != 0.0:
                     row = v[i * columns : (i + 1) * columns]
                     for j in range(row.shape[0]):
@@ -360,12 +363,12 @@ def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> N
             at += 1
 
 
-@compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f8[::1])")
-def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Array) -> None:
+@compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f4[::1])")
+def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) -> None:
     """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
     `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
     m = y.shape[0]
-    v = bank[int(bank[SENSITIVITIES]) :]
+    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     square = 0.0
     for a in range(m):
@@ -387,14 +390,15 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Array) -
             y_a = y[a]
             at_0 = unsigned(a * columns + first * LANES)
             for k in range(length):
-                j, s_0 = own + unsigned(k), work[at_0 + unsigned(k)]
+                j, s_0 = own + unsigned(k), np.float64(work[at_0 + unsigned(k)])
                 bank[j + unsigned(L_AT)] += s_0 * s_0
                 bank[j + unsigned(E_AT)] += s_0 * y_a
             if three:
                 at_1, at_2 = at_0 + unsigned(LANES), at_0 + unsigned(2 * LANES)
                 for k in range(length):
                     j, lane = own + unsigned(k), unsigned(k)
-                    s_0, s_1, s_2 = work[at_0 + lane], work[at_1 + lane], work[at_2 + lane]
+                    s_0, s_1 = np.float64(work[at_0 + lane]), np.float64(work[at_1 + lane])
+                    s_2 = np.float64(work[at_2 + lane])
                     bank[j + unsigned(L10)] += s_1 * s_0
                     bank[j + unsigned(L11)] += s_1 * s_1
                     bank[j + unsigned(L20)] += s_2 * s_0

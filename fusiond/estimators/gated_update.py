@@ -16,6 +16,7 @@ from fusiond.estimators.fault_bank import (
     SIGNATURE,
     SIZE,
     UNJUDGED,
+    UNWEIGHED,
     WEIGHT,
     column_of,
     group_at,
@@ -23,19 +24,21 @@ from fusiond.estimators.fault_bank import (
 from fusiond.estimators.fault_odds import APART, judge, solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, keep_fed_back, sensitivity_rows
+from fusiond.estimators.fault_suspects import judge_what_waits, restarts
 from fusiond.estimators.update import feed_back, fold_in, whiten
 from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 AMBIGUOUS = 1.0 / (1.0 + math.exp(APART))
 """Probability of a story from which on another is not `APART` ahead of it."""
 
 
-@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])", allocates=True)
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f4[::1])", allocates=True)
 def nis_if_sensors_fail(
-    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
+    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Single
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
     and those of sources that are over leave open, as they are weighed; `work` as
@@ -57,7 +60,7 @@ def nis_if_sensors_fail(
         for a in range(rows):
             for b in range(rows):
                 for i in range(size):
-                    s_a = work[a * columns + column_of(bank, number, i)]
+                    s_a = np.float64(work[a * columns + column_of(bank, number, i)])
                     for j in range(size):
                         x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
                         s_b = work[b * columns + column_of(bank, number, j)]
@@ -78,7 +81,7 @@ def nis_if_sensors_fail(
 
 @compiled(
     "f8(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
-    "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, i8, f8[::1], f8[::1])"
+    "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, i8, f4[::1], f8[::1])"
 )
 def fold_and_account(
     nav: Array,
@@ -99,7 +102,7 @@ def fold_and_account(
     t_ns: int,
     measures: int,
     device: int,
-    work: Array,
+    work: Single,
     found: Array,
 ) -> float:
     """As `fusiond.estimators.update.fuse` without holding, with the bank beside it; `measures` and
@@ -113,6 +116,9 @@ def fold_and_account(
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
+    if nis > threshold or restarts(bank, t_ns):
+        judge_what_waits(bank, ints, numbers, lanes, found)
+    bank[UNWEIGHED] = np.inf  # what comes now is evidence, too
     if nis > threshold and bank[UNJUDGED] < np.inf:
         judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
     restart_due(bank, ints, numbers, n, t_ns, nav, step)
@@ -132,7 +138,7 @@ def fold_and_account(
 
 @compiled(
     "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1],"
-    "f8[:, ::1], i8, i8, i8, f8[::1])"
+    "f8[:, ::1], f8[::1], i8, i8, i8, f4[::1], f8[::1])"
 )
 def account_for(
     nav: Array,
@@ -145,14 +151,19 @@ def account_for(
     bank: Array,
     ints: Indices,
     numbers: Array,
+    lanes: Array,
     t_ns: int,
     measures: int,
     device: int,
-    work: Array,
+    work: Single,
+    found: Array,
 ) -> None:
     """Update the bank by rows that were `fused` or not, as `whiten` has left y (m,) and g (m, w):
     of a filter that keeps its estimate."""
     n = h.shape[1]
+    if restarts(bank, t_ns):
+        judge_what_waits(bank, ints, numbers, lanes, found)
+    bank[UNWEIGHED] = np.inf
     restart_due(bank, ints, numbers, n, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
     account(bank, n, y, g, fused, work)

@@ -20,6 +20,7 @@ from fusiond.estimators.fault_bank import (
     ONSET,
     OTHER,
     PERIODS_S,
+    PHI,
     PLACES,
     RESTARTS,
     ROLLS,
@@ -36,10 +37,12 @@ from fusiond.estimators.fault_bank import (
     columns_of,
     group_at,
 )
+from fusiond.estimators.fault_carried import settle
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
 from fusiond.estimators.fault_opened import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
 from fusiond.estimators.fault_rows import keep_fed_back, rows_of_fault
+from fusiond.estimators.fault_suspects import judge_what_waits
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 
@@ -82,19 +85,23 @@ class Hypotheses:
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
         """Result of the last `judge`, as of fusiond.estimators.fault_odds."""
-        self._mounting = np.full((2, 2), -1.0)
+        self.mounting = np.full((2, 2), -1.0)
         """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
         for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
-            self._mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
+            self.mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
         self.columns = columns_of(table)
-        self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
+        self.rows = np.zeros(LENT_ROWS * self.columns, dtype=np.float32)
+        self.work = np.zeros(OPENED_WORK)
         self._judged = bank, table.ints, table.numbers, table.lanes, self.n
-        self._widened = *of, self._mounting, self.work, wider, self.found
+        self._widened = *of, self.mounting, self.work, wider, self.found
         """Arguments of `judge_and_widen` before and behind an epoch."""
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
-        self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
+        self.sensitivities = bank[int(bank[SENSITIVITIES]) :].view(np.float32).reshape(self.n, -1)
         """V (n, columns)."""
+        first = int(bank[PHI])
+        self.transition = bank[first : first + self.width**2].reshape(self.width, -1)
+        """What V waits to be multiplied by (w, w); one where it waits for nothing."""
         self._nine = np.zeros((9, 9))
         self.of_source: dict[str, tuple[int, int]] = {}
 
@@ -117,7 +124,7 @@ class Hypotheses:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step: one
         that starts, or one of whose error state a fault's `mean` (n,) has been taken. Of the
         mounting that is a turn."""
-        for k, slot in enumerate(self._mounting[:, 0].astype(int).tolist()):
+        for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
@@ -161,6 +168,7 @@ class Hypotheses:
 
     def conclude(self) -> None:
         """Judge what waits for it."""
+        judge_what_waits(self.bank, *self.table[:3], self.found)
         epoch_s = self.bank.item(UNJUDGED)
         if epoch_s < math.inf:
             judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)
@@ -202,6 +210,11 @@ class Hypotheses:
             effect[1:],
         )
 
+    def carry_over(self) -> None:
+        """`transition` has been written: V <- T V."""
+        self.bank[WAITS] = 1.0
+        settle(self.bank, self.n)
+
     def each(self, which: int) -> Array:
         """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""
         found: Array = self.bank[self._at + which]
@@ -210,7 +223,8 @@ class Hypotheses:
     def effect(self, number: int) -> Array:
         """V of a group (n, p)."""
         count = int(self.table.ints[number // RESTARTS, SIZE])
-        return self.sensitivities[:, [column_of(self.bank, number, c) for c in range(count)]]
+        columns = [column_of(self.bank, number, c) for c in range(count)]
+        return self.sensitivities[:, columns].astype(np.float64)
 
     @property
     def log_odds(self) -> Array:

@@ -62,6 +62,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import NOTHING_LEFT, Innovation, Linearised, NotApplicable, State
+from fusiond.estimators.aid_run import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
@@ -76,7 +77,8 @@ from fusiond.estimators.invariant_error import (
 )
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_down_rows, keep_downward
+from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes_carried import keep_down_rows, keep_downward
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -149,13 +151,21 @@ class InvariantFilter(TiltAxesFilter):
         super().__init__(model, gap_s, faults)
         self._settles = settles
         self._mounts = model.indices[MOUNTING]
-        self._known = False
-        """True if the heading has been known since the start, to `PLAIN_SD_RAD`."""
+        self._knows[[SETTLES, PLAIN, LARGE]] = settles, PLAIN_SD_RAD**2, LARGE_SD_RAD**2
         self._bent = False
         """True if the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
         that fails its gate counts as one at the gate: it may be the measurement's fault."""
+
+    @property
+    def _known(self) -> bool:
+        """True if the heading has been known since the start, to `PLAIN_SD_RAD`."""
+        return self._knows.item(KNOWN) > 0.0
+
+    @_known.setter
+    def _known(self, true: bool) -> None:
+        self._knows[KNOWN] = true
 
     def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
         """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""

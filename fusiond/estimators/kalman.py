@@ -9,11 +9,13 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1.
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
+from fusiond.estimators.aid_run import KNOWS, NO_AXES, AidRun, Axes
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
@@ -27,6 +29,9 @@ Array = NDArray[np.float64]
 class KalmanEstimator(ErrorStateFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
+    packs: ClassVar[bool] = True
+    """True if an update is that of fusiond.estimators.aid_run, where a bank is beside it."""
+
     def __init__(
         self,
         model: Model,
@@ -36,6 +41,22 @@ class KalmanEstimator(ErrorStateFilter):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+        self.turns = False
+        """True if the heading may be far off, and updates are another kind's."""
+        self._knows = np.zeros(KNOWS)
+        self._runs = self._new_run(NO_AXES)
+
+    def _new_run(self, axes: Axes) -> AidRun | None:
+        """Aids in one call, with what updates carry over; None without a bank."""
+        bank = self.hypotheses
+        if bank is None or not self.packs:
+            return None
+        return AidRun(self, self._memory, self.model, bank, axes, self._knows)
+
+    @property
+    def runs(self) -> AidRun | None:
+        """Aids in one call; None while an estimate is held, or updates turn."""
+        return None if self._holding or self.turns else self._runs
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; `noise` (3,) times its variances."""
@@ -64,12 +85,12 @@ class KalmanEstimator(ErrorStateFilter):
         else:
             of, table = bank.of_source.get(aid.source) or bank.of(aid), bank.table
             if not self._holding:
-                now = bank.bank, *table[:3], aid.t_ns, *of, bank.work, bank.found
+                now = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
                 nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
-                    told = bank.bank, *table[:2], aid.t_ns, *of, bank.work
+                    told = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
                     account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *told)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
@@ -103,9 +124,9 @@ class KalmanEstimator(ErrorStateFilter):
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
         y, g = work(count, self.model.width)
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            told = bank.bank, *bank.table[:2], aid.t_ns, *bank.of(aid)
-            space = np.empty(count * bank.columns)
-            account_for(self.nav, self.step, h, r, y, g, fused, *told, space)
+            told = bank.bank, *bank.table[:3], aid.t_ns, *bank.of(aid)
+            space = np.empty(count * bank.columns, dtype=np.float32)
+            account_for(self.nav, self.step, h, r, y, g, fused, *told, space, bank.found)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

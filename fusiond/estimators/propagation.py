@@ -348,7 +348,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                     )
                 sums[SPAN] = 0.0
         if bank.size and not passing:
-            settle(bank, n, width)
+            settle(bank, n)
         head[AHEAD] = sums[SPAN] > 0.0
         for k in range(used):
             mirror(covs[k * square : (k + 1) * square], width, n)

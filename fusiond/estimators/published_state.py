@@ -47,6 +47,7 @@ from fusiond.navigation.strapdown import (
     Q0,
     STEP_DCM,
     STEP_RATE_B,
+    STEP_RESTS_S,
     STEP_SMOOTH_N,
     VN,
 )
@@ -55,6 +56,8 @@ Array = NDArray[np.float64]
 
 WIDER = 9
 """Variances of `widen`."""
+MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
+"""A vehicle moves whose speed is beyond both."""
 ENTRIES, MOVING = 22, 12
 """Numbers of `entries` and of `moving`."""
 
@@ -193,21 +196,17 @@ def widen(wider: Array, out: Array) -> None:
             out[i] = math.sqrt(out[i] * out[i] + wider[i])
 
 
-@compiled("f8(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])", allocates=True)
-def speed_sigma(
-    cov: Array,
-    nav: Array,
-    step: Array,
-    time_slot: int,
-    clock_sd_s: float,
-    axes_sd_rad: float,
-    wider: Array,
-) -> float:
-    """One sigma of the horizontal velocity, of `sigmas` that are `wider`."""
+@compiled("f8(f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", allocates=True)
+def surely_moves(cov: Array, nav: Array, step: Array, published: Array, wider: Array) -> float:
+    """1 if the vehicle moves, by its horizontal velocity and the sigma of that, by `published` (3,)
+    and `wider` (9,); else 0."""
+    speed = math.hypot(nav[VN], nav[VN + 1])
+    if step[STEP_RESTS_S] > 0.0 or speed <= MOVES_M_S:
+        return 0.0
     out = np.empty(9)
-    sigmas(cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
+    sigmas(cov, nav, step, int(published[0]), published[1], published[2], out)
     widen(wider, out)
-    return math.hypot(out[3], out[4])
+    return 1.0 if speed > MOVES_SIGMAS * math.hypot(out[3], out[4]) else 0.0
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")

@@ -15,10 +15,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.base import Innovation, Linearised
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -294,3 +298,38 @@ def jumped(codes: Codes, h: Array, offsets: Sequence[int]) -> bool:
     ranges = (np.abs(h[:, offsets]) > 0.5).any(axis=1)
     lost = np.count_nonzero(codes[ranges])
     return bool(lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges))
+
+
+class Screened(NamedTuple):
+    """An update by rows: `codes` (m,), whitened `y` (m,), nu^T S^-1 nu, and P and dx after it."""
+
+    codes: Codes
+    y: Array
+    nis: float
+    cov: Array
+    dx: Array
+
+
+def screened(
+    aid: Linearised, rows: Innovation, model: Model, threshold: float, cov: Array, dx: Array
+) -> Screened:
+    """Update by rows of a screened aid, without touching `cov` and `dx`.
+
+    A receiver that sets its clock moves all ranges at once: where it says so, or where the better
+    half of the ranges fails while the rates pass, the clock offset starts anew, in `cov` too, and
+    the rows are judged again.
+    """
+    z, h, r = rows
+    offsets = model.slots_of(CLOCK_OFFSET)
+    renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
+    while True:
+        if renew:
+            cov[offsets] = 0.0
+            cov[:, offsets] = 0.0
+            cov[offsets, offsets] = model.initial[offsets] ** 2
+        codes, y = np.zeros(z.shape[0], dtype=np.int64), np.empty(z.shape[0])
+        cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
+        nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
+        if renew or not offsets or not jumped(codes, h, offsets):
+            return Screened(codes, y, nis, cov_out, dx_out)
+        renew = True

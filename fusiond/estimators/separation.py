@@ -43,6 +43,8 @@ class SeparatedEstimator(KalmanEstimator):
     """The centralised filter with a subset for each of `devices`: sources of position, by the name
     that their aids begin with. What is published is, to rounding, the filter's without subsets."""
 
+    packs = False
+
     def __init__(
         self,
         model: Model,

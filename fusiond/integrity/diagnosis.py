@@ -51,6 +51,7 @@ from fusiond.integrity.service import (
     REPEATS,
     STILL,
     Series,
+    Service,
     value_of,
 )
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -157,6 +158,16 @@ class Diagnosis:
         self._shared.discard(aid.source)
         one = self._series[aid.source] = Series.of(aid) if one is None else one.copied()
         return one
+
+    def plain(self, aid: Aid) -> Series | None:
+        """The series of an aid of which nothing is to be judged beyond its gate and hypotheses: it
+        is nominal, and nothing of its device is out; None of another. It may be changed."""
+        one = self._series.get(aid.source)
+        if one is None or one.state is not Service.NOMINAL or one.failed:
+            return None
+        if one.device in self._agreement:
+            return None
+        return self.own(aid) if aid.source in self._shared else one
 
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """The series of an aid, before it is folded in; one that repeats itself leaves service,

@@ -46,7 +46,7 @@ from fusiond.aiding.candidates import (
 )
 from fusiond.estimators.fault_bank import LASTS_S as LIKELY_FOR_S
 from fusiond.estimators.fault_odds import APART
-from fusiond.integrity.noise import forget_lately, learn, unlearned
+from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
 
@@ -173,6 +173,16 @@ class Series:
         self.proven_ns = 2 * t_ns - self.out_ns
         self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
         self.failed = self.passed = 0
+
+    def went_on(self, t_ns: int, value: object, moved: int) -> None:
+        """Several have come while it was nominal, the last at `t_ns`, none with the `value` of the
+        one before it; None of a constraint. The vehicle `moved` at so many of them."""
+        self.heard_ns = t_ns
+        if value is None:
+            return
+        self.value, self.repeats, self.unchanged = value, 0, False
+        for _ in range(0 if self.locates else moved):
+            self.repeating += -self.repeating / REPEATS_KEPT
 
     def repeats_itself(self, value: object, moving: bool) -> bool:
         """True if a new value makes so many alike to the bit, of a vehicle that is `moving`, that

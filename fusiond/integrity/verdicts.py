@@ -53,6 +53,10 @@ class Verdicts:
         self._on_change = on_change
         self._series: dict[str, _Series] = {}
         self._heard = 0
+        self.waiting: list[tuple[Aid, Outcome]] = []
+        """Fused and not judged yet, once each though a rewind brings it again."""
+        self._turned: list[tuple[int, str, Verdict]] = []
+        """Verdicts that have turned and are not told yet, with the number of the innovation."""
 
     def judge(self, aid: Aid, outcome: Outcome) -> None:
         """An aid has been fused; to be called once for each, though a rewind brings it again."""
@@ -81,7 +85,15 @@ class Verdicts:
     def tell(self) -> None:
         """Judge what has come since the last time, and say which verdicts have turned, in the order
         in which they did."""
-        turned: list[tuple[int, str, Verdict]] = []
+        self._judge_all()
+        for _, source, verdict in sorted(self._turned):
+            self._on_change(source, verdict)
+        self._turned.clear()
+
+    def _judge_all(self) -> None:
+        for aid, outcome in self.waiting:
+            self.judge(aid, outcome)
+        self.waiting.clear()
         for source, series in self._series.items():
             waiting = series.waiting
             if not waiting:
@@ -92,21 +104,23 @@ class Verdicts:
                 whitened = np.fromiter(chain.from_iterable(rows), np.float64)
                 judged = series.monitor.take(whitened.reshape(len(rows), -1), np.array(nis))
                 for row, verdict in judged:
-                    turned.append((numbers[row], source, verdict))
-        for _, source, verdict in sorted(turned):
-            self._on_change(source, verdict)
+                    self._turned.append((numbers[row], source, verdict))
 
     def reset(self) -> None:
         """The filter starts anew: what came before says nothing of it."""
+        self.waiting.clear()
+        self._turned.clear()
         for series in self._series.values():
             series.waiting.clear()
             series.monitor.reset()
 
     def verdict(self, source: str) -> Verdict | None:
         """A source's verdict; None for one that is not judged."""
+        self._judge_all()
         series = self._series.get(source)
         return None if series is None else series.monitor.verdict
 
     def reports(self) -> dict[str, Consistency]:
         """The tests' figures by source."""
+        self._judge_all()
         return {name: series.monitor.report() for name, series in self._series.items()}

@@ -119,6 +119,24 @@ class Model:
         of their instants."""
         return _Indices(self)
 
+    @cached_property
+    def listed(self) -> dict[tuple[str | tuple[str, ...], ...], tuple[int, ...]]:
+        """Slots as a packed row of numbers has them, by the names of blocks: what `list_slots` has
+        found."""
+        return {}
+
+    def list_slots(
+        self, names: tuple[str | tuple[str, ...], ...], most: tuple[int, ...]
+    ) -> tuple[int, ...]:
+        """Of each of some lists of blocks the number of slots, at `most` so many, and the slots,
+        with zeros up to as many."""
+        found: list[int] = []
+        for blocks, count in zip(names, most, strict=True):
+            slots = self.indices[blocks].tolist()[:count]
+            found += [len(slots), *slots, *([0] * (count - len(slots)))]
+        self.listed[names] = tuple(found)
+        return self.listed[names]
+
     def slots_of_each(self, *lists: tuple[str, ...]) -> tuple[Indices, ...]:
         """`slots_of_all` of several lists of blocks: what an aid asks at each of its instants."""
         found = self._each.get(lists)

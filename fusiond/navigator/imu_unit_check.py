@@ -151,15 +151,18 @@ class RateUnits:
     def change(self) -> None:
         """The samples from now on are another sensor's."""
         self.wrong: str | None = None
-        self._fit = False
+        self.fits = False
+        """True if the rates are known to be in rad/s."""
         self._turns: dict[str, CourseTurns] = {}
+        self.due_ns: dict[str, int] = {}
+        """By receiver with velocities, the instant before which its next one says nothing more."""
         self._ways: dict[str, WayTurns] = {}
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
     def unproven(self, estimator: Estimator) -> str | None:
         """Reason why a solution with these biases is not vouched for before the course has turned:
         one that the data sheet does not allow; None where they are like it."""
-        if self._fit:
+        if self.fits:
             return None
         model = estimator.model
         if self._first is None or self._first[0] is not model:
@@ -184,7 +187,7 @@ class RateUnits:
             return
         if not self._count:
             self._since_ns = int(imu.times[new])
-        for way in () if self._fit else self._ways.values():
+        for way in () if self.fits else self._ways.values():
             if way.samples(imu.times[new : imu.end], imu.samples[new : imu.end, 2]):
                 self._weigh(way)
         self._squares += squares(imu.samples, new, imu.end)
@@ -197,7 +200,7 @@ class RateUnits:
         """A measurement, valid at `t_ns`, as the aids it stands for: velocities count, and
         positions of a source that gives none."""
         if not isinstance(m, PositionFix) or m.v_ned_m_s is None:
-            for aid in () if self._fit else aids:
+            for aid in () if self.fits else aids:
                 for candidate in aid.candidates():
                     if isinstance(candidate, PositionCandidate):
                         way = self._ways.setdefault(aid.source, WayTurns(self._bias_sd))
@@ -206,12 +209,11 @@ class RateUnits:
         turns = self._turns.get(m.source)
         if turns is None:
             turns = self._turns[m.source] = CourseTurns()
-        if t_ns < turns.next_ns:
-            return
         turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
+        self.due_ns[m.source] = turns.next_ns
         if turns.decided:
             self._tell(turns.said())
-            self._fit = self.wrong is None and (self._fit or turns.fits)
+            self.fits = self.wrong is None and (self.fits or turns.fits)
             turns.begin_anew()
 
     def _weigh(self, way: WayTurns) -> None:
@@ -221,7 +223,7 @@ class RateUnits:
             return
         well = evidence > 0.0
         self._tell(None if well else reason("rate_path"))
-        self._fit = well
+        self.fits = well
         way.begin_anew()
 
     def _tell(self, wrong: str | None) -> None:

@@ -56,6 +56,8 @@ class ConstraintMaker:
     def feed(self, imu: ImuBuffer, new: int) -> Sensed:
         """The samples from row `new` on have come."""
         windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
+        if windows:
+            self.rest_evidence.catch_up()
         aids: list[Aid] = []
         if self._options.zero_velocity.enabled:
             for window in windows:

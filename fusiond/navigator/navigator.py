@@ -64,6 +64,8 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
+# Verdicts on a sigma, of windows of minutes, are made of all that has come within this.
+VERDICTS_NS = 1_000_000_000
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
 UNKNOWN_TIME_S = 0.9
@@ -115,7 +117,8 @@ class Navigator:
         self.without_imu = WithoutImu(
             config, of_aids, self._event, self.last_fused_ns, self._on_outcome
         )
-        self._last_position_ns = 0
+        self._last_position_ns = self._verdicts_ns = 0
+        self._heading = ""
         self.started: Start | None = None
         self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
@@ -222,11 +225,15 @@ class Navigator:
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         self.without_imu.hear(aids, seen_ns)
-        aids = self._latency.hear(m.source, aids)
+        if self.started is not None and m.source in self._latency.on_time:
+            self._latency.waiting.append((m.source, aids))
+        else:
+            aids = self._latency.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
-        self._units.fix(m, t_ns, self.imu, aids)
-        self._constraints.rest_evidence.hear(aids)
+        if t_ns >= self._units.due_ns.get(m.source, 0):
+            self._units.fix(m, t_ns, self.imu, aids)
+        self._constraints.rest_evidence.waiting.extend(aids)
         for aid in aids:
             self.timeline.insert(aid)
         return "accepted"
@@ -285,17 +292,22 @@ class Navigator:
             self.started = start
             self._start_check = StartCheck(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._event("aligned", reason("heading_from", how=start.how))
+            self._heading = reason("heading_from", how=start.how)
+            self._event("aligned", self._heading)
         self.timeline.run(record)
-        self.verdicts.tell()
         e = self.estimator
+        if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
+            self._verdicts_ns = e.t_ns
+            self.verdicts.tell()
         if first_not_finite(e.nav, e.xi, e.covariance) >= 0:
             what = broken(e)
             self._event("filter_not_finite", f"{what}: aligning again")
             self.reset(what)
             return
-        if self._service_events.tell():
-            self.calibrating.corrected()
+        if self.timeline.decided:
+            self.timeline.decided = False
+            if self._service_events.tell():
+                self.calibrating.corrected()
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         failure = self._status.failure(self.timeline.diagnosis)
@@ -380,7 +392,7 @@ class Navigator:
         that very instant, by the aids valid until then; before what is kept of it (`buffer_s`, and
         the start) nothing is known. The mode is always that of now.
         """
-        if self.without_imu.active:
+        if self.without_imu.estimator is not None:
             return self.without_imu.solution(t_ns, self.mode(t_ns)[1], self._protection.unknown())
         if self.started is None or t_ns >= self.estimator.t_ns:
             return self._present(t_ns)
@@ -401,7 +413,7 @@ class Navigator:
         """Mode at `t_ns`, and why."""
         started = None
         if self.started is not None:
-            started = StartedNavigation(self.started.how, self.unconfirmed, self._last_position_ns)
+            started = StartedNavigation(self._heading, self.unconfirmed, self._last_position_ns)
         return self._status.of(t_ns, started, self._aligner.reason)
 
     @property
@@ -429,7 +441,7 @@ class Navigator:
         if name == "fused":
             if not entry.judged and outcome.whitened:
                 entry.judged = True
-                self.verdicts.judge(aid, outcome)
+                self.verdicts.waiting.append((aid, outcome))
             t_ns = entry.key[0]
             if t_ns > self.last_fused_ns.get(source, -1):
                 self.last_fused_ns[source] = t_ns

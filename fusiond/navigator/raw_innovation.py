@@ -22,8 +22,10 @@ import numpy as np
 from fusiond.aiding.base import Linearised, NotApplicable, State
 from fusiond.estimators.base import Estimator
 
-PARTS: tuple[tuple[slice, Literal["m", "m/s"]], ...] = ((slice(6, 9), "m"), (slice(3, 6), "m/s"))
-"""Position and velocity in the error state."""
+PARTS: tuple[tuple[int, Literal["m", "m/s"]], ...] = ((3, "m"), (0, "m/s"))
+"""First of the columns of velocity and position that are the position's, and the velocity's."""
+VELOCITY_AND_POSITION = slice(3, 9)
+"""Those columns in the error state."""
 
 
 class RawInnovation(NamedTuple):
@@ -43,12 +45,16 @@ def raw_innovation(aid: Linearised, estimator: Estimator) -> RawInnovation | Non
     rows = aid.innovation(State(e.nav, e.xi, e.step, e.model, e.covariance))
     if isinstance(rows, NotApplicable):
         return None
-    for part, unit in PARTS:
-        h = rows.h[:, part].tolist()  # three columns: numpy costs more than it saves
+    return of_rows(rows.z.tolist(), rows.h[:, VELOCITY_AND_POSITION].tolist())
+
+
+def of_rows(z: list[float], of_state: list[list[float]]) -> RawInnovation | None:
+    """Of an innovation (m,) and what its rows have of velocity and position (m, 6)."""
+    for first, unit in PARTS:
+        h = [row[first : first + 3] for row in of_state]
         axes = [k for k in range(3) if any(row[k] for row in h)]
         if not axes:
             continue
-        z = rows.z.tolist()
         if len(axes) != len(h):
             values = [value / math.hypot(*row) for value, row in zip(z, h, strict=True)]
             return RawInnovation(tuple(values), unit, "")

@@ -21,10 +21,11 @@ from fusiond.navigator.reasons import joined, reason
 
 
 class StartedNavigation(NamedTuple):
-    """Start of the navigation: `how` its heading came about; `unconfirmed`: what the heading hangs
-    on and nothing has shown, empty where it does not; `position_ns`: of the last position fused."""
+    """Start of the navigation: how its `heading` came about, in words; `unconfirmed`: what that
+    hangs on and nothing has shown, empty where it does not; `position_ns`: of the last position
+    fused."""
 
-    how: str
+    heading: str
     unconfirmed: str
     position_ns: int
 
@@ -66,10 +67,10 @@ class NavigationStatus:
         if not sd_m <= self._limits.invalid_sd_m:
             limit = self._limits.invalid_sd_m
             return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
-        heading = reason("heading_from", how=started.how)
+        heading = started.heading
         if started.unconfirmed:
             return Mode.COASTING, joined((heading, started.unconfirmed))
-        if (why := self._units.unproven(self._estimator)) is not None:
+        if not self._units.fits and (why := self._units.unproven(self._estimator)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - started.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:

@@ -19,11 +19,13 @@ import numpy as np
 
 from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.candidates import Candidate
+from fusiond.estimators.aid_run import INNOVATION, JUDGE, KEEP, RESULT
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
+from fusiond.navigator.aid_rows import AidRows, outcome_of, raw_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
@@ -40,11 +42,14 @@ MOST_WAITING = 4096
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `judged`
     that its innovation has been told a verdict of: a rewind applies it again. `error` is what made
-    it `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    it `failed`; `raw` is kept where the timeline `keeps_raw`. `row` is the aid as a row of numbers,
+    empty where it has none, and `value` what a frozen sensor would repeat."""
 
     key: Key
     aid: Aid
     feedback: Feedback = "at_once"
+    row: bytes = b""
+    value: object = None
     outcome: Outcome | None = None
     judged: bool = False
     error: str = ""
@@ -87,6 +92,9 @@ class Timeline:
         self.counters = Counters()
         self.keeps_raw = False
         """True if entries are to have their raw innovation: a log wants it, at 10 us an aid."""
+        self.decided = True
+        """True if anything was decided since somebody set this to False: more than that aids that
+        are in service were fused."""
         self._keep_ns = round(keep_s * 1e9)
         self._checkpoint_ns = round(checkpoint_s * 1e9)
         self._on_outcome = on_outcome
@@ -96,6 +104,7 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.diagnosis = Diagnosis(kinds)
         self._isolates = estimator.isolates
+        self._rows = AidRows(estimator)
 
     def start(self, used: Collection[Candidate] = ()) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
@@ -141,7 +150,7 @@ class Timeline:
         first = " " if aid.moves and not aid.locates else ""
         feedback: Feedback = aid.feedback if aid.waits else "at_once"
         key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
-        entry = Entry(key, aid, feedback)
+        entry = Entry(key, aid, feedback, *self._rows.packed(aid))
         oldest = self._checkpoints[0] if self._checkpoints else None
         if oldest and key[0] <= oldest.snapshot.t_ns and not self._precedes(oldest, key):
             self._count(entry, Outcome("too_old"))
@@ -166,11 +175,12 @@ class Timeline:
     def run(self, record: bool = False) -> None:
         """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
         latest, imu, kept = self.imu.latest_ns, self.imu, self._checkpoints
-        estimator, entries = self.estimator, self._entries
-        for entry in entries[self._next :]:
-            if (t_ns := entry.key[0]) > latest:
-                break
-            if t_ns > estimator.t_ns or estimator.passing:
+        estimator, end = self.estimator, bisect_left(self._keys, (latest + 1,), self._next)
+        while self._next < end:
+            if self._run_rows(end, record):
+                continue
+            entry = self._entries[self._next]
+            if (t_ns := entry.key[0]) > estimator.t_ns or estimator.passing:
                 estimator.propagate(imu, t_ns, record)
                 if estimator.t_ns - kept[-1].snapshot.t_ns >= self._checkpoint_ns:
                     self._checkpoint()
@@ -211,6 +221,44 @@ class Timeline:
             estimator.restore(present)
             self.diagnosis.restore(memory)
 
+    def _run_rows(self, end: int, record: bool) -> bool:
+        """Run the estimator over the next entries, before `end`, that are rows of numbers of which
+        nothing is to be judged beyond gate and hypotheses; False where the next one is not."""
+        runs, kept_ns = self.estimator.runs, self._checkpoints[-1].snapshot.t_ns
+        if runs is None:
+            return False
+        which, until_ns = range(self._next, end), kept_ns + self._checkpoint_ns
+        batch = self._rows.batch(self._entries, which, self.diagnosis, until_ns)
+        if batch is None:
+            return False
+        ran = runs(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
+        results = ran.results[: ran.done, : RESULT if self.keeps_raw else INNOVATION].tolist()
+        entries = self._entries[self._next : self._next + ran.done]
+        self._rows.went_on(entries, results)
+        for entry, result in zip(entries, results, strict=True):
+            outcome = outcome_of(entry.row, result)
+            entry.raw = raw_of(result, outcome.degrees) if self.keeps_raw else None
+            self._next += 1
+            if ran.how == JUDGE and entry is entries[-1]:
+                outcome = self._judged(entry, outcome)
+            self._count(entry, outcome)
+        if ran.how == KEEP:
+            self._checkpoint()
+        return ran.done > 0 or ran.how == KEEP
+
+    def _judged(self, entry: Entry, outcome: Outcome) -> Outcome:
+        """Outcome of an aid that is judged."""
+        aid, self.decided = entry.aid, True
+        try:
+            one = self.diagnosis.series[aid.source]
+            correction = self.diagnosis.judge(aid, one, outcome, self.estimator)
+            if correction is not None:
+                self.estimator.adopt(correction.mean, correction.spread)
+        except RAISED_BY_NUMBERS as error:
+            entry.error = repr(error)
+            return Outcome("failed")
+        return outcome
+
     def _give_up(self, count: int, name: str) -> None:
         """Drop the first `count` of those that wait."""
         rows = slice(self._next, self._next + count)
@@ -220,7 +268,7 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         """An exception, wherever it comes from, costs the aid."""
-        estimator, diagnosis = self.estimator, self.diagnosis
+        estimator, diagnosis, self.decided = self.estimator, self.diagnosis, True
         try:
             if entry.feedback == "release":
                 estimator.release()
@@ -269,7 +317,7 @@ class Timeline:
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
         self.diagnosis.restore(checkpoint.memory)
-        self._next = self._following(checkpoint)
+        self._next, self.decided = self._following(checkpoint), True
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])
 

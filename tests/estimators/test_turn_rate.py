@@ -9,7 +9,7 @@ import pytest
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.tilt_axes import heading_turn, turn_rows
+from fusiond.estimators.tilt_axes_carried import heading_turn, turn_rows
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.error_model import PHI

@@ -23,7 +23,8 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.covariance import mirror
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
+from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes_carried import turn_rows
 from fusiond.estimators.turned_axes import TURN_SIZE, rest_axes, rest_rows, turn_at_rest
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

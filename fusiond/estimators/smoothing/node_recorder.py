@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import Outcome, Screened, Snapshot
+from fusiond.estimators.base import Outcome, Snapshot
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
 from fusiond.estimators.renewal import renew
-from fusiond.estimators.screening import KEPT
+from fusiond.estimators.screening import KEPT, Screened
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
-from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
+from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes_carried import turn_rows
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -66,6 +67,7 @@ class TapedKalman(TiltAxesFilter):
     """
 
     carries_transition = True
+    packs = False
 
     def __init__(
         self,

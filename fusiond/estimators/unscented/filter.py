@@ -43,6 +43,8 @@ class UnscentedEstimator(KalmanEstimator):
     `spread`: sigmas from the mean to a sigma point. `propagation`: sigma points there too.
     """
 
+    packs = False
+
     def __init__(
         self, model: Model, gap_s: float, spread: float = SPREAD, propagation: bool = False
     ) -> None:

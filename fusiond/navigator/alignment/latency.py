@@ -80,6 +80,7 @@ LEAST_PRIOR_S = 0.05
 # Fixes of so long are looked at, and so many at least; kept are a minute's of a receiver of 10 Hz,
 # and handed on the last of them.
 KEPT_NS, MOST_KEPT, HANDED_ON, FEWEST = 15_000_000_000, 600, 300, 5
+MOST_WAITING = 4 * MOST_KEPT
 # The valley is sought with `sensed_motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
 ALL_FIXES = 5 * KEPT_NS // 1_000_000_000
 # A delay that is known worse (s) is waited for so long (ns) to be known better: half the sigma
@@ -187,13 +188,24 @@ class LatencySearch:
         self._options, self._noise, self._model = options, noise, model
         self._event = on_event
         self._receivers: dict[str, _Receiver] = {}
+        self.on_time: set[str] = set()
+        """Known receivers whose stamps are taken as they are."""
+        self.waiting: deque[tuple[str, Sequence[Aid]]] = deque(maxlen=MOST_WAITING)
+        """What has come of receivers that are `on_time`, taken in when somebody looks."""
         self._due_ns = self._fitted_ns = 0
         self._looking: Generator[None, None, Found | None] | None = None
         self._looks: deque[int] = deque(maxlen=MOST_LOOKS)
 
+    def _catch_up(self) -> None:
+        """Take in what waits."""
+        while self.waiting:
+            source, aids = self.waiting.popleft()
+            self._receivers[source].heard.append(_Heard(tuple(aids)))
+
     def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
         """A measurement has come, as the aids it stands for; the same at the instants at which it
         was true."""
+        self._catch_up()
         receiver = self._receivers.get(source)
         if receiver is None:
             if not any(aid.moves and not aid.screened for aid in aids):
@@ -201,10 +213,15 @@ class LatencySearch:
             receiver = self._receivers[source] = _Receiver()
         receiver.heard.append(_Heard(tuple(aids)))
         late_ns = receiver.late_ns
+        if late_ns:
+            self.on_time.discard(source)
+        else:
+            self.on_time.add(source)
         return [_earlier(aid, late_ns) for aid in aids] if late_ns else aids
 
     def kept(self) -> list[Aid]:
         """The last aids of all receivers, at the instants at which they were true."""
+        self._catch_up()
         return [
             _earlier(aid, receiver.late_ns)
             for receiver in self._receivers.values()
@@ -260,6 +277,7 @@ class LatencySearch:
 
     def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
         """`look` at all that there is now, a fit at a time."""
+        self._catch_up()
         t_ns = imu.latest_ns
         self._due_ns = t_ns + EVERY_NS
         earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
@@ -275,6 +293,7 @@ class LatencySearch:
             late = receiver.settled(t_ns)
             if late is None:
                 continue
+            self.on_time.discard(source)
             text = (
                 f"{source} is {late.seconds:.2f} s later than its stamps (sigma {late.sd:.2f}); "
                 "corrected"

@@ -38,17 +38,19 @@ class StartCheck:
         self._backward = start.backward and on_wheels and not start.confirmed
         self._unproven = bool(self._claim) and not start.confirmed
         self._since_ns: int | None = None
-
-    @property
-    def unconfirmed(self) -> str:
+        self.unconfirmed = ""
         """Condition of the heading that nothing has shown, in words; empty where there is no such
         thing. A configured heading is a hypothesis until the first motion, and so is one that was
         saved without it; another that was saved was measured, before the vehicle was parked. And
         what looks like driving backward is driving forward with an IMU that is mounted the other
         way, until it goes forward as well."""
+        self._say()
+
+    def _say(self) -> None:
         if self._backward:
-            return reason("backward_or_mounted")
-        return reason("not_confirmed_by_motion") if self._unproven else ""
+            self.unconfirmed = reason("backward_or_mounted")
+        else:
+            self.unconfirmed = reason("not_confirmed_by_motion") if self._unproven else ""
 
     def refuted(
         self, t_ns: int, nav: Array, covariance: Array, measured: RestEvidence, doubted: bool
@@ -63,12 +65,14 @@ class StartCheck:
             sd = math.sqrt(max(float(ahead @ covariance[3:6, 3:6] @ ahead), 0.0))
             if backward - 3.0 * sd > self._options.max_reverse_m_s:
                 return "imu_backwards", reason("imu_backwards", speed=backward)
-        if -backward > self._options.course_speed_m_s:
+        if self._backward and -backward > self._options.course_speed_m_s:
             self._backward = False
+            self._say()
         if not self._claim:
             return None
         if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw and not doubted:
             self._unproven = False
+            self._say()
         velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
         return velocity and self._heading(
             t_ns, velocity, math.atan2(axes[3], axes[0]), math.sqrt(covariance[2, 2]), doubted
@@ -99,6 +103,7 @@ class StartCheck:
             )
         if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
             self._claim, self._unproven = "", False
+            self._say()
             return None
         if self._since_ns is None:
             self._since_ns = t_ns

@@ -125,9 +125,10 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     by_phase = _by_phase(m, sections)
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
     wander, wander_m = "" if by_phase else receiver.wander, 0.0
-    shares = _shares(m, when, motion, by_phase, o, sections, sd) if receiver.wander else None
+    level_m = math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2))
+    shares = _shares(m, when, motion, by_phase, o, sections, level_m) if receiver.wander else None
     if shares is not None:
-        wander_m = math.sqrt(shares.wanders) * _level(sd)
+        wander_m = math.sqrt(shares.wanders) * level_m
         if receiver.holds and not receiver.told:
             share = _lasting(sd, shares, receiver.shared_m)
     height = m.height_m
@@ -234,11 +235,6 @@ def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
     return sections.own(FIX_WANDER, source, section) if section.shared_sd_m else ""
 
 
-def _level(sd: Vector3) -> float:
-    """One sigma (m) of a horizontal axis."""
-    return math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2))
-
-
 def _shares(
     m: PositionFix,
     when: Instants,
@@ -246,10 +242,11 @@ def _shares(
     by_phase: bool,
     o: GnssAiding,
     sections: Sections,
-    sd: Vector3,
+    level_m: float,
 ) -> Shares | None:
     """Division of a fix's variance, as this receiver's fixes and velocities have shown, those by
-    code and those by phase each; None of one that states no velocity with it."""
+    code and those by phase each; None of one that states no velocity with it. `level_m`: one sigma
+    of a horizontal axis."""
     known = sections.fix_errors.get((m.source, by_phase))
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
@@ -259,7 +256,7 @@ def _shares(
     if motion is None:
         return None
     (north, east, *_), sds = motion
-    variance, sd_v = _level(sd) ** 2, math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
+    variance, sd_v = level_m**2, math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
     known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, variance, (north, east), sd_v))
     return known.shares(when.t_ns)
 

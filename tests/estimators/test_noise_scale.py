@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusiond.integrity.noise import MOST, forget_lately, learn, unlearned
+from fusiond.estimators.noise_scale import MOST, forget_lately, learn, unlearned
 
 STEP_S = 0.2
 MANY = 6_000

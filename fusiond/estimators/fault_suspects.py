@@ -1,0 +1,111 @@
+"""Compiled kernel: whether a hypothesis may be likely, at a fraction of what odds of all cost.
+
+With the prior's density taken for its largest, log odds are at most
+
+    log(rate T) + l / 2        of any kind, as fusiond.estimators.fault_odds has them
+
+so that an epoch of which none is beyond what makes a hypothesis likely needs no odds and no
+weights, unless somebody reads them before the next one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    ALL,
+    CONSTANTS,
+    COUNTS_BY,
+    DECIDED,
+    E1,
+    E2,
+    E_AT,
+    GROUPS,
+    L10,
+    L11,
+    L20,
+    L21,
+    L22,
+    L_AT,
+    LANES,
+    LENGTH,
+    OF_ONE,
+    OF_THREE,
+    P_AT,
+    PERIODS_NS,
+    RATE_AT,
+    RESTARTED,
+    THREES,
+    UNJUDGED,
+    UNWEIGHED,
+)
+from fusiond.estimators.fault_odds import _TINY as TINY
+from fusiond.estimators.fault_odds import judge
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+ROUNDING = 0.1
+"""Log odds that no rounding makes."""
+
+
+@compiled("b1(f8[::1], f8[::1])", allocates=True)
+def any_likely(bank: Array, lanes: Array) -> bool:
+    """True if the log odds of a group may be beyond `DECIDED`."""
+    length, most = int(bank[LENGTH]), np.full(LANES, -np.inf)
+    threes = (int(bank[THREES]) + LANES - 1) // LANES
+    ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
+    unsigned = np.uint64
+    for row in range(threes + ones):
+        at = unsigned(GROUPS + min(row, threes) * OF_THREE + max(row - threes, 0) * OF_ONE)
+        constants = unsigned(row * CONSTANTS)
+        if row < threes:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
+                a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+                l_1, l_2 = a_1 / d_0, a_2 / d_0
+                d_1 = bank[j + unsigned(L11)] + TINY * lanes[c + unsigned(P_AT + LANES)]
+                d_1 -= l_1 * a_1
+                a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+                l_3 = a_3 / d_1
+                d_2 = bank[j + unsigned(L22)] + TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
+                d_2 -= l_2 * a_2 + l_3 * a_3
+                e_0 = bank[j + unsigned(E_AT)]
+                e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+                e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+                gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+                odds = lanes[c + unsigned(RATE_AT)] + bank[j + unsigned(COUNTS_BY)] + 0.5 * gained
+                most[unsigned(k)] = max(most[unsigned(k)], odds)
+        else:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                e = bank[j + unsigned(E_AT)]
+                gained = e * e / (bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)])
+                odds = lanes[c + unsigned(RATE_AT)] + bank[j + unsigned(COUNTS_BY)] + 0.5 * gained
+                most[unsigned(k)] = max(most[unsigned(k)], odds)
+    largest = -np.inf
+    for k in range(LANES):
+        largest = max(largest, most[k])
+    return largest > DECIDED - ROUNDING
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8[::1])")
+def judge_what_waits(
+    bank: Array, ints: Indices, numbers: Array, lanes: Array, found: Array
+) -> None:
+    """Odds of an epoch that nobody has read until now."""
+    if bank[UNWEIGHED] < np.inf:
+        epoch_s = bank[UNWEIGHED]
+        bank[UNWEIGHED] = np.inf
+        if bank[UNJUDGED] == np.inf:
+            judge(bank, ints, numbers, lanes, epoch_s, found)
+
+
+@compiled("b1(f8[::1], i8)", forceinline=True)
+def restarts(bank: Array, t_ns: int) -> bool:
+    """True if a restart is due at an instant."""
+    due: bool = bank[RESTARTED] != t_ns // PERIODS_NS[0]
+    return due
