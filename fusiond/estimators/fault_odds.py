@@ -70,7 +70,6 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
-    SIZE,
     SUSPECTS,
     THREES,
     UNEXPLAINED,
@@ -90,8 +89,7 @@ _TINY = 1e-9
 MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
-missed is as near as half the youngest period. What is lost is left unexplained: who leaves no more
-than its degrees of freedom has lost nothing."""
+missed is as near as half the youngest period."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
 MOST_OF_UNIT = 10.0
@@ -261,21 +259,17 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
         return np.inf
     step = ints[kind, SIGNATURE] <= FOLLOWED
     alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
-    fit, left, ahead, same = 0.0, 0.0, np.inf, False
+    fit, ahead, same = 0.0, np.inf, False
     for restart in range(RESTARTS):
         other = group_at(bank, RESTARTS * kind + restart)
         if bank[other + UNEXPLAINED] > 0.0:
             continue
         ahead = min(ahead, bank[group + LOG_ODDS] - bank[other + LOG_ODDS])
         if bank[other + LOG_ODDS] > 0.0:
-            if bank[other + EXPLAINED] > fit:
-                fit = bank[other + EXPLAINED]
-                degrees = max(bank[other + N_AT] - ints[kind, SIZE], 1.0)
-                chance = UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
-                left = bank[other + UNEXPLAINED] + chance
+            fit = max(fit, bank[other + EXPLAINED])
             same = same or abs(bank[other + ONSET] - bank[group + ONSET]) < ALIKE_S
     if fit > 0.0 and not alike:
-        missed = 0.0 if same else min(MISSED * bank[group + EXPLAINED], max(left, 0.0))
+        missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
     if ints[kind, SIGNATURE] == FOLLOWED:
         ahead -= DECIDED - APART
