@@ -24,23 +24,10 @@ degrees of freedom; five fifths of ten samples a second are all above ten times 
 each and for a second. The means then begin anew, at all tau with T H(T) of that second, and what
 the noise has made of attitude and velocity meanwhile, N^2 of one second, is made up for at once.
 
-What attitude and velocity integrate of vibration is not as much of it always: a sensor that is
-shaken twice as much, in amplitude, errs by four times as much in the mean (rectification: axes and
-flexures that are not quite linear). Of a density D that is seen
-
-    D^2 <D> / <D^2>,   means of the last minutes
-
-counts, as much as D in the mean, more of it on a bad road and less on a good one; no more than D
-before those minutes have been seen.
-
-Source: Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), section 5.2.9;
-IEEE Std 1293, model equation of an accelerometer (its second-order coefficient); Analog Devices,
-Vibration rectification in MEMS accelerometers (technical article).
+Source: Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), section 5.2.9.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +42,6 @@ Stamps = NDArray[np.int64]
 LEVELS, RATIO = 3, 4
 # Seconds that the mean looks back: what an engine's speed or a road's surface takes to change.
 MEMORY_S = 10.0
-# Seconds of the means that a rectified density is told by: some streets.
-MEAN_S = 200.0
 # Differences that a level needs before it counts: its estimate is then good to a factor of two.
 FEWEST = 10
 # The sheet's noise stands while what is seen is below so many times its density: the smallest of
@@ -97,29 +82,22 @@ def _risen(parts: Array, memory: Array) -> float:
     return density
 
 
-@compiled(
-    "void(f8[:, ::1], f8, f8, f8, f8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
-)
+@compiled("void(f8[:, ::1], f8, f8, f8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1])")
 def _follow(
     samples: Array,
     period_s: float,
     memory_s: float,
-    mean_gain: float,
     sheet: Array,
     memory: Array,
     lately: Array,
-    known: Array,
     out: Array,
 ) -> None:
-    """Write `out` (m, 6), what of the smallest density so far is integrated after each of `samples`
-    (m, 6) beyond that of `sheet` (6,), which is seen where it is not above it by EXCESS.
+    """Write `out` (m, 6), the smallest density so far after each of `samples` (m, 6) beyond that of
+    `sheet` (6,), 0 where it is not above it by EXCESS.
 
-    `memory` (LEVELS, 6, 6), `lately` (6, PARTS + 1, 5) and `known` (13,), means of the density seen
-    and of its square, and of how many samples they are, go on from call to call.
+    `memory` (LEVELS, 6, 6) and `lately` (6, PARTS + 1, 5) go on from call to call.
     """
     for i in range(samples.shape[0]):
-        known[12] += 1.0
-        slow = max(mean_gain, 1.0 / known[12])
         for axis in range(6):
             smallest, parts = np.inf, lately[axis]
             wanted = 1.0
@@ -153,22 +131,14 @@ def _follow(
                 risen = _risen(parts, memory[:, axis])
                 if risen > 0.0:
                     smallest = risen
-                    known[axis], known[6 + axis] = risen, risen * risen
                     missed = (risen - parts[PARTS, _KNOWN]) * PARTS * PART_S / period_s
                     parts[:] = 0.0
                 for j in range(_PART_SIZE):
                     for k in range(PARTS, 0, -1):
                         parts[k, j] = parts[k - 1, j]
                     parts[0, j] = 0.0
-            seen = smallest
-            if not (smallest < np.inf and smallest > EXCESS * sheet[axis]):
-                seen, missed = sheet[axis], 0.0
-            known[axis] += slow * (seen - known[axis])
-            known[6 + axis] += slow * (seen * seen - known[6 + axis])
-            integrated = seen * seen * known[axis] / known[6 + axis]
-            if slow > mean_gain:
-                integrated = min(integrated, seen)
-            out[i, axis] = max(integrated - sheet[axis], 0.0) + missed
+            above = smallest < np.inf and smallest > EXCESS * sheet[axis]
+            out[i, axis] = smallest - sheet[axis] + missed if above else 0.0
 
 
 class Vibration:
@@ -180,8 +150,6 @@ class Vibration:
         self._sheet = np.repeat([rate_noise**2, force_noise**2], 3)
         self._memory = np.zeros((LEVELS, 6, 6))
         self._lately = np.zeros((6, PARTS + 1, _PART_SIZE))
-        self._mean_gain = 1.0 - math.exp(-period_s / MEAN_S)
-        self._known = np.zeros(13)
         self.shares = FromInstants()
         """Which share of the density of each axis (6,) is noise."""
         self.shaken = False
@@ -190,8 +158,8 @@ class Vibration:
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
         """Write to `densities` (m, 6) that beyond the sheet's, (rad/s)^2/Hz and (m/s^2)^2/Hz, after
         each of samples (m, 6), rate and force of the same axes, at `times` (m,) ns."""
-        of_axes = self._sheet, self._memory, self._lately, self._known
-        _follow(samples, self._period_s, MEMORY_S, self._mean_gain, *of_axes, densities)
+        of_axes = self._sheet, self._memory, self._lately
+        _follow(samples, self._period_s, MEMORY_S, *of_axes, densities)
         self.shaken = bool(densities[-1].any())
         for rows, shares in self.shares.rows(times):
             of = densities[rows]

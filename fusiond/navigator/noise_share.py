@@ -64,9 +64,10 @@ RARE = 25.0
 _NOTHING = 1e18
 """Share of a filter whose noise counts nothing."""
 _VELOCITY = slice(DV, DV + 3)
-_OF_SENSORS = np.array([1, 0, 1, 0, 1, 2])
-"""The axis of a velocity, forward, right or down, that shows the noise of a gyro (x, y, z) and of
-an accelerometer: gravity goes forward with a pitch and to the right with a roll."""
+_SHOWN_BY = ((0, 1), (1, 0), (5, 2))
+"""Sensor (of rates and forces) and the axis of a velocity, forward, right or down, that shows its
+noise: gravity goes forward with a pitch and to the right with a roll. Noise of the others is small
+beside it, and tells nothing: all of it counts."""
 
 
 class _Predictor(KalmanEstimator):
@@ -113,8 +114,7 @@ class NoiseShares:
         self._log = np.array(log_likelihoods).reshape(3, -1)
         shares = self._shares()
         self._counted = [(0, shares)]
-        found: Array = shares[_OF_SENSORS]
-        return found
+        return _of_sensors(shares)
 
     def restart(self) -> None:
         """The filter has been started anew: a prediction that is under way has no end."""
@@ -158,8 +158,7 @@ class NoiseShares:
         self._count = kept * self._count + 1.0
         shares = self._shares()
         self._counted = [*self._counted[-3:], (e.t_ns + COUNTS_NS, shares)]
-        found: Array = shares[_OF_SENSORS]
-        return found
+        return _of_sensors(shares)
 
     def _shares(self) -> Array:
         """Of noise that shows forward, to the right and down."""
@@ -167,6 +166,14 @@ class NoiseShares:
         mean = weight @ GRID / weight.sum(axis=1)
         found: Array = (self._count * mean + FIRST) / (self._count + FIRST)
         return found
+
+
+def _of_sensors(shares: Array) -> Array:
+    """Of rates and forces (6,)."""
+    found = np.ones(6)
+    for sensor, axis in _SHOWN_BY:
+        found[sensor] = shares[axis]
+    return found
 
 
 def _level_axes(nav: Array) -> Array:
