@@ -124,7 +124,7 @@ PAPERS: dict[str, Paper] = {
         },
         ("imu", "gnss"),
         lambda: replace(SCENARIOS["drive"], path=town),
-        {},
+        {"imu": {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}},  # 20 states hold none
         raw="ubx",
     ),
     "004": Paper(

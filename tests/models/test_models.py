@@ -181,3 +181,13 @@ def test_a_model_that_outgrows_the_kernels_is_a_mistake_of_the_configuration(
     assert "gnss_velocity_time" in result.stderr
     config.write_text(TOO_MANY + '[estimator]\nmodel = "ins15"\n')
     assert runner.invoke(app, ["check", "--compile", str(config)]).exit_code == 0
+
+
+def test_ins20s_accelerometer_walks_as_its_markov_part_does() -> None:
+    """Its whole variance, and 2 s^2 / tau: 0.1 mg of a MEMS unit, not its 10 mg at switch-on."""
+    noise = imu_noise(Imu())
+    block = next(b for b in make_model("ins20", noise).blocks if b.name == "accel_markov")
+    whole = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    assert block.steady == block.initial == whole
+    walk = 2.0 * noise.force_bias_instability**2 / noise.bias_correlation_s
+    assert math.isclose(2.0 * block.steady**2 / block.tau_s, walk)

@@ -81,6 +81,20 @@ def test_level_tilt_of_the_reduced_filter_is_the_accelerometer_bias() -> None:
         assert 0.7 * tilt < believed < 1.4 * tilt
 
 
+def test_noises_that_are_not_printed_make_table_2() -> None:
+    """The figures of 23 states within a sixth, but for the velocity north; of 17 the level tilt and the velocity east. What
+    no noise gives stays apart: azimuth and vertical velocity of 17."""
+    of, paper = result()["implied"]["models"], result()["paper"]["models"]
+    ratio = {
+        name: np.concatenate([np.array(of[name][key]) / paper[name][key] for key in of[name]])
+        for name in ("23", "17")
+    }
+    assert np.abs(np.log(ratio["23"])).max() < math.log(1.31), ratio
+    assert np.abs(np.log(ratio["17"][[0, 1, 3]])).max() < math.log(1.1), ratio
+    assert ratio["17"][2] < 0.75
+    assert ratio["17"][5] > 5.0
+
+
 def test_ranks_at_rest() -> None:
     """By GNSS the 16 of the paper's 23: the radar's angles, level tilt and accelerometers, azimuth
     and east gyro hide."""
@@ -186,7 +200,7 @@ def test_costs_of_step_and_live_second() -> None:
 
 def test_tables_and_picture(tmp_path: Path) -> None:
     found = tables(result())
-    assert len(found) == 2 * (1 + len(study.VARIANTS)) + 2
+    assert len(found) == 2 * (1 + len(study.VARIANTS)) + 3
     for _, header, rows in found:
         assert all(len(row) == len(header) for row in rows)
     picture = tmp_path / "r.png"
