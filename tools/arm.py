@@ -25,6 +25,8 @@ ROOT, SITE, LISTS = FOLDER / "root", FOLDER / "site", FOLDER / "apt"
 EMULATOR = "qemu-aarch64-static"
 PYTHON = "python3.11"
 """Of Debian 12, for which all locked wheels exist."""
+PACKAGES = (PYTHON, "libstdc++6")
+"""The wheels bring all else."""
 PLATFORMS = ("manylinux2014_aarch64", "manylinux_2_17_aarch64", "manylinux_2_28_aarch64")
 SECONDS = 10
 REST_S = 60
@@ -61,7 +63,7 @@ def prepare() -> None:
     apt = ["apt-get", "-q", "-y", *(f"-o{key}={value}" for key, value in options.items())]
     say(f"Debian's {PYTHON} for arm64")
     run([*apt, "update"], quiet=True)
-    run([*apt, "install", "--download-only", "--no-install-recommends", PYTHON], quiet=True)
+    run([*apt, "install", "--download-only", "--no-install-recommends", *PACKAGES], quiet=True)
     for package in sorted((LISTS / "cache/archives").glob("*.deb")):
         run(["dpkg-deb", "--extract", str(package), str(ROOT)])
     say("the locked wheels for aarch64")
@@ -81,7 +83,7 @@ def emulated(arguments: list[str], text: str | None = None) -> str:
     environment = {
         **os.environ,
         "QEMU_LD_PREFIX": str(ROOT),
-        "PYTHONPATH": str(SITE),
+        "PYTHONPATH": f"{REPOSITORY}{os.pathsep}{SITE}",
         "PYTHONHOME": str(ROOT / "usr"),
         "XDG_CACHE_HOME": str(FOLDER / "cache"),
         "OPENBLAS_NUM_THREADS": "1",

@@ -75,8 +75,10 @@ export function showSources(store) {
     const state = service === "out" ? "left out" : service || (inside ? "derived" : s.state);
     const wrong = (s.diagnosis && s.diagnosis.text) || s.isolated || "";
     const refused = refusals(s.rejected);
+    // A device that is not there says so; what was refused before is in the tooltip.
+    const trouble = inside || s.state === "running" ? wrong : s.detail || wrong;
     const count = refused.count,
-      why = wrong || refused.why,
+      why = trouble || refused.why,
       title = [wrong, refused.title].filter(Boolean).join("\n");
     const used = agedFurther(s.fused_age_s, latest, store.now);
     const row = [
@@ -101,7 +103,7 @@ export function showSources(store) {
     rows.push(row);
     if (!why) continue;
     // In a row of its own: a column of it would be cut on all but the widest screens.
-    const reason = [{ text: why, title, span: HEAD.length, className: wrong ? "warn" : "quiet" }];
+    const reason = [{ text: why, title, span: HEAD.length, className: trouble ? "warn" : "quiet" }];
     reason.rowClass = old ? "reason-row old" : "reason-row";
     rows.push(reason);
   }
