@@ -129,7 +129,7 @@ class RecorderClock:
             return "time_ahead"
         if self.is_step(change):
             set_ns = set_by_utc()
-            if set_ns is not None and abs(set_ns) >= LEAP_NS // 2 and change - set_ns > -AHEAD_NS:
+            if set_ns is not None and abs(set_ns) >= LEAP_NS and change - set_ns > -AHEAD_NS:
                 self._step(stamp_ns, set_ns, of)
                 return "taken"
         self._on(stamp_ns, change, of)

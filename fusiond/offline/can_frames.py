@@ -27,9 +27,11 @@ from fusiond.files.extras import install
 from fusiond.offline.can_blf import DAY_S, Containers
 from fusiond.offline.can_text import (
     HEADER_ENDS,
+    TRC_VERSIONS,
     Asc,
     Candump,
     TextLines,
+    Trc,
     candump_of,
     dated,
     first_stamps,
@@ -166,7 +168,8 @@ def _text(
         candump = candump_of(stamps)
         if stamps and dated(stamps[0]):
             told("recorder_zone", _DATED_LOG.format(zone=_zone(stamp_s(stamps[0]))))
-    plain = {".log": candump.plain, ".asc": asc.plain}.get(log.suffix, lambda line: line)
+    trc = Trc()
+    plain = {".log": candump.plain, ".asc": asc.plain, ".trc": trc.plain}[log.suffix]
     lines = TextLines(stream, plain, lambda line, text: lost.add(line, "unreadable", text))
     source = cast(Any, lines)
     reader: Any
@@ -196,6 +199,9 @@ def _text(
                 lines.put_before(HEADER_ENDS)
     if lines.damage is not None:
         lost.add(0, "cut", f"the log ends in damage: {lines.damage}")
+    if trc.version and trc.version not in TRC_VERSIONS and not began:
+        read = ", ".join(TRC_VERSIONS)
+        raise TableError(f"{log.path}: TRC of version {trc.version}; versions {read} are read")
     if candump.unstamped and not began:
         raise TableError(
             f"{log.path}: candump's terminal form without times: record with candump -L"

@@ -7,7 +7,7 @@ python-can reads is said in its words:
     candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
     stamps as differences      candump -t d, ASC "timestamps relative": summed
     stamps before the trigger  ASC -0.5: without the sign, which `before_trigger_s` remembers
-    decimal commas             ASC 0,5 of a German or French Windows
+    decimal commas             ASC and TRC 0,5 of a German or French Windows
     CANFD without a channel    ASC "CANFD   Start of measurement" and the like: no frame
 
 Sources: can-utils, candump.c and lib.c (`snprintf_long_canframe`); Vector, ASC format description.
@@ -288,3 +288,24 @@ class Asc:
         self._sum_ns += -ns if found[1] else ns
         seconds, fraction = divmod(max(0, self._sum_ns), 10**9)
         return f"{seconds}.{fraction:09d}{rest}" if rest else None
+
+
+# --------------------------------------------------------------------------- PEAK's TRC
+
+TRC_VERSIONS = ("1.0", "1.1", "1.3", "2.0", "2.1")
+"""Those that python-can reads."""
+_VERSION = re.compile(r";\$FILEVERSION=([\d.]+)")
+_COMMA = re.compile(r"(;\$STARTTIME=\d+|\s*\d+\)?\s+\d+),(\d+)(?=\s|$)")
+
+
+class Trc:
+    """Lines of a TRC file; `version` is what it says of itself, "" where nothing."""
+
+    def __init__(self) -> None:
+        self.version = ""
+
+    def plain(self, line: str) -> str:
+        """The line, with a point in its numbers."""
+        if found := _VERSION.match(line):
+            self.version = found[1]
+        return _COMMA.sub(r"\1.\2", line, count=1) if "," in line else line

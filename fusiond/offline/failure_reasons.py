@@ -94,6 +94,12 @@ def nothing_navigated(
     if len(others) == len(aids):
         ranges = " and ".join(others)
         return f"No time in common: {imu_name} from {_span(imu)}, {ranges}"
+    empty = [source for source, outcomes in refused.items() if set(outcomes) == {"too_few"}]
+    if empty:
+        return (
+            f"{reason}: the epochs of {', '.join(empty)} hold too few satellites of GPS, Galileo "
+            "and BeiDou, on signals that are read"
+        )
     kept = [f"{n} of {source} {name}" for source, o in refused.items() for name, n in o.items()]
     return f"{reason} ({', '.join(kept)})" if kept else reason
 

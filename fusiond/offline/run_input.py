@@ -79,6 +79,7 @@ def read_recorded(
         name = kind if kind not in files else f"{kind}:{path.name}"
         files[name] = FileRead(_span_s(rows), len(rows), rejected)
         arrivals += rows
+    _check_observed(aids, arrivals)
     held = Counter[str]()
     if outages:
         there = {row.measurement.source for row in arrivals}
@@ -92,6 +93,17 @@ def read_recorded(
         arrivals = kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
     return Recorded(config, imu, arrivals, files, events, held, units)
+
+
+def _check_observed(aids: list[tuple[str, Path]], arrivals: list[Arrival]) -> None:
+    """Raise `TableError` for raw data of which nothing is an observation."""
+    raw = [path for kind, path in aids if kind == "raw"]
+    if raw and not any(isinstance(row.measurement, RawGnssEpoch) for row in arrivals):
+        names = ", ".join(map(str, raw))
+        raise TableError(
+            f"{names}: what satellites broadcast, and no observation: give that file as well, with "
+            "--aid raw=FILE"
+        )
 
 
 def _read_aid(

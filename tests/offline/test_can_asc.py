@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from fusiond.files.csv_tables import TableError
 from tests.offline.can_files import FRAMES, asc, read, same, written
 from tests.offline.recorded_bus import BEGIN_S
 
@@ -151,3 +152,21 @@ def test_trc(bad: str, tmp_path: Path) -> None:
     assert spacing == pytest.approx([m.timestamp - BEGIN_S for m in FRAMES], abs=2e-3)
     assert [(each.line, each.reason) for each in refused.all()] == [(first + 51, "unreadable")]
     assert told == ["the date of a TRC log has no zone: taken as UTC"]
+
+
+def test_trc_with_decimal_commas(tmp_path: Path) -> None:
+    path = written(tmp_path / "bus.trc", FRAMES)
+    points = re.compile(r"(?m)^(;\$STARTTIME=\d+|\s*\d+\s+\d+)\.(\d+)")
+    text, changed = points.subn(r"\1,\2", path.read_text())
+    assert changed > len(FRAMES)
+    path.write_text(text)
+    found, refused, told = read(path)
+    same(found, FRAMES, 1.0)
+    assert (refused.all(), told) == ([], ["the date of a TRC log has no zone: taken as UTC"])
+
+
+def test_a_version_of_trc_that_is_not_read_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bus.trc"
+    path.write_text(";$FILEVERSION=1.2\n;\n     1)  0.000 1  Rx  07E8  2  03 41\n")
+    with pytest.raises(TableError, match=r"TRC of version 1\.2; versions 1\.0, 1\.1, 1\.3"):
+        read(path)

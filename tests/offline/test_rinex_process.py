@@ -103,6 +103,8 @@ def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, output = run(tmp_path, imu, OBSERVATIONS)
     assert code == 65
     assert "no_ephemeris" in output
+    code, output = run(tmp_path, imu, NAVIGATION)
+    assert (code, "and no observation: give that file as well" in output) == (65, True)
     old = tmp_path / "old.rnx"
     old.write_text(header("2.11"))
     code, output = run(tmp_path, imu, old)
