@@ -81,7 +81,7 @@ class _Header:
     leap_seconds: int | None = None
     listed: str = ""
 
-    def take(self, line: str) -> None:
+    def read(self, line: str) -> None:
         """A header line, of the file's head or of an event. ValueError where it cannot be read."""
         label = line[LABEL].strip()
         if label == "SYS / # / OBS TYPES":
@@ -153,7 +153,7 @@ class ObservationReader:
 
     def _take_header(self, line: str) -> None:
         try:
-            self._header.take(line)
+            self._header.read(line)
         except ValueError:
             self._counters["lines_unreadable"] += 1
 

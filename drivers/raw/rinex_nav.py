@@ -58,8 +58,8 @@ _ION_3: dict[str, tuple[System, int]] = {
 }
 _LINES, _LINES_CNAV, _LINES_GPS_CNAV = 8, 10, 9
 """Of a record, with its first."""
-_TGD, _ISC, _SENT = 25, 27, 31
-"""Where delays and transmission stand in a record of GPS CNAV, the clock's three before them."""
+_TGD, _ISC = 25, 27
+"""Places of delays in a record of GPS CNAV, the clock's three before them."""
 
 # Where numbers stand, the clock's three before them; all messages share what comes first.
 _ORBIT = (

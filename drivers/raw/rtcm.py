@@ -158,7 +158,7 @@ class RtcmDecoder:
             self._parameters(bits)
             return []
         if number in SSR:
-            return list(self._ssr.take(number, bits, t_seen_ns))
+            return list(self._ssr.decode(number, bits, t_seen_ns))
         if not msm and number not in EPHEMERIDES:
             self._counters["rtcm_not_used"] += 1
             return []

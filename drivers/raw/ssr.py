@@ -102,7 +102,7 @@ class SsrDecoder:
         self._weeks = weeks
         self._counters = counters
 
-    def take(self, number: int, bits: Bits, t_seen_ns: int) -> list[Correction]:
+    def decode(self, number: int, bits: Bits, t_seen_ns: int) -> list[Correction]:
         """Result of a message by its `number`, one of `MESSAGES`, `GLONASS` or `OTHERS`."""
         if number not in MESSAGES:
             name = "ssr_glonass_not_used" if number in GLONASS else "ssr_not_used"
@@ -191,7 +191,7 @@ class SsrDecoder:
         of: tuple[int, CorrectionPart, int],
         found: _Found,
     ) -> int:
-        """Where the next begin; those that can be are taken."""
+        """Place of the next; those that can be are kept."""
         values, known = [], True
         for length, scale in fields:
             if at + length > bits.length:

@@ -187,7 +187,7 @@ class Aid:
 
     @property
     def renewal(self) -> Renewal | None:
-        """What of the errors that successive ones share is new with it."""
+        """Change of the errors that successive ones share, at its instant."""
         return None
 
     @property

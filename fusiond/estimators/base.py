@@ -18,7 +18,14 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import (
+    LENT_ROWS,
+    Innovation,
+    Linearised,
+    NotApplicable,
+    Renewal,
+    State,
+)
 from fusiond.estimators.aid_run import AidRun
 from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
@@ -374,15 +381,13 @@ class ErrorStateFilter:
         if self.hypotheses is not None:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
-    def _renew(self, aid: Linearised) -> None:
-        """Errors that measurements share become what they are from the aid's instant on."""
-        if not aid.screened or aid.renewal is None:
-            return
+    def _renew(self, renewal: Renewal) -> None:
+        """Errors that measurements share become what they are from an aid's instant on."""
         others = [self.xi, *self._dxs]
         if self.hypotheses is not None:
             self.hypotheses.conclude()
             others.append(self.hypotheses.sensitivities)
-        renew(aid.renewal, self.model, self._covs, others)
+        renew(renewal, self.model, self._covs, others)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -256,7 +256,8 @@ class InvariantFilter(TiltAxesFilter):
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:
-        self._renew(aid)
+        if aid.screened and aid.renewal is not None:
+            self._renew(aid.renewal)
         rows = aid.innovation(self.state)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)

@@ -63,10 +63,8 @@ class KalmanEstimator(ErrorStateFilter):
         return self._fold_in(aid, noise)
 
     def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
-        self._renew(aid)
-        return self._fold_renewed(aid, noise)
-
-    def _fold_renewed(self, aid: Linearised, noise: Array) -> Outcome:
+        if aid.screened and aid.renewal is not None:
+            self._renew(aid.renewal)
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)

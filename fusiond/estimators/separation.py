@@ -25,7 +25,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, Renewal
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.federated.options import local_of
@@ -70,19 +70,23 @@ class SeparatedEstimator(KalmanEstimator):
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
-        self._renew(aid)
+        if aid.screened and aid.renewal is not None:
+            super()._renew(aid.renewal)
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         held, self._holding = self._holding, True
         try:
-            outcome = self._fold_renewed(aid, noise)
+            outcome = super().update(aid, noise)
         finally:
             self._holding = held
         self._fold_into_subsets(aid, innovation)
         if not held:
             self._take_out()
         return outcome
+
+    def _renew(self, renewal: Renewal) -> None:
+        """Nothing more: `update` does it before it linearises."""
 
     def look(self, aid: Linearised) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is

@@ -112,8 +112,9 @@ def displace(
     effect: Array,
     out: Array,
 ) -> None:
-    """Write `effect` (3, n + 2), G and G S by rows' `values`, and to `out` (6, 3) K, its inverse,
-    of errors of `variance` (n,).
+    """Write the effect of errors of `variance` (n,), and its roots.
+
+    `effect` (3, n + 2): G and G S by rows' `values`; `out` (6, 3): K and its inverse.
 
     `clock` (n,) below `clocks`: which of the clocks' offsets each has.
     """

@@ -62,15 +62,15 @@ _DATA_SHARE = {"1P": 0.0, "1D": 1.0, "1X": 0.25, "5P": 0.0, "5D": 1.0, "5X": 0.5
 
 
 def group_delay(
-    ephemeris: Ephemeris, signal: str, told: SignalDelays | None = None
+    ephemeris: Ephemeris, signal: str, sent: SignalDelays | None = None
 ) -> GroupDelay | None:
     """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris, and by what CNAV
-    has `told`; None if unknown."""
+    has `sent`; None if unknown."""
     band, delays = signal[0], ephemeris.group_delay_s
-    if told is not None:
-        for name, correction_s in told.correction_s:
+    if sent is not None:
+        for name, correction_s in sent.correction_s:
             if name == signal:
-                return GroupDelay(told.group_delay_s - correction_s, ISC_SIGMA_M[band])
+                return GroupDelay(sent.group_delay_s - correction_s, ISC_SIGMA_M[band])
     if ephemeris.system == "G":
         return _gps(signal, delays)
     if ephemeris.system == "E":

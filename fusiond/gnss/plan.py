@@ -339,7 +339,7 @@ class Planner:
 
 
 def _by_bias(applied: Applied, signal: str) -> GroupDelay:
-    """What a bias, added to the range, is as a group delay."""
+    """Group delay that stands for a bias, which is added to the range."""
     return GroupDelay(-applied.bias[signal] / SPEED_OF_LIGHT_M_S)
 
 

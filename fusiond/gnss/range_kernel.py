@@ -187,9 +187,11 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (29, n) values, the last but `SLOT`, which is the plan's, for a receiver (3,) ECEF
-    m at GPS time `week`, `tow` of its clock; how many satellites are lower than
-    `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
+    """Write (29, n) values of satellites as a receiver has them.
+
+    `SLOT` is the plan's and stays. `receiver` (3,) ECEF m, at GPS time `week`, `tow` of its clock;
+    returns how many satellites are lower than `least_elevation` (rad) or weaker than `least_cno`
+    (dB Hz).
 
     `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the

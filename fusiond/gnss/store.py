@@ -35,7 +35,7 @@ MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
 (Galileo OS SDD: longest time a set of navigation data is valid). BeiDou: a new set each hour, for
 the hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4; toe on the hour), and one hour more for a set that
 was not received whole."""
-COMPARED_S, APART_M = 14_400.0, 1e5
+COMPARED_S, OTHER_ORBIT_M = 14_400.0, 1e5
 """Four hours beyond its toe a broadcast orbit is kilometres off, after a manoeuvre tens; two
 satellites are thousands apart."""
 KEPT_ISSUES = 4
@@ -66,7 +66,7 @@ class EphemerisStore:
         self._delays: dict[tuple[System, int], SignalDelays] = {}
         self.version = 0
         self.replaced = 0
-        """How often a number has become another satellite's."""
+        """Numbers that have become another satellite's so far."""
 
     def __len__(self) -> int:
         """Satellites of which an ephemeris is held."""
@@ -117,12 +117,12 @@ class EphemerisStore:
         if abs(seconds_from_toe(kept[-1], week, toe_s)) > COMPARED_S:
             return False
         old, new = Orbits.of([kept[-1], message]).at(week, toe_s).position
-        return bool(np.linalg.norm(old - new) > APART_M)
+        return bool(np.linalg.norm(old - new) > OTHER_ORBIT_M)
 
     def delay(self, ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
         """Group delay of a signal by all that its satellite has sent; None if unknown."""
-        told = self._delays.get((ephemeris.system, ephemeris.prn))
-        return group_delay(ephemeris, signal, told)
+        sent = self._delays.get((ephemeris.system, ephemeris.prn))
+        return group_delay(ephemeris, signal, sent)
 
     def corrected(self, system: System, prn: int, week: int, tow_s: float) -> Applied | None:
         """The ephemeris with the correction that holds at a GPS time; None where there is none."""

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from fusiond.bench.delayed_fix import Drive
 
+from fusiond.bench.delayed_fix import Drive
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.navigator.timeline import Entry

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, Renewal
 from fusiond.estimators.base import Outcome, Snapshot
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
@@ -171,12 +171,11 @@ class TapedKalman(TiltAxesFilter):
         turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
         self._keep(self._phi, before)
 
-    def _renew(self, aid: Linearised) -> None:
+    def _renew(self, renewal: Renewal) -> None:
         """Errors that measurements share become others: what they were has a part in it."""
-        if aid.screened and aid.renewal is not None:
-            self._close()  # with P as it was
-            renew(aid.renewal, self.model, (), (self._phi,))
-        super()._renew(aid)
+        self._close()  # with P as it was
+        renew(renewal, self.model, (), (self._phi,))
+        super()._renew(renewal)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -105,11 +105,11 @@ class GnssRawOptions:
     clock_noise_m_sqrt_s: float = 0.05
     inter_system_sd_m: float = 5.0
     reflections_per_hour: float = 0.0
-    """How often a satellite comes by a wall alone, and no longer straight."""
+    """Rate at which a satellite begins to come by a wall alone, and no longer straight."""
     reflection_m: tuple[float, float] = (3.0, 60.0)
-    """By how much longer its way is then: uniform in the logarithm."""
+    """Length that its way has more then: uniform in the logarithm."""
     reflection_s: float = 20.0
-    """For how long, in the mean; exponential."""
+    """Duration, in the mean; exponential."""
     latency_s: tuple[float, float] = (0.05, 0.1)
     """From an epoch to its last byte, uniform."""
 

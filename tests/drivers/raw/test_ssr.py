@@ -9,13 +9,15 @@ from typing import Any
 
 import pyrtcm
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDriver, GnssOptions
 from drivers.raw.messages import Correction, RawEvent, System
-from drivers.raw.ssr import INTERVALS_S, SIGNALS, accuracy_m
+from drivers.raw.ssr import GLONASS, INTERVALS_S, MESSAGES, OTHERS, SIGNALS, accuracy_m
 from fusiond.recording.records import Record, input_of, input_record
-from tests.drivers.raw.frames import measurement, rawx, rtcm
+from tests.drivers.raw.frames import measurement, put, rawx, rtcm
 
 FIRST: dict[System, int] = {"G": 1057, "E": 1240, "C": 1258}
 ISSUE_BITS: dict[System, tuple[int, ...]] = {"G": (8,), "E": (10,), "C": (10, 8)}
@@ -216,3 +218,21 @@ def test_a_casters_corrections_go_to_the_receiver_and_to_fusiond(tmp_path: Path)
     deaf = GnssDriver("gnss", options.model_copy(update={"use_raw": False}), emitted.append)
     assert deaf._pass_on(frame) is False
     assert emitted == []
+
+
+@given(st.sampled_from([*MESSAGES, *GLONASS, *OTHERS]), st.binary(max_size=120), st.integers(0, 63))
+@settings(max_examples=400, deadline=None)
+def test_any_bytes_are_read_or_named(number: int, rest: bytes, satellites: int) -> None:
+    """Each frame ends in one counter, and what comes of it can be."""
+    body = int.from_bytes(rest, "big")
+    bits = 8 * len(rest)
+    for at in (61, 62):  # the number of satellites, without and with a datum
+        if bits > at + 6 - 12:
+            body = put(body, bits, at - 12, 6, satellites % 4)
+    found, counters = heard(packed((number, 12), (body, bits)))
+    names = ("rtcm_ssr", "ssr_unreadable", "ssr_not_used", "ssr_glonass_not_used")
+    assert sum(counters[name] for name in names) == 1
+    for each in found:
+        assert isinstance(each, Correction)
+        assert all(abs(value) <= 164.0 for value in each.values)
+        assert 0.0 <= each.tow_s < 604_800.0 + 7200.0
