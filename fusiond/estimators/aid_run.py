@@ -85,8 +85,8 @@ DONE, KEEP, JUDGE, OTHERWISE = range(4)
 """Ways in which a call ends: all is done; a checkpoint is due before the next aid; the last one is
 to be judged; the next one is no row of this kernel."""
 KNOWN, TURNED, SETTLES, UNDOUBTED, PLAIN, LARGE, KNOWS = range(7)
-"""What a filter knows beside its memory: 1 if its heading has been known; by how much (rad) the
-last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the
+"""Layout of a filter's state beside its memory: 1 if its heading has been known; by how much (rad)
+the last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the
 heading's variances below and above which it is known, and is not."""
 _Y, _Z, _R, _BEFORE, _H = 0, 3, 6, 9, 9 + ESTIMATE_SIZE
 """Layout of work space, g behind H."""
@@ -355,7 +355,7 @@ for _width in WIDTHS:
 
 
 class Filter(Protocol):
-    """What a run moves on of a filter beside its memory."""
+    """State that a run moves on, of a filter beside its memory."""
 
     t_ns: int
     sample: int

@@ -1,4 +1,4 @@
-r"""Whether a fault lasts for which a series is out of service, by what comes of it.
+r"""Test whether the fault of a series out of service lasts, by its innovations.
 
     fault i lasts       z = A x + D_i b_i + v          b_i ~ N(size, M) as it was found
     it is over          z = A x + v                    v ~ N(0, R)
@@ -49,8 +49,8 @@ class Mode(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """What looks have in common: instant (ns) of the last, slots of states that decay, C, and
-    modes, the last of which is that all is over."""
+    """Common error of successive looks: instant (ns) of the last, slots of states that decay, C,
+    and modes, the last of which is that all is over."""
 
     t_ns: int
     slots: tuple[int, ...]
@@ -59,7 +59,7 @@ class Shared(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """What a fault has done to the filter: the error (n,) that is left after what was taken out,
+    """Effect of a fault on the filter: the error (n,) that is left after what was taken out,
     and its covariance V M (n, p) with the fault's size."""
 
     left: Array

@@ -39,8 +39,8 @@ _PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZ
 
 @dataclass(slots=True)
 class Span:
-    """What a series has of a batch: its number, instant and value of the last, and at how many the
-    vehicle moved."""
+    """Part of a batch that is of one series: its number, instant and value of the last, and at
+    how many the vehicle moved."""
 
     one: Series
     number: int
@@ -73,7 +73,7 @@ class AidRows:
         return row + body + _PADDING[len(body)], None if shown is None else shown(aid)
 
     def _new(self, aid: Aid) -> tuple[int, int, int, int]:
-        """What is known of an aid's source."""
+        """Register the source of an aid: its number, device and rows."""
         assert self._bank is not None
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))

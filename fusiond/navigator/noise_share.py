@@ -57,8 +57,8 @@ HEADING_SD_RAD = math.radians(5.0)
 FORGETS = 60.0
 """Predictions, ten minutes of them: streets and loads change."""
 FIRST = 2.0
-"""How many predictions it counts that all is noise, before any has been judged: a filter that has
-once been too sure of its tilt stays so."""
+"""Number of predictions that the prior counts for, that all is noise, before any has been judged:
+a filter that has once been too sure of its tilt stays so."""
 RARE = 25.0
 """Five sigma: what is beyond is no noise."""
 _NOTHING = 1e18
@@ -99,11 +99,11 @@ class NoiseShares:
         self._counted = [(0, np.ones(3))]
         """From when on (ns) which shares count, those that a prediction may still be made of."""
         self._begins_ns = -1
-        """When the prediction that is under way began; -1 where none is."""
+        """Instant at which the present prediction began; -1 where none is."""
 
     @property
     def shown(self) -> tuple[float, tuple[float, ...]]:
-        """How many predictions have been judged, and the log likelihoods of `GRID` of each axis,
+        """Number of predictions judged, and the log likelihoods of `GRID` of each axis,
         for the next start."""
         log = self._log - self._log.max(axis=1, keepdims=True)
         return self._count, tuple(log.ravel().tolist())

@@ -68,7 +68,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What a filter published that trusts all, and its innovations by instant (ns) and source."""
+    """Solution of a filter that trusts all, and its innovations by instant (ns) and source."""
 
     run: Published
     whitened: Mapping[tuple[int, str], tuple[float, ...]]
