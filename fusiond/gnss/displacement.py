@@ -40,6 +40,9 @@ Array = npt.NDArray[np.float64]
 PLACE_M, CLOCK_M = 30.0, 1.0
 """One sigma of what is known of place and clock but for the epoch: an inertial unit over a minute;
 a crystal whose phase walks by 0.1 m by the root of a second, over a hundred."""
+PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
+"""Of the displacement's states by their defaults, `bias_sd_m` and `bias_down_sd_m`: that is what a
+sky of eight satellites displaces, and stands for what the sky at hand does."""
 LEAST_M = 1e-3
 """Of K along an axis: below it the sky displaces nothing, and nothing is carried on."""
 FLOOR_M = 0.2
@@ -153,7 +156,7 @@ def displace(
 class Displacement(NamedTuple):
     """Of a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the two errors of
     all, `variance` (n,) m^2 of what is not known of what lasts, `root` (3, 3) K and `back` (3, 3)
-    its inverse, m."""
+    its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -161,6 +164,7 @@ class Displacement(NamedTuple):
     variance: Array
     root: Array
     back: Array
+    shape: Array
 
     @classmethod
     def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
@@ -173,7 +177,8 @@ class Displacement(NamedTuple):
         known = np.sqrt(variance / rows.values[rk.LASTING])
         for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
             effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
-        return cls(t_s, rows.satellites, effect, variance, out[:3], out[3:])
+        root = out[:3]
+        return cls(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA)
 
     def holds(self, rows: Rows, t_s: float) -> bool:
         """True if it is that of an epoch of these rows, too."""

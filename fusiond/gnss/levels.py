@@ -46,7 +46,7 @@ _OFFSET, _VARIANCE, _PRIOR, _T = range(COLUMNS)
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8, f8[::1], f8[::1])")
 def _expect(levels: Array, values: Array, t_s: float, offset: Array, variance: Array) -> None:
-    """Write r (n,) and V (n,) of rows' `values` at `t_s`."""
+    """Write r (n,) and V (n,) of rows' `values` at `t_s`, and take them off."""
     for k in range(offset.shape[0]):
         known = levels[int(values[rk.SLOT, k])]
         prior = values[rk.LASTING, k]
@@ -55,6 +55,8 @@ def _expect(levels: Array, values: Array, t_s: float, offset: Array, variance: A
         if known[_T] > 0.0 and 0.0 <= since <= FORGOTTEN_S:
             more = max(known[_PRIOR] - prior, 0.0) + 2.0 * prior * since / LASTS_S
             offset[k], variance[k] = known[_OFFSET], min(known[_VARIANCE] + more, prior)
+        values[rk.CORRECTED, k] -= offset[k]
+        values[rk.VARIANCE, k] += variance[k] - prior
 
 
 @compiled(
@@ -136,7 +138,5 @@ def take_off(last: Levels | None, rows: Rows, t_s: float) -> Levels:
     n = len(rows.satellites)
     offset, variance = np.empty(n), np.empty(n)
     _expect(before, rows.values, t_s, offset, variance)
-    rows.values[rk.CORRECTED] -= offset
-    rows.values[rk.VARIANCE] += variance - rows.values[rk.LASTING]
-    teaches = abs(t_s - before[0, _T]) >= EVERY_S
+    teaches = abs(t_s - before.item(_T)) >= EVERY_S
     return Levels(t_s, before, rows, offset, variance, [] if teaches else None)

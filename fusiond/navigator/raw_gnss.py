@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
@@ -57,12 +57,8 @@ REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """Names of screened rows in `health`; everything else is `gated`."""
 
 
-PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
-"""Of the displacement's states by their defaults, `bias_sd_m` and `bias_down_sd_m`: that is what a
-sky of eight satellites displaces, and stands for what the sky at hand does."""
-
-
-NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), np.zeros((3, 3)), np.zeros((3, 3)))
+NOTHING = np.zeros((3, 3))
+NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING)
 """Of an epoch without satellites."""
 
 
@@ -238,8 +234,9 @@ class RawGnss:
         oldest = self.recent[-1].t_ns - REMEMBERED_NS
         forgotten = self.recent[: bisect_left(self.recent, oldest, key=_instant)]
         for earlier in forgotten:
-            memory, last = earlier.memory, self._forgotten
-            self._forgotten = memory.displacement or last[0], memory.levels or last[1]
+            memory = earlier.memory
+            if memory.displacement is not None:
+                self._forgotten = memory.displacement, memory.levels
         del self.recent[: len(forgotten)]
         return aid
 
@@ -298,12 +295,13 @@ class RawGnss:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
         t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
-        levels = aid.memory.levels = take_off(self._last_levels(aid), rows, t_s)
+        before, last = self._sky_before(aid)
+        levels = take_off(last, rows, t_s)
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
-        displacement, kept = self._displaced(aid, rows, levels.variance)
+        displacement, kept = self._displaced(aid, rows, levels, before)
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -315,34 +313,33 @@ class RawGnss:
             aid.epoch.clock_reset,
             aid.memory.before,
             aid.memory.left,
-            displacement.root * PER_SIGMA,
+            displacement.shape,
             kept,
             levels.seen,
             robust=aid.robust,
         )
 
-    def _earlier(self, aid: RawEpochAid) -> Iterator[_Memory]:
-        """Epochs before one, the last first."""
+    def _sky_before(self, aid: RawEpochAid) -> tuple[Displacement | None, Levels | None]:
+        """Displacement and levels of the last epoch before one that had satellites."""
         at = bisect_left(self.recent, aid.t_ns, key=_instant)
-        return (self.recent[k].memory for k in range(at - 1, -1, -1))
-
-    def _last_levels(self, aid: RawEpochAid) -> Levels | None:
-        found = (memory.levels for memory in self._earlier(aid))
-        return next((levels for levels in found if levels is not None), self._forgotten[1])
+        for k in range(at - 1, -1, -1):
+            memory = self.recent[k].memory
+            if memory.displacement is not None:
+                return memory.displacement, memory.levels
+        return self._forgotten
 
     def _displaced(
-        self, aid: RawEpochAid, rows: Rows, variance: Array
+        self, aid: RawEpochAid, rows: Rows, levels: Levels, before: Displacement | None
     ) -> tuple[Displacement, tuple[Array, Array] | None]:
         """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
         if not rows.satellites:
             return NOWHERE, None
-        found = (memory.displacement for memory in self._earlier(aid))
-        before = next((d for d in found if d is not None), self._forgotten[0])
-        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
+        memory, t_s = aid.memory, levels.t_s
+        memory.levels = levels
         if before is not None and before.holds(rows, t_s):
-            aid.memory.displacement = before
+            memory.displacement = before
             return before, None
-        aid.memory.displacement = now = Displacement.of(rows, t_s, variance)
+        memory.displacement = now = Displacement.of(rows, t_s, levels.variance)
         return now, None if before is None else now.carried(before)
 
     def judged(
