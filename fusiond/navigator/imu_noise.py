@@ -15,6 +15,7 @@ import numpy as np
 from fusiond.aiding.fix_errors import SETTLES_NS
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -32,7 +33,9 @@ class ImuNoise:
     def __init__(self, model: Model, imu: Imu) -> None:
         self._shares = NoiseShares(model, imu.gap_s)
         of_class = imu.sensor_class is not None and imu.misalignment_deg > 0.0
-        self._grade = UnitGrade(model) if of_class else None
+        self._unit = UnitGrade(model) if of_class else None
+        self._grade = self._unit
+        """None where nothing tells how good the unit is."""
         self._axes_sd_rad = imu.misalignment_deg * DEG
         self._cell = self._at_ns = -1
 
@@ -53,10 +56,18 @@ class ImuNoise:
         """The filter has been started anew."""
         self._shares.restart()
         self._cell = self._at_ns = -1
+        self._grade = self._unit
 
     def change(self) -> None:
         """The samples from now on are a spare's: nothing tells how good the one or the other is."""
+        self._unit = None
         self.restart()
+
+    def corrected(self, estimator: Estimator) -> None:
+        """A fault was taken out of the state: what is left of it is no error of a good unit's axes,
+        which are those of its class until it aligns anew."""
+        if self._grade is not None and isinstance(estimator, KalmanEstimator):
+            estimator.axes_known(self._axes_sd_rad)
         self._grade = None
 
     def look(self, timeline: Timeline, imu: ImuBuffer) -> None:

@@ -308,6 +308,7 @@ class Navigator:
             self.timeline.decided = False
             if self._service_events.tell():
                 self.calibrating.corrected()
+                self._imu_noise.corrected(e)
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         failure = self._status.failure(self.timeline.diagnosis)

@@ -117,7 +117,6 @@ def test_a_drive_tells_how_its_sensor_is_mounted(
 
 @recorded
 @TURNS
-@pytest.mark.xfail(strict=True, reason="a sound velocity is left out before an outage")
 def test_what_was_calibrated_bridges_outages_as_what_was_typed(
     rpy_deg: tuple[float, float, float], typed_rms_m: float, tmp_path: Path
 ) -> None:
