@@ -45,8 +45,7 @@ def _variance(p: Array | None, axis: Array) -> float:
     """Of the velocity along an axis (3,)."""
     if p is None:
         return 0.0
-    found: float = axis @ p[FIRST : FIRST + 3, FIRST : FIRST + 3] @ axis
-    return max(found, 0.0)
+    return max(float(axis @ p[FIRST : FIRST + 3, FIRST : FIRST + 3] @ axis), 0.0)
 
 
 @immutable()

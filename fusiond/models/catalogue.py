@@ -126,9 +126,9 @@ def _ins17(noise: ImuNoise) -> list[Block]:
 
 
 def _ins20(noise: ImuNoise) -> list[Block]:
-    # One Markov state an axis for all of the accelerometer's bias: of its whole variance, and of the
-    # walk of its Markov part, 2 s^2 / tau. A constant that came back to zero in an hour would walk by
-    # a hundred times what a MEMS unit's bias does.
+    # One Markov state an axis for all of the accelerometer's bias: of its whole variance, and of
+    # the walk of its Markov part, 2 s^2 / tau. A constant that came back to zero in an hour would
+    # walk by a hundred times what a MEMS unit's bias does.
     markov = noise.force_bias_instability
     force = math.hypot(noise.force_bias_initial, markov)
     accel_markov = parameter(
