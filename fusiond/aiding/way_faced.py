@@ -34,7 +34,7 @@ class WayFaced:
         """True if the vehicle goes the way it faces, or backwards."""
         return math.isfinite(self.slips_m_s)
 
-    def hear(self, heading: Faced) -> None:
+    def add(self, heading: Faced) -> None:
         """A heading has come, in whatever order."""
         insort(self._headings, heading)
         oldest = Faced(self._headings[-1].t_ns - KEPT_NS, -math.inf, 0.0)
