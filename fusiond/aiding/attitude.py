@@ -44,7 +44,7 @@ from fusiond.aiding.base import (
     misaligned_axes,
 )
 from fusiond.aiding.candidates import HeadingCandidate
-from fusiond.aiding.over_ground import CourseAid
+from fusiond.aiding.over_ground import CourseMeasurement
 from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
@@ -72,11 +72,11 @@ class AttitudeAid(Aid):
     sd_time_s: float = 0.0
     block: str = ""
 
-    def unturned(self, way: WayFaced) -> CourseAid | None:
+    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
         if not way.known or self.block or math.isnan(self.rpy[2]):
             return None
         own = self.source, self.t_ns, self.gate, self.rpy[2], self.sd[2], way.slips_m_s
-        return CourseAid(*own, robust=self.robust)
+        return CourseMeasurement(*own, robust=self.robust)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         dcm, slots = misaligned_axes(state, self.block)
@@ -118,9 +118,9 @@ class HeadingAid(Aid):
     yaw_rad: float
     sd_rad: float
 
-    def unturned(self, way: WayFaced) -> CourseAid | None:
+    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
         own = self.source, self.t_ns, self.gate, self.yaw_rad, self.sd_rad, way.slips_m_s
-        return CourseAid(*own, robust=self.robust) if way.known else None
+        return CourseMeasurement(*own, robust=self.robust) if way.known else None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         _, pitch, yaw = rpy_from_dcm(state.dcm)

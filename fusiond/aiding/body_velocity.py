@@ -48,7 +48,7 @@ from fusiond.aiding.base import (
     Vector3,
 )
 from fusiond.aiding.candidates import STEADY, SpeedCandidate
-from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeedAid
+from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeed
 from fusiond.aiding.preintegration import add_of_force, turning
 from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
@@ -342,8 +342,8 @@ class WheelSpeedAid(Aid):
     shared_step_m_s: float = 0.0
     drifts: tuple[float, float] = STEADY
 
-    def unturned(self, way: WayFaced) -> GroundSpeedAid:
-        return GroundSpeedAid(
+    def unturned(self, way: WayFaced) -> GroundSpeed:
+        return GroundSpeed(
             *(self.source, self.t_ns, self.gate, self.speed_m_s, self.sd_m_s, self.signed),
             *(self.drift, self.scale, self.latency, self.rounding, self.shared_step_m_s, way),
             robust=self.robust,

@@ -24,7 +24,7 @@ from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingAid
 from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.candidates import HeadingCandidate
-from fusiond.aiding.over_ground import CourseAid
+from fusiond.aiding.over_ground import CourseMeasurement
 from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
@@ -54,10 +54,10 @@ class CompassAid(HeadingAid):
     disturbance: str
     lasting_sd_rad: float
 
-    def unturned(self, way: WayFaced) -> CourseAid | None:
+    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
         own = self.source, self.t_ns, self.gate, self.yaw_rad, self.sd_rad, way.slips_m_s
         blocks, by = (self.deviation, self.disturbance), lasting(self.yaw_rad)
-        return CourseAid(*own, blocks, by, robust=self.robust) if way.known else None
+        return CourseMeasurement(*own, blocks, by, robust=self.robust) if way.known else None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         found = HeadingAid.innovation(self, state)  # super() knows no dataclass with slots

@@ -45,12 +45,11 @@ def _variance(p: Array | None, axis: Array) -> float:
     """Of the velocity along an axis (3,)."""
     if p is None:
         return 0.0
-    found = float(axis @ p[FIRST : FIRST + 3, FIRST : FIRST + 3] @ axis)
-    return max(found, 0.0)
+    return max(float(axis @ p[FIRST : FIRST + 3, FIRST : FIRST + 3] @ axis), 0.0)
 
 
 @immutable()
-class CourseAid(Aid):
+class CourseMeasurement(Aid):
     """No velocity across a heading `yaw_rad` with `sd_rad`, but for a slip of sigma `slips_m_s`.
 
     `blocks` name the model's blocks of what the heading is off by, in the order of `shares` (k,):
@@ -81,7 +80,7 @@ class CourseAid(Aid):
 
 
 @immutable()
-class GroundSpeedAid(Aid):
+class GroundSpeed(Aid):
     """A wheel's speed (m/s) with `sd_m_s`; all else as `WheelSpeedAid` has it, and the `way` that
     the vehicle faces."""
 
@@ -100,8 +99,8 @@ class GroundSpeedAid(Aid):
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model, y = state.model, self.speed_m_s
-        late = sum(float(model.initial[slot]) for slot in model.slots_of(self.latency))
-        variance = self.sd_m_s**2 + (BRAKES_M_S2 * late) ** 2
+        latency_s = sum(float(model.initial[slot]) for slot in model.slots_of(self.latency))
+        variance = self.sd_m_s**2 + (BRAKES_M_S2 * latency_s) ** 2
         forward = self._forward(state)
         if forward is None:
             lasts = sum(float(model.initial[slot]) for slot in model.slots_of(self.drift))

@@ -35,7 +35,7 @@ class WayFaced:
         return math.isfinite(self.slips_m_s)
 
     def add(self, heading: Faced) -> None:
-        """Keep a heading, in whatever order they come."""
+        """A heading has come, in whatever order."""
         insort(self._headings, heading)
         oldest = Faced(self._headings[-1].t_ns - KEPT_NS, -math.inf, 0.0)
         del self._headings[: bisect_left(self._headings, oldest)]

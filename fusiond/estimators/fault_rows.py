@@ -74,8 +74,10 @@ Indices = NDArray[np.int64]
 
 @compiled("void(f8[::1], f8[::1], f8, f8)")
 def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
-    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is, with the
-    velocity before all that has been fed back."""
+    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is.
+
+    With the velocity before all that has been fed back.
+    """
     for i in range(3):
         bank[PATH + i] += step_s * nav[VN + i]
     bank[PATH_S] = now_s

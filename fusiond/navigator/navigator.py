@@ -224,7 +224,7 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
-        self.without_imu.hear(aids, seen_ns)
+        self.without_imu.receive(aids, seen_ns)
         if self.started is not None and m.source in self._latency.on_time:
             self._latency.waiting.append((m.source, aids))
         else:
@@ -256,9 +256,9 @@ class Navigator:
         outcome is returned."""
         where, without = (lat_rad, lon_rad, height_m), self.without_imu
         if without.takes_over(t_ns, self.imu):
-            return without.set_position(told_by_operator(t_ns, where, sd_m), t_ns) or "beginning"
+            return without.take_position(told_by_operator(t_ns, where, sd_m), t_ns) or "beginning"
         if without.active:
-            without.set_position(told_by_operator(t_ns, where, sd_m), t_ns)
+            without.take_position(told_by_operator(t_ns, where, sd_m), t_ns)
         aid = told_by_operator(self.imu.latest_ns, where, sd_m)
         if self.started is None:
             self._aligner.aids([aid])

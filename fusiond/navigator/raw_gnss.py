@@ -149,8 +149,8 @@ class RawEpochAid(Aid):
             self.memory.corrected = found
         return found.aid
 
-    def unturned(self, way: WayFaced) -> LevelEpochAid:
-        return LevelEpochAid(self.source, self.t_ns, self.gate, self, way, robust=self.robust)
+    def unturned(self, way: WayFaced) -> LevelEpoch:
+        return LevelEpoch(self.source, self.t_ns, self.gate, self, way, robust=self.robust)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return self.at(state.nav).innovation(state)
@@ -169,7 +169,7 @@ class RawEpochAid(Aid):
 
 
 @immutable(eq=False)
-class LevelEpochAid(Aid):
+class LevelEpoch(Aid):
     """An epoch for a vehicle whose attitude nobody knows (`Aid.unturned`)."""
 
     screened: ClassVar[bool] = True

@@ -41,7 +41,7 @@ class SavedNoise:
     shares: Shown
 
     def at(self, now_utc_s: float | None) -> SavedNoise:
-        """Share of it that counts for a start at that time; of unknown age, as much as of a week."""
+        """Share of it that counts for a start then; of unknown age, as much as of a week."""
         age_s = FADES_S
         if now_utc_s is not None and self.utc_s is not None:
             age_s = max(now_utc_s - self.utc_s, 0.0)

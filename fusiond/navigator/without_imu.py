@@ -62,21 +62,21 @@ MOST_REMEMBERED = 128
 
 
 class _Received:
-    """An aid that has come, and where the vehicle is by it alone: asked for once."""
+    """A measurement that has come, and where the vehicle is by it alone, asked for once."""
 
-    __slots__ = ("_asked", "_position", "aid")
+    __slots__ = ("_asked", "_position", "measurement")
 
-    def __init__(self, aid: Aid) -> None:
-        self.aid = aid
+    def __init__(self, measurement: Aid) -> None:
+        self.measurement = measurement
         self._asked = False
         self._position: PositionCandidate | None = None
 
     @property
     def position(self) -> PositionCandidate | None:
-        """None of an aid that says none."""
+        """Position by it alone; None where it says none."""
         if not self._asked:
             self._asked = True
-            for candidate in self.aid.candidates():
+            for candidate in self.measurement.candidates():
                 if isinstance(candidate, PositionCandidate):
                     self._position = candidate
         return self._position
@@ -109,7 +109,7 @@ class WithoutImu:
         """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
         self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
-        self._headings = WayFaced(_slips_m_s(config.constraints.non_holonomic))
+        self._way = WayFaced(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None
         self._silent_ns = 0
         self._located_ns = 0
@@ -120,30 +120,30 @@ class WithoutImu:
         """True if it navigates."""
         return self.estimator is not None
 
-    def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
-        """Aids have come at `seen_ns`."""
-        self._recent.extend(map(_Received, aids))
-        if self._first_ns is None and aids:
-            self._first_ns = seen_ns or aids[0].t_ns
-        for aid in aids if self._headings.known else ():
-            for candidate in aid.candidates() if not aid.locates else ():
+    def receive(self, measurements: Sequence[Aid], seen_ns: int) -> None:
+        """Measurements have come at `seen_ns`."""
+        self._recent.extend(map(_Received, measurements))
+        if self._first_ns is None and measurements:
+            self._first_ns = seen_ns or measurements[0].t_ns
+        for one in measurements if self._way.known else ():
+            for candidate in one.candidates() if not one.locates else ():
                 if isinstance(candidate, HeadingCandidate):
-                    self._headings.add(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
+                    self._way.add(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
         if self.estimator is not None:
-            for aid in aids:
-                self._insert(aid)
+            for one in measurements:
+                self._insert(one)
 
     def takes_over(self, t_ns: int, imu: ImuBuffer) -> bool:
         """True if no inertial unit navigates at `t_ns`, nor will with its next sample."""
         return not imu.end or (t_ns - imu.latest_ns) * 1e-9 > BEARABLE_GAP_S
 
-    def set_position(self, aid: Aid, t_ns: int) -> str | None:
-        """Use an operator's position at `t_ns`: its outcome, or None where a start waits for it."""
+    def take_position(self, fix: Aid, t_ns: int) -> str | None:
+        """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
         if self.estimator is None:
-            self.hear([aid], t_ns)
+            self.receive([fix], t_ns)
             return None
         self._run(self.estimator, t_ns)
-        entry = self._insert(replace(aid, t_ns=self._imu.latest_ns))
+        entry = self._insert(replace(fix, t_ns=self._imu.latest_ns))
         self._run(self.estimator, t_ns)
         return None if entry is None or entry.outcome is None else entry.outcome.name
 
@@ -213,8 +213,8 @@ class WithoutImu:
 
     def _begin(self, since_ns: int) -> None:
         """Start at the newest fix since the samples ended, if there is one."""
-        recent = [h for h in self._recent if h.aid.t_ns > since_ns]
-        newest_first = sorted(recent, key=lambda h: h.aid.t_ns, reverse=True)
+        recent = [h for h in self._recent if h.measurement.t_ns > since_ns]
+        newest_first = sorted(recent, key=lambda h: h.measurement.t_ns, reverse=True)
         fix = next((h.position for h in newest_first if h.position is not None), None)
         if fix is None:
             return
@@ -238,16 +238,16 @@ class WithoutImu:
         estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
         self._timeline.start()
         self.estimator = estimator
-        for received in self._recent:
-            if received.aid.t_ns >= fix.t_ns:
-                self._insert(received.aid)
+        for one in self._recent:
+            if one.measurement.t_ns >= fix.t_ns:
+                self._insert(one.measurement)
         self._event(
             "without_imu",
             "no inertial unit: position and velocity by fixes and a constant velocity, no attitude",
         )
 
     def _insert(self, aid: Aid) -> Entry | None:
-        level = aid.unturned(self._headings)
+        level = aid.unturned(self._way)
         return None if level is None else self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:

@@ -12,7 +12,7 @@ from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
 from fusiond.aiding.compass import CompassAid, deviation, disturbance
-from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeedAid
+from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeed
 from fusiond.aiding.way_faced import HOLDS_NS, Faced, WayFaced
 from fusiond.models.constant_velocity import constant_velocity
 from fusiond.models.vehicle import (
@@ -158,7 +158,7 @@ def test_a_heading_counts_for_a_second_and_never_one_of_later() -> None:
     assert way(Faced(5 * SECOND - HOLDS_NS - 1, YAW_RAD, 0.02)).at(5 * SECOND) is None
     # In whatever order they come.
     wheel = level(WHEEL, way(late, FACED))
-    assert isinstance(wheel, GroundSpeedAid)
+    assert isinstance(wheel, GroundSpeed)
     assert wheel.way.at(WHEEL.t_ns) == FACED
 
 
@@ -173,7 +173,7 @@ def test_a_heading_says_which_way_the_vehicle_goes_or_backs() -> None:
 
 def test_who_may_slide_has_no_course_and_an_attitude_alone_none_without_a_yaw() -> None:
     free = WayFaced()
-    free.hear(FACED)
+    free.add(FACED)
     assert HEADING.unturned(free) is None
     assert COMPASS.unturned(free) is None
     assert free.at(5 * SECOND) is None

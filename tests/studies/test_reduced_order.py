@@ -82,8 +82,8 @@ def test_level_tilt_of_the_reduced_filter_is_the_accelerometer_bias() -> None:
 
 
 def test_noises_that_are_not_printed_make_table_2() -> None:
-    """The figures of 23 states within a sixth, but for the velocity north; of 17 the level tilt and
-    the velocity east. What no noise gives stays apart: azimuth and vertical velocity of 17."""
+    """Those of 23 states within a sixth, but for the velocity north; of 17 the level tilt and the
+    velocity east. What no noise gives stays apart: azimuth and vertical velocity of 17."""
     of, paper = result()["implied"]["models"], result()["paper"]["models"]
     ratio = {
         name: np.concatenate([np.array(of[name][key]) / paper[name][key] for key in of[name]])
@@ -220,7 +220,7 @@ def test_azimuth_of_the_points_stays_where_the_text_says() -> None:
     angles = []
     for k, scene in enumerate(flight.scenes(600.0)):
         state = State(nav[k + 1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
-        angles.append(flight.rows(flight.measurements(scene, np.zeros(scene.rows)), state).z[8])
+        angles.append(flight.rows(flight.aids(scene, np.zeros(scene.rows)), state).z[8])
     degrees = np.degrees(np.abs(angles))
     assert 52.0 < degrees.min() < 54.5
     assert 125.5 < degrees.max() < 128.0

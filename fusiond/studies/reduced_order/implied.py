@@ -49,13 +49,13 @@ def found(
     (m,) as of `analyse`."""
     full, reduced = models["23"], models["17"]
     gyro = (math.radians(GYRO_DEG_SQRT_H) / ROOT_HOUR) ** 2
-    felt = (ACCELEROMETER_M_S_SQRT_H / ROOT_HOUR) ** 2
+    of_biases = (ACCELEROMETER_M_S_SQRT_H / ROOT_HOUR) ** 2
     truth = list(_with(systems["23"], full, {"attitude": gyro}))
     filters = {
         "23": (full, truth, np.arange(full.size)),
         "17": (
             reduced,
-            list(_with(systems["17"], reduced, {"attitude": gyro, "velocity": felt})),
+            list(_with(systems["17"], reduced, {"attitude": gyro, "velocity": of_biases})),
             kept,
         ),
     }
