@@ -88,12 +88,11 @@ LOG_PRIOR = 7
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
-# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, by how
-# much the unit has been found to have turned on the vehicle in pitch and yaw (rad), and the epoch
-# (s) of what was judged last.
+# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, and by
+# how much the unit has been found to have turned on the vehicle in pitch and yaw (rad).
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, TURNED_BY = range(10, 19)
-JUDGED_S, HEAD = 20, 24
+HEAD = 24
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
