@@ -34,7 +34,7 @@ from fusiond.aiding.packed import (
     T_NS,
     packed_rows,
 )
-from fusiond.estimators.fault_bank import JUDGED_S, PERIODS_S, SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
+from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
 from fusiond.estimators.fault_bank import PHI as BANK_PHI
 from fusiond.estimators.fault_carried import settle
 from fusiond.estimators.fault_odds import judge
@@ -141,7 +141,7 @@ def conclude(
     epoch_s = bank[UNJUDGED]
     if epoch_s < np.inf:
         if later and aids[next_, KIND] <= VELOCITY and not any_likely(bank, lanes):
-            bank[UNJUDGED], bank[UNWEIGHED], bank[JUDGED_S] = np.inf, epoch_s, epoch_s
+            bank[UNJUDGED], bank[UNWEIGHED] = np.inf, epoch_s
         elif later:
             judge(bank, ints, numbers, lanes, epoch_s, found)
         else:
@@ -249,7 +249,7 @@ def take_aid(
         carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, late)
         bank[WAITS] = 1.0
         settle(bank, n)
-    if not measured and t_s - bank[JUDGED_S] < PERIODS_S[0]:
+    if not measured:
         judge_and_widen(
             *(bank, ints, numbers, lanes, n, t_s, False, True),
             *(nav, xi, step, published, mounting, bank_work, wider, found),
@@ -258,8 +258,7 @@ def take_aid(
     if bank[SUSPECTS] != 0.0:
         return JUDGE
     bank[UNJUDGED] = t_s
-    if measured:
-        learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
+    learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
     return DONE
 
 

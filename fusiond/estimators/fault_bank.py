@@ -94,12 +94,11 @@ LOG_PRIOR = 7
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
 # one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the row
 # width of the transition, by how much the unit has been found to have turned on the vehicle in
-# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
-# back of the velocity in all (m/s), and the epoch (s) of what was judged last.
+# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, and what has been
+# fed back of the velocity in all (m/s).
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, JUDGED_S = 21, 22, 25
-HEAD = 32
+UNWEIGHED, FED_BACK, HEAD = 21, 22, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8

@@ -43,7 +43,6 @@ from fusiond.estimators.fault_bank import (
     FOLLOWED,
     GROUPS,
     J_AT,
-    JUDGED_S,
     L10,
     L11,
     L20,
@@ -290,7 +289,6 @@ def judge(
     the source's may have lost something.
     """
     groups, m, counts = int(bank[ALL]), np.empty(12), np.zeros((RESTARTS, 2))
-    bank[JUDGED_S] = epoch_s
     _gains(bank, lanes)
     largest = 0.0
     for number in range(groups):

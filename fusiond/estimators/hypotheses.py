@@ -13,13 +13,11 @@ from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
     ALL,
     EXPLAINED,
-    JUDGED_S,
     LOG_ODDS,
     MOVES,
     NOTHING,
     ONSET,
     OTHER,
-    PERIODS_S,
     PHI,
     PLACES,
     RESTARTS,
@@ -152,19 +150,14 @@ class Hypotheses:
         return self.found
 
     def take(self, t_ns: int, measured: bool, used: bool, fused: bool) -> Array | None:
-        """After rows of an aid: what is `found` of all if they are `used`, and were `measured` or
-        nothing was judged for half a second; and, unless one is identified, what the weighed
-        hypotheses leave open of what is published goes to `wider`. None where nothing is judged, or
-        all that can wait, of rows that were `fused`, until `conclude`."""
-        bank = self.bank
-        late = t_ns * 1e-9 - bank.item(JUDGED_S) >= PERIODS_S[0]
-        measured = measured or late
-        judged = measured and used
-        if fused and judged and bank.item(SUSPECTS) == 0.0:
-            bank[UNJUDGED] = t_ns * 1e-9
+        """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
+        unless one is identified, what the weighed hypotheses leave open of what is published goes
+        to `wider`. None where all that can wait, of rows that were `fused`, until `conclude`."""
+        if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
+            self.bank[UNJUDGED] = t_ns * 1e-9
             return None
         judge_and_widen(*self._judged, t_ns * 1e-9, measured, used, *self._widened)
-        return self.found if judged else None
+        return self.found
 
     def conclude(self) -> None:
         """Judge what waits for it."""

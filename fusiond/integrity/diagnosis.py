@@ -205,7 +205,7 @@ class Diagnosis:
             self._agrees(aid, one)
         if bank is not None:
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
-            if found is not None:
+            if found is not None and measured and used:
                 if identified(found):
                     correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
