@@ -34,8 +34,8 @@ from fusiond.aiding.packed import (
     T_NS,
     packed_rows,
 )
-from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
 from fusiond.estimators.fault_bank import PHI as BANK_PHI
+from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
 from fusiond.estimators.fault_carried import settle
 from fusiond.estimators.fault_odds import judge
 from fusiond.estimators.fault_opened import judge_and_widen

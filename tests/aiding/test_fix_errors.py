@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def _driven(t_s: Array) -> tuple[Array, Array]:
     return np.cumsum(between * step, axis=0), v
 
 
-def _shown(
+def _receiver(
     seed: int,
     error_m: float,
     lasts_s: float = LASTS_S,
@@ -46,8 +47,8 @@ def _shown(
     late_s: float = 0.0,
     velocity_sd_m_s: float = VELOCITY_SD_M_S,
     wanders: bool = True,
-) -> Shares:
-    """What fixes with such an error have shown, which state all of it; their velocities are valid
+) -> FixErrors:
+    """One whose fixes have such an error, of which they state all; their velocities are valid
     `late_s` later than they."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, seconds, 1.0 / rate_hz)
@@ -64,7 +65,13 @@ def _shown(
         north, east = v[k].tolist()
         t_ns = round(t_s[k] * 1e9)
         shown.take(Fix(t_ns, lat, lon, variance, (north, east), velocity_sd_m_s))
-    return shown.shares(round(t_s[-1] * 1e9) + SETTLES_NS)
+    shown.shares(round(t_s[-1] * 1e9) + SETTLES_NS)
+    return shown
+
+
+def _shown(seed: int, *what: float, **how: Any) -> Shares:
+    """What its fixes have shown."""
+    return _receiver(seed, *what, **how).shares(1 << 60)
 
 
 def _mean(drives: int, *what: float, **how: float) -> Array:
@@ -177,3 +184,16 @@ def test_a_share_is_its_mean_by_likelihood(x: float, sigma: float) -> None:
     mean = np.trapezoid(first, y) if hasattr(np, "trapezoid") else np.trapz(first, y)
     expected = mean / (math.exp(-0.5 * (near / sigma) ** 2) + some)
     assert share_of(x, sigma) == pytest.approx(float(expected), abs=2e-3)
+
+
+@pytest.mark.parametrize("error_m", [0.0, 2.0])
+def test_the_next_start_begins_with_what_was_shown(error_m: float) -> None:
+    """A fifth of ten minutes; what comes then outweighs it in some."""
+    known = _receiver(0, error_m)
+    shown = tuple(0.2 * x for x in known.shown)
+    at_first, carried = FixErrors(OFFSET_SD_S), FixErrors(OFFSET_SD_S)
+    carried.take_up(shown)
+    found, before, now = known.shares(1 << 60), at_first.shares(0), carried.shares(0)
+    print(found, before, now)
+    assert abs(now.white - found.white) < 0.3 * abs(before.white - found.white)
+    assert sum(now) == pytest.approx(1.0, abs=0.011)

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json
+import math
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fusiond.aiding.fix_errors import SHOWN
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.noise_share import GRID
 from fusiond.navigator.saved_calibration import (
     SavedCalibration,
     load_calibration,
     mounting_digest,
     save_calibration,
 )
+from fusiond.navigator.saved_noise import SavedNoise
 
 CONFIG: dict[str, Any] = {"constraints": {"non_holonomic": {"enabled": True}}}
 VALUES = {"mounting_yaw_deg": (2.0, 0.2)}
@@ -84,6 +89,26 @@ def test_what_is_no_calibration_is_put_aside(tmp_path: Path, damage: dict[str, A
     assert not path.exists()
     assert path.with_name(path.name + ".bad").exists()
     assert offered(config) == (None, [])
+
+
+@pytest.mark.parametrize(("age_s", "kept"), [(0.0, 0.2), (7 * 86400.0, 0.2 * math.exp(-1.0))])
+def test_noise_counts_a_fifth_at_the_next_start_and_fades(
+    tmp_path: Path, age_s: float, kept: float
+) -> None:
+    config = vehicle(tmp_path)
+    fixes = {"gnss by code": (1.0,) * SHOWN}
+    noise = SavedNoise(time.time() - age_s, fixes, 30.0, (-5.0,) * 3 * len(GRID))
+    saved = SavedCalibration(mounting_digest(config), VALUES, noise)
+    save_calibration(tmp_path / "truck.calibration.json", saved)
+    found, events = offered(config)
+    assert not events
+    assert found is not None
+    assert found.noise is not None
+    assert found.noise.predictions == pytest.approx(30.0 * kept, rel=1e-3)
+    assert found.noise.fixes["gnss by code"] == pytest.approx((kept,) * SHOWN, rel=1e-3)
+    navigator = Navigator(config)
+    navigator.calibration = found
+    assert navigator.shown_noise(None).predictions == found.noise.predictions
 
 
 async def test_nothing_is_kept_before_it_navigates(tmp_path: Path) -> None:
