@@ -177,7 +177,7 @@ class Guests:
 
 
 class ServerQueue:
-    """What one server has to do: descriptors of its own, and pieces of work."""
+    """Queue of one server: its descriptors, and pieces of work."""
 
     def __init__(self, guests: Guests) -> None:
         self._guests = guests
