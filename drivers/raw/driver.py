@@ -94,6 +94,11 @@ class GnssDecoder:
         return self._nmea.refusal or self._ubx.refusal
 
     @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return self._ubx.cautions | self._nmea.cautions
+
+    @property
     def unread(self) -> str:
         """Text on what arrives in the place of anything that is read, as a sentence; "" where
         nothing tells."""
@@ -268,6 +273,11 @@ class GnssDriver(ReceiverDriver):
                 "(no_group_delay): B-CNAV has it, so switch on UBX-RXM-SFRBX, or B1I or B3I"
             )
         return ""
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """As `ReceiverDriver`."""
+        return self._gnss.cautions
 
     def _useless_detail(self) -> str:
         counters = self.counters
