@@ -87,6 +87,8 @@ class ReceiverDriver:
         self._now_ns = self.inputs.now_ns
         self._line = SerialLine(options.port, options.baud, now_ns, open_port=open_port)
         self._open = False
+        self._told: set[str] = set()
+        """Cautions that have been an event."""
         self._why_closed = ""
         self.counters: Counter[str] = self._line.counters
         self._decoder = self._make_decoder()
@@ -106,6 +108,11 @@ class ReceiverDriver:
         """Counters at that instant: what came since and was not understood."""
         self._useful_ns = self._alive_ns
         """Instant when the line opened or a measurement was last handed over."""
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return {}
 
     def _make_decoder(self) -> ReceiverDecoder:
         """The decoder, which counts in `self.counters`."""
@@ -190,6 +197,10 @@ class ReceiverDriver:
             if not isinstance(measurement, TimeReport | NavigationMessage):
                 self._useful_ns = measurement.t_seen_ns
             self._emit(measurement)
+        for code, text in self.cautions.items() if found else ():
+            if code not in self._told:
+                self._told.add(code)
+                self._emit(DeviceEvent(self.name, self._now_ns(), code, text))
 
     # ----------------------------------------------------------------- status
 

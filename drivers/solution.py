@@ -86,6 +86,8 @@ class SolutionJudge:
         self.counters = counters
         self.refusal = ""
         """Reason why the last epoch was refused, by counter name; empty when it was not."""
+        self.implausible_date: date | None = None
+        """The last date that no receiver can truly report."""
         self.gga = b""
         """The last fix as a GGA, for a caster that asks where the receiver is; empty before one."""
         self._source = source
@@ -146,6 +148,7 @@ class SolutionJudge:
         whichever week was taken for which."""
         if self._calendar.plausible(day_of(utc_ns)):
             return UtcStamp(utc_ns)
+        self.implausible_date = day_of(utc_ns)
         return TimeOfDayStamp(utc_ns % DAY_NS * 1e-9)
 
     def _fix(self, s: Solution, stamp: Stamp) -> PositionFix:

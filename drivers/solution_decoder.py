@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 from drivers.cycle import Cycle, Name
 from drivers.decoding import SolutionDecoding
 from drivers.measurements import Measurement
+from drivers.nmea.reasons import implausible_date
 from drivers.solution import Solution, SolutionJudge
 from drivers.splitter import Splitter
 
@@ -45,6 +46,14 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
     def refusal(self) -> str:
         """Reason why the last epoch gave no fix, by counter name."""
         return self._judge.refusal
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        day = self._judge.implausible_date
+        if day is None:
+            return {}
+        return {"implausible_date": implausible_date(day, self._decoding.earliest_date)}
 
     @property
     def gga(self) -> bytes:

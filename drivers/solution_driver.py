@@ -82,6 +82,12 @@ class SolutionDriver(ReceiverDriver):
         found = named(bytes(self._foreign))
         return "" if f'driver = "{self.kind}"' in found else found
 
+    @property
+    def cautions(self) -> dict[str, str]:
+        """As `ReceiverDriver`."""
+        found: dict[str, str] = self._solutions.cautions
+        return found
+
     def _useless_detail(self) -> str:
         if self.counters["position_type_unknown"]:
             return "the receiver names a kind of position that is not known here: please report it"

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
-from drivers.measurements import DeviceEvent, Measurement
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.reasons import REFUSALS
-from drivers.raw.messages import RawEvent
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 
 __all__ = ["REFUSALS", "NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
@@ -28,7 +25,6 @@ class NmeaDriver(ReceiverDriver):
         self, name: str, options: NmeaOptions, emit: Emit, now_ns: Now = monotonic_ns
     ) -> None:
         self._options = options
-        self._told: set[str] = set()
         super().__init__(name, options, emit, now_ns)
 
     def _make_decoder(self) -> NmeaDecoder:
@@ -42,15 +38,8 @@ class NmeaDriver(ReceiverDriver):
 
     @property
     def cautions(self) -> dict[str, str]:
-        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        """As `ReceiverDriver`."""
         return self._nmea.cautions
-
-    def _hand_over(self, found: Sequence[Measurement | RawEvent]) -> None:
-        super()._hand_over(found)
-        for code, text in self.cautions.items():
-            if code not in self._told:
-                self._told.add(code)
-                self._emit(DeviceEvent(self.name, self._now_ns(), code, text))
 
     def _useless_detail(self) -> str:
         return self.cause

@@ -11,7 +11,7 @@ from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS as NMEA_REFUSALS
 from drivers.nmea.driver import NmeaOptions
 from drivers.nmea.framing import Item, Sentence, StreamSplitter
-from drivers.nmea.reasons import wrong_checksums
+from drivers.nmea.reasons import nothing_verified
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawEvent, RawGnssEpoch
@@ -44,6 +44,9 @@ class GnssOptions(NmeaOptions):
     """Hand over observations, ephemerides and ionosphere models."""
     rtcm: bool = True
     """Decode RTCM 3, which needs the package pyrtcm (extra `raw`)."""
+
+
+ALIVE_BY = ("sentences", "ubx_frames", "rtcm_frames")
 
 
 class GnssDecoder:
@@ -89,6 +92,20 @@ class GnssDecoder:
     def refusal(self) -> str:
         """Reason why the last epoch of NMEA, or else of UBX-NAV, gave no fix, by counter name."""
         return self._nmea.refusal or self._ubx.refusal
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return self._ubx.cautions | self._nmea.cautions
+
+    @property
+    def unread(self) -> str:
+        """Text on what arrives in the place of anything that is read, as a sentence; "" where
+        nothing tells."""
+        if not any(self.counters[name] for name in ALIVE_BY):
+            return nothing_verified(self.counters, self._splitter.unread)
+        heard = self._nmea.heard
+        return self._nmea.cause if heard.talkers and not heard.used else ""
 
     @property
     def gga(self) -> bytes:
@@ -225,7 +242,7 @@ class GnssDriver(ReceiverDriver):
     """
 
     Options: ClassVar[type[GnssOptions]] = GnssOptions
-    alive_by = ("sentences", "ubx_frames", "rtcm_frames")
+    alive_by = ALIVE_BY
 
     def __init__(
         self, name: str, options: GnssOptions, emit: Emit, now_ns: Now = monotonic_ns
@@ -271,6 +288,11 @@ class GnssDriver(ReceiverDriver):
             )
         return ""
 
+    @property
+    def cautions(self) -> dict[str, str]:
+        """As `ReceiverDriver`."""
+        return self._gnss.cautions
+
     def _useless_detail(self) -> str:
         counters = self.counters
         if self._options.use_raw:
@@ -279,6 +301,8 @@ class GnssDriver(ReceiverDriver):
             if counters["time_unset"]:
                 return "the receiver has observations, but no time yet"
             if not counters["epochs_raw"] and not self._gnss.refusal:
+                if unread := self._gnss.unread:
+                    return unread
                 return "no observations arrive: switch on UBX-RXM-RAWX, or RTCM MSM4 or MSM7"
         if self._options.use_nmea_fix and counters["epochs"]:
             words = {**REFUSALS, **NMEA_REFUSALS}
@@ -287,11 +311,11 @@ class GnssDriver(ReceiverDriver):
 
     def _unintelligible_detail(self) -> str:
         where = self._where_to_look()
-        return f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies{where}"
+        return self.cause or f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies{where}"
 
     @property
     def cause(self) -> str:
         """Reason why nothing on the line verifies, as a sentence; "" where nothing that arrives
         tells."""
         alive = any(self.counters[name] for name in self.alive_by)
-        return "" if alive else wrong_checksums(self.counters)
+        return "" if alive else self._gnss.unread

@@ -89,7 +89,7 @@ class RecorderClock:
         own_ns = self._of_channel.get(of[0], stamp_ns)
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
-    def is_step(self, change_ns: int) -> bool:
+    def jumps(self, change_ns: int) -> bool:
         """True if stamps that advance by so much say that the clock was set, or paused."""
         spacing_ns = max(self._spacings, default=0)
         return change_ns < -AHEAD_NS or change_ns >= max(LEAP_NS, ORDINARY * spacing_ns)
@@ -127,7 +127,7 @@ class RecorderClock:
             return "taken"
         if change > AHEAD_NS and self._is_ahead(stamp_ns, following):
             return "time_ahead"
-        if self.is_step(change):
+        if self.jumps(change):
             set_ns = set_by_utc()
             if set_ns is not None and abs(set_ns) >= LEAP_NS and change - set_ns > -AHEAD_NS:
                 self._step(stamp_ns, set_ns, of)

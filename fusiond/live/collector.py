@@ -20,8 +20,8 @@ _FORCED_NS = (100 * _MS, 1_000 * _MS, 20_000 * _MS)
 _DEAR_NS = 4 * _MS
 """The oldest generation was full of garbage: then it is looked through more often, by as much."""
 _LONGEST_WAIT = 32
-"""Largest factor of its interval, which doubles where it had no garbage, up to five minutes. What
-lives costs 4 to 11 ms each time, a whole tick after a long one."""
+"""Longest back-off, 320 s: the wait doubles where there was no garbage at all. Live objects cost 4
+to 11 ms each time, a whole tick after a long one."""
 _SLACK_MARGIN_NS = 500_000
 
 
@@ -32,7 +32,7 @@ class Collector:
         self._now = now
         self._cost_ns = [0, 0, 0]
         self._last_ns = [0, 0, 0]
-        self._wait_factor = 1
+        self._backoff = 1
         """Of the oldest generation: by so much its times are longer."""
         self._was_enabled = gc.isenabled()
         self.collections = 0
@@ -60,8 +60,8 @@ class Collector:
             cost_ns = self._cost_ns[generation]
             since_ns = start_ns - self._last_ns[generation]
             if generation == 2:
-                dear = max(1, cost_ns // _DEAR_NS) if self._wait_factor == 1 else 1
-                since_ns = since_ns * dear // self._wait_factor
+                dear = max(1, cost_ns // _DEAR_NS) if self._backoff == 1 else 1
+                since_ns = since_ns * dear // self._backoff
             if since_ns < _DUE_NS[generation]:
                 continue
             fits = 3 * cost_ns // 2 + _SLACK_MARGIN_NS < slack_ns
@@ -71,7 +71,7 @@ class Collector:
                 self._cost_ns[generation] = cost_ns
                 self._last_ns[: generation + 1] = [start_ns] * (generation + 1)
                 if generation == 2:
-                    self._wait_factor = 1 if found else min(2 * self._wait_factor, _LONGEST_WAIT)
+                    self._backoff = 1 if found else min(2 * self._backoff, _LONGEST_WAIT)
                 self.max_ns = max(self.max_ns, cost_ns)
                 self.collections += 1
                 self.forced += not fits

@@ -100,11 +100,14 @@ def messages(
     """
     log, lost = _format(path), Refusals() if refusals is None else refusals
     read = {".blf": _binary, ".mf4": _mf4}.get(log.suffix, _text)
-    count = 0
+    count, odd = 0, Counter[str]()
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_warned(lambda: odd.update(("length_or_type_odd",))))
         for message in read(log, lost, stack, told):
             count += 1
             yield message
+    if log.suffix != ".trc":  # whose lines are refused by their number
+        lost.count(odd)
     if not count and lost.first:
         hint = "; candump writes logs with -L or -l" if log.suffix == ".log" else ""
         raise TableError(f"{path}: cannot be read as {log.suffix}: {lost.first}{hint}")

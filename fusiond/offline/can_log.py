@@ -262,7 +262,7 @@ class _Replay:
             driver.feed(_frame(first, first_ns, first_ns))
         for message, ns in frames.ahead():
             change_ns = ns - stamp_ns
-            if self._recorder.is_step(change_ns):
+            if self._recorder.jumps(change_ns):
                 others_ns.append(change_ns)
                 stamp_ns = ns
             elif change_ns > 0:

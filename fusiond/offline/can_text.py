@@ -117,8 +117,8 @@ class TextLines:
 
 
 def _decoded(stream: BinaryIO) -> BinaryIO:
-    """The bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`), and with
-    line ends that are one, where it has carriage returns alone."""
+    """Bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`); with line feeds,
+    where it ends lines by carriage returns alone."""
     try:
         first = stream.read(LONGEST)
         encoding = _BOMS.get(first[:2])

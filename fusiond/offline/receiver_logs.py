@@ -54,6 +54,9 @@ class _Decoder(Protocol):
     @property
     def refusal(self) -> str: ...
 
+    @property
+    def cautions(self) -> dict[str, str]: ...
+
     def feed(self, data: bytes, t_seen_ns: int) -> Sequence[Measurement]: ...
 
     def flush(self) -> Sequence[Measurement]: ...
@@ -118,7 +121,8 @@ def read_solutions(
             raise TableError(f"{path}: no fix: {why}")
         raise TableError(f"{path}: {kind_of(log.data) or named(log.data) or f'no {_NAMES[kind]}'}")
     refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
-    return rows, [*log.notes, *counted({**refused, "undated": undated})]
+    notes = [Rejection(0, *note, 0) for note in decoder.cautions.items()]
+    return rows, [*log.notes, *notes, *counted({**refused, "undated": undated})]
 
 
 def is_of_week(imu: ImuTable) -> bool:

@@ -177,7 +177,7 @@ class Guests:
 
 
 class ServerQueue:
-    """Work of one server: descriptors of its own, and pieces that wait for a turn."""
+    """Queue of one server: its descriptors, and pieces of work."""
 
     def __init__(self, guests: Guests) -> None:
         self._guests = guests

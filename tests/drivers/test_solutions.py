@@ -12,7 +12,7 @@ import pytest
 
 from drivers.base import Emitted
 from drivers.bestpos.driver import BestposDriver
-from drivers.measurements import Heading, PositionFix, TimeReport
+from drivers.measurements import DeviceEvent, Heading, PositionFix, TimeReport
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.raw.driver import GnssDecoder
 from drivers.sbf.driver import SbfDriver
@@ -109,6 +109,20 @@ async def test_a_line_becomes_fixes_headings_and_time(name: str, device: Device)
         await until(lambda: driver.status.state == "absent")
     assert len(of(emitted, TimeReport)) == 3
     assert all(fix.v_ned_m_s is not None or name != "ubx" for fix in of(emitted, PositionFix))
+
+
+async def test_a_date_that_cannot_be_is_an_event_once(name: str, device: Device) -> None:
+    """An old log, or a rollover: what was done about it is told."""
+    driver, emitted = made(name, device, earliest_date="2090-01-01")
+    async with at_work(driver.run()):
+        await until(lambda: driver.counters["opened"] == 1)
+        for k in range(3):
+            device.send(PROTOCOLS[name].epoch(k) + PROTOCOLS[name].heading(k))
+            await until(lambda k=k: len(of(emitted, PositionFix)) == k + 1)
+    (told,) = [e for e in of(emitted, DeviceEvent) if e.code == "implausible_date"]
+    assert "before 2090-01-01: its dates are not used, its times of day are" in told.text
+    assert list(driver.cautions) == ["implausible_date"]
+    assert of(emitted, TimeReport) == []
 
 
 async def test_status_says_what_is_wrong(name: str, device: Device) -> None:

@@ -170,3 +170,17 @@ def test_a_version_of_trc_that_is_not_read_is_named(tmp_path: Path) -> None:
     path.write_text(";$FILEVERSION=1.2\n;\n     1)  0.000 1  Rx  07E8  2  03 41\n")
     with pytest.raises(TableError, match=r"TRC of version 1\.2; versions 1\.0, 1\.1, 1\.3"):
         read(path)
+
+
+def test_what_the_reader_only_warns_of_is_counted(
+    tmp_path: Path, zone: Callable[[str], None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It would write a line a frame on the terminal."""
+    zone("UTC")
+    odd = "   0.1 CANFD   1 Rx 7E8 1 0 8 3 01 02 03 0 0 0 0 0 0 0 0\n"
+    path = asc(tmp_path / "bus.asc", change=lambda text: odd * 3 + text)
+    found, refused, _ = read(path)
+    assert len(found) == len(FRAMES) + 3
+    (warned,) = refused.all()
+    assert (warned.reason, warned.times) == ("length_or_type_odd", 3)
+    assert capfd.readouterr().err == ""

@@ -105,11 +105,13 @@ async def test_raw_alone_is_running_and_tells_the_time(device: Device) -> None:
     [
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xa5" * 50, "silent", "neither NMEA, UBX nor RTCM 3 verifies at 115200 baud"),
+        (b"!AIVDM,1,1,,A,13HOI:0P0000VOHLCnHQKwvL05Ip,0*23\r\n" * 4, "silent", "AIS (!AIVDM) arr"),
+        (b"login: \r\nLinux pi 6.1\r\n" * 4, "silent", "such as 'Linux pi 6.1'"),
         (ubx(b"\x0a\x04", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
         (rawx(measurement(), week=0), "running", "no time yet"),
         (gga(29, quality=0), "running", "no fix"),
     ],
-    ids=["nothing", "baud", "no_rawx", "no_time", "no_fix"],
+    ids=["nothing", "baud", "ais", "console", "no_rawx", "no_time", "no_fix"],
 )
 async def test_status_says_what_is_wrong(
     device: Device, sent: bytes, state: str, words: str
