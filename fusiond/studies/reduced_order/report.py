@@ -102,9 +102,7 @@ def picture(series: dict[str, Any], path: Path) -> None:
             panel.set_yscale("log")
             panel.set_ylabel(f"{AXIS_NAMES[axis]}, {unit}")
             panel.grid(alpha=0.3)
-    figure.suptitle(
-        "one sigma: true (solid), believed by the filter (dashed), paper (dotted)"
-    )
+    figure.suptitle("one sigma: true (solid), believed by the filter (dashed), paper (dotted)")
     axes[0, 0].set_title("attitude", loc="left")
     axes[0, 1].set_title("velocity", loc="left")
     axes[0, 1].legend(fontsize="small")
