@@ -102,12 +102,9 @@ def picture(series: dict[str, Any], path: Path) -> None:
             panel.set_yscale("log")
             panel.set_ylabel(f"{AXIS_NAMES[axis]}, {unit}")
             panel.grid(alpha=0.3)
-    axes[0, 0].set_title(
-        "attitude, one sigma: true, believed (dashed), the paper's (dotted)", loc="left"
-    )
-    axes[0, 1].set_title(
-        "velocity, one sigma: true, believed (dashed), the paper's (dotted)", loc="left"
-    )
+    figure.suptitle("one sigma: true (solid), believed by the filter (dashed), paper (dotted)")
+    axes[0, 0].set_title("attitude", loc="left")
+    axes[0, 1].set_title("velocity", loc="left")
     axes[0, 1].legend(fontsize="small")
     for panel in axes[2]:
         panel.set_xlabel("s")
