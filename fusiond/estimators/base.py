@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.aid_run import AidRun
 from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.measurement_run import MeasurementRun
 from fusiond.estimators.memory import AHEAD, GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
@@ -130,7 +130,7 @@ class Estimator(Protocol):
         """True if it detects and leaves out faulty sources by itself."""
 
     @property
-    def runs(self) -> AidRun | None:
+    def runs(self) -> MeasurementRun | None:
         """Aids in one call; None while it takes them one by one."""
 
     @property
@@ -237,7 +237,7 @@ class ErrorStateFilter:
         return False
 
     @property
-    def runs(self) -> AidRun | None:
+    def runs(self) -> MeasurementRun | None:
         """Aids in one call; None while it takes them one by one."""
         return None
 
