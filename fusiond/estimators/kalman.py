@@ -48,9 +48,12 @@ class KalmanEstimator(ErrorStateFilter):
         self._runs = self._new_run(NO_AXES)
 
     def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Aids in one call, with what updates carry over; None of a filter whose updates differ."""
-        of = self._memory, self.model, self.hypotheses
-        return MeasurementRun(self, *of, axes, self._knows) if self.packs else None
+        """Aids in one call, with what updates carry over; None without a bank, whose updates are
+        cheap, and of a filter whose updates differ."""
+        bank = self.hypotheses
+        if bank is None or not self.packs:
+            return None
+        return MeasurementRun(self, self._memory, self.model, bank, axes, self._knows)
 
     @property
     def runs(self) -> MeasurementRun | None:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS
-from fusiond.estimators.fault_bank import NO_FAULTS
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import Memory
 from fusiond.estimators.propagation import RECORD
@@ -45,20 +44,15 @@ class MeasurementRun:
         filter_: Filter,
         memory: Memory,
         model: Model,
-        bank: Hypotheses | None,
+        bank: Hypotheses,
         axes: Axes,
         knows: Array,
     ) -> None:
         work = np.zeros(AT_H + LENT_ROWS * (model.size + model.width))
         self._filter, self._memory, self._kernel = filter_, memory.array, run_for(model.width)
-        table, of_bank = NO_FAULTS, (np.full((2, 2), -1.0), np.zeros(0, dtype=np.float32))
-        for_bank, found = np.zeros(0), np.zeros(0)
-        if bank is not None:
-            table, of_bank = bank.table, (bank.mounting, bank.rows)
-            for_bank, found = bank.work, bank.found
         self._given = (
-            *(*table[:3], model.column_of, model.initial, *axes),
-            *(of_bank[0], work, of_bank[1], for_bank, knows, found),
+            *(*bank.table[:3], model.column_of, model.initial, *axes),
+            *(bank.mounting, work, bank.rows, bank.work, knows, bank.found),
         )
         self._hold_height, self._knows = model.hold_height, knows
 

@@ -63,7 +63,6 @@ from fusiond.estimators.tilt_axes_carried import (
     may_part,
     remember_estimate,
 )
-from fusiond.estimators.update import fuse
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import PHI, WIDTHS
 from fusiond.navigation.strapdown import STEP_RESTS_S
@@ -129,8 +128,6 @@ def conclude(
     `waits` where nobody reads odds before they are others."""
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
-    if bank.size == 0:
-        return
     judge_what_waits(bank, ints, numbers, lanes, found)
     epoch_s = bank[UNJUDGED]
     if epoch_s < np.inf:
@@ -169,12 +166,11 @@ def _carry_over(
     kept = gyros if knows[UNDOUBTED] > 0.0 and step[STEP_RESTS_S] == 0.0 else gyros[:0]
     turned = carry_over_all(cov[:n, :n], before, nav, xi, biases, kept, lever, time)
     knows[TURNED] = turned
-    if bank.size:
-        at = int(bank[BANK_PHI])
-        phi = bank[at : at + width * width].reshape((width, width))
-        carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, time)
-        bank[WAITS] = 1.0
-        settle(bank, n)
+    at = int(bank[BANK_PHI])
+    phi = bank[at : at + width * width].reshape((width, width))
+    carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, time)
+    bank[WAITS] = 1.0
+    settle(bank, n)
 
 
 @compiled(f"i8(i8[::1], f8[::1], {_STATE}, {_BANK}, {_OPENED}, f8[::1])")
@@ -192,12 +188,11 @@ def _judged(
     bank, ints, numbers, lanes, found, _, work = of_bank
     m, t_s = of[ROWS], of[T_NS] * 1e-9
     if of[ASKED] & MEASURED:
-        if bank.size and bank[SUSPECTS] != 0.0:
+        if bank[SUSPECTS] != 0.0:
             return JUDGE
+        bank[UNJUDGED] = t_s
         learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
-        if bank.size:
-            bank[UNJUDGED] = t_s
-    elif bank.size:
+    else:
         published, mounting, wider = opened
         judge_and_widen(
             *(bank, ints, numbers, lanes, dx.shape[0], t_s, False, True),
@@ -254,13 +249,10 @@ def fold_row(
     carried = axes[2].size > 0 or may_part(cov[:n, :n], axes[0][0])
     if carried:
         remember_estimate(nav, xi, axes[0], axes[1], axes[2], before)
-    if bank.size:
-        nis = fold_and_account(
-            *(nav, xi, step, cov, dx, z, h, r, x[GATE], y, g, bank, ints, numbers, lanes),
-            *(of[T_NS], of[MEASURES], of[OF_DEVICE], of_rows, found),
-        )
-    else:
-        nis = fuse(nav, xi, cov, dx, z, h, r, x[GATE], False, y, g)
+    nis = fold_and_account(
+        *(nav, xi, step, cov, dx, z, h, r, x[GATE], y, g, bank, ints, numbers, lanes),
+        *(of[T_NS], of[MEASURES], of[OF_DEVICE], of_rows, found),
+    )
     result[NIS] = nis
     if not nis <= x[GATE]:
         result[BECAME] = GATED if math.isfinite(nis) else NOT_FINITE

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, NAMES, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
-from fusiond.estimators.fault_bank import NOTHING
+from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.estimators.row_kernels import (
     BECAME,
@@ -55,7 +55,7 @@ class MeasurementRows:
 
     def __init__(self, estimator: Estimator) -> None:
         runs = estimator.runs
-        self._packs, self._bank = runs is not None, estimator.hypotheses
+        self._bank = None if runs is None else estimator.hypotheses
         self._model = estimator.model
         self._known: dict[str, tuple[int, int, int, int]] = {}
         """By source: number of its series, what its rows are and its device, what is asked."""
@@ -64,23 +64,23 @@ class MeasurementRows:
 
     def packed(self, measurement: Aid) -> tuple[bytes, object]:
         """An aid's row, empty where it has none, and what a frozen sensor would repeat of it."""
-        packed = measurement.packed(self._model) if self._packs and not measurement.robust else None
-        if packed is None:
+        bank = None if measurement.robust else self._bank
+        packed = None if bank is None else measurement.packed(self._model)
+        if bank is None or packed is None:
             return b"", None
-        known = self._known.get(measurement.source) or self._new(measurement)
+        known = self._known.get(measurement.source) or self._new(measurement, bank)
         kind, rows, body = packed
         row = HEADER.pack(kind, measurement.t_ns, rows, THRESHOLDS[measurement.gate, rows], *known)
         shown = None if measurement.constraint else type(measurement).shown
         return row + body + _PADDING[len(body)], None if shown is None else shown(measurement)
 
-    def _new(self, measurement: Aid) -> tuple[int, int, int, int]:
+    def _new(self, measurement: Aid, bank: Hypotheses) -> tuple[int, int, int, int]:
         """Constants of an aid's source."""
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not measurement.constraint:
             asked = MEASURED if measurement.locates else MEASURED | MOTION_ASKED
-        of = (NOTHING, -1) if self._bank is None else self._bank.of(measurement)
-        known = self._known[measurement.source] = number, *of, asked
+        known = self._known[measurement.source] = number, *bank.of(measurement), asked
         return known
 
     def batch(
