@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 HEADER = Struct("<3qd4q")
-"""Kind, instant (ns), number of rows, gate (chi-square), number of its series, what its rows are
-and its device (fusiond.estimators.fault_bank), and what is asked of it."""
+"""Kind, instant (ns), number of rows, gate (chi-square), number of its series. Then what its rows
+and its device are to the bank (fusiond.estimators.fault_bank), and what is asked of it."""
 KIND, T_NS, ROWS, GATE, SERIES, MEASURES, OF_DEVICE, ASKED, BODY = range(9)
 MEASURED, MOTION_ASKED = 1, 2
 """Of `ASKED`: it is no constraint; whether the vehicle moves is to be told with its outcome."""
@@ -46,26 +46,27 @@ def _slots(ints: Indices, at: int) -> Indices:
 
 
 @compiled(
-    "i8(f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], b1, f8[::1], f8[:, :], f8[::1],"
+    "i8(f8[::1], UniTuple(f8[::1], 3), Tuple((i8[::1], f8[::1], b1)), f8[:, :], f8[::1],"
     "f8[:, ::1], f8[::1])",
     allocates=True,
 )
 def packed_rows(
     x: Array,
-    ints: Indices,
-    nav: Array,
-    xi: Array,
-    step: Array,
-    column_of: Indices,
-    hold_height: bool,
-    initial: Array,
+    state: tuple[Array, Array, Array],
+    model: tuple[Indices, Array, bool],
     p: Array,
     z: Array,
     h: Array,
     r: Array,
 ) -> int:
-    """Write z (m,), H (m, n) and r (m,) of the row `x` (SIZE,), the same as integers `ints`, for a
-    filter's state (10,), parameters (n,), last step and P (n, n); whether it `APPLIES`."""
+    """Write z (m,), H (m, n) and r (m,) of the row `x` (SIZE,); whether it `APPLIES`.
+
+    `state`: a filter's state (10,), parameters (n,) and last step, with P (n, n); `model`: columns
+    and sigmas at the start of its parameters (n,), and whether it holds the height.
+    """
+    nav, xi, step = state
+    column_of, initial, hold_height = model
+    ints = x.view(np.int64)
     kind, a = ints[KIND], BODY
     if kind == POSITION:
         position_rows(

@@ -105,8 +105,7 @@ def velocity_rows(
     down = f2 + gravity(nav[LAT], nav[HEIGHT])
     for slot in time:
         late_s = xi[slot]
-        z[0] += f0 * late_s
-        z[1] += f1 * late_s
+        z[0], z[1] = z[0] + f0 * late_s, z[1] + f1 * late_s
         h[0, slot], h[1, slot] = -f0, -f1
         h[0, 1] -= late_s * f2
         h[0, 2] += late_s * f1
@@ -120,8 +119,7 @@ def velocity_rows(
         for i in range(z.shape[0]):
             x, y, d = late_s * c[3 * i], late_s * c[3 * i + 1], late_s * c[3 * i + 2]
             add_of_force(step, column_of, c, x, y, d, h[i])
-    z[0] -= v0
-    z[1] -= v1
+    z[0], z[1] = z[0] - v0, z[1] - v1
     r[0], r[1] = sd0 * sd0, sd1 * sd1
     if z.shape[0] > 2:
         z[2] -= v2

@@ -26,10 +26,10 @@ from fusiond.aiding.base import (
     Renewal,
     State,
 )
-from fusiond.estimators.aid_run import AidRun
 from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.measurement_run import MeasurementRun
 from fusiond.estimators.memory import AHEAD, GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
@@ -148,7 +148,7 @@ class Estimator(Protocol):
         """True if it detects and leaves out faulty sources by itself."""
 
     @property
-    def runs(self) -> AidRun | None:
+    def runs(self) -> MeasurementRun | None:
         """Aids in one call; None while it takes them one by one."""
 
     @property
@@ -255,7 +255,7 @@ class ErrorStateFilter:
         return False
 
     @property
-    def runs(self) -> AidRun | None:
+    def runs(self) -> MeasurementRun | None:
         """Aids in one call; None while it takes them one by one."""
         return None
 

@@ -99,7 +99,7 @@ class Hypotheses:
         """V (n, columns)."""
         first = int(bank[PHI])
         self.transition = bank[first : first + self.width**2].reshape(self.width, -1)
-        """Transition that V has still to be multiplied by (w, w); unit where there is none."""
+        """Matrix (w, w) that V waits to be multiplied by; one where it waits for nothing."""
         self._nine = np.zeros((9, 9))
         self.of_source: dict[str, tuple[int, int]] = {}
 

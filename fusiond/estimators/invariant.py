@@ -62,7 +62,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import NOTHING_LEFT, Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.aid_run import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
@@ -76,6 +75,7 @@ from fusiond.estimators.invariant_error import (
     write_jacobian,
 )
 from fusiond.estimators.robust import reweighted
+from fusiond.estimators.row_kernels import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.estimators.tilt_axes_carried import keep_down_rows, keep_downward

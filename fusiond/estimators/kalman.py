@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
-from fusiond.estimators.aid_run import KNOWS, NO_AXES, AidRun, Axes
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
+from fusiond.estimators.measurement_run import MeasurementRun
+from fusiond.estimators.row_kernels import KNOWS, NO_AXES, Axes
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, whiten, work
 from fusiond.models.model import Model
@@ -30,7 +31,7 @@ class KalmanEstimator(ErrorStateFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
     packs: ClassVar[bool] = True
-    """True if an update is that of fusiond.estimators.aid_run, where a bank is beside it."""
+    """True if an update is that of fusiond.estimators.measurement_run."""
 
     def __init__(
         self,
@@ -46,15 +47,16 @@ class KalmanEstimator(ErrorStateFilter):
         self._knows = np.zeros(KNOWS)
         self._runs = self._new_run(NO_AXES)
 
-    def _new_run(self, axes: Axes) -> AidRun | None:
-        """Aids in one call, with what updates carry over; None without a bank."""
+    def _new_run(self, axes: Axes) -> MeasurementRun | None:
+        """Aids in one call, with what updates carry over; None without a bank, whose updates are
+        cheap, and of a filter whose updates differ."""
         bank = self.hypotheses
         if bank is None or not self.packs:
             return None
-        return AidRun(self, self._memory, self.model, bank, axes, self._knows)
+        return MeasurementRun(self, self._memory, self.model, bank, axes, self._knows)
 
     @property
-    def runs(self) -> AidRun | None:
+    def runs(self) -> MeasurementRun | None:
         """Aids in one call; None while an estimate is held, or updates turn."""
         return None if self._holding or self.turns else self._runs
 
@@ -88,8 +90,8 @@ class KalmanEstimator(ErrorStateFilter):
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
-                    told = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
-                    account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *told)
+                    of_row = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
+                    account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_row)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
@@ -122,9 +124,9 @@ class KalmanEstimator(ErrorStateFilter):
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
         y, g = work(count, self.model.width)
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            told = bank.bank, *bank.table[:3], aid.t_ns, *bank.of(aid)
+            of_row = bank.bank, *bank.table[:3], aid.t_ns, *bank.of(aid)
             space = np.empty(count * bank.columns, dtype=np.float32)
-            account_for(self.nav, self.step, h, r, y, g, fused, *told, space, bank.found)
+            account_for(self.nav, self.step, h, r, y, g, fused, *of_row, space, bank.found)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

@@ -311,7 +311,7 @@ class Screened(NamedTuple):
 
 
 def screened(
-    aid: Linearised, rows: Innovation, model: Model, threshold: float, cov: Array, dx: Array
+    measurement: Linearised, rows: Innovation, model: Model, threshold: float, cov: Array, dx: Array
 ) -> Screened:
     """Update by rows of a screened aid, without touching `cov` and `dx`.
 
@@ -321,7 +321,7 @@ def screened(
     """
     z, h, r = rows
     offsets = model.slots_of(CLOCK_OFFSET)
-    renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
+    renew = bool(offsets) and bool(getattr(measurement, "clock_reset", False))
     while True:
         if renew:
             cov[offsets] = 0.0

@@ -73,12 +73,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.estimators.aid_run import UNDOUBTED, Axes
 from fusiond.estimators.antenna_place import antenna_slots
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
+from fusiond.estimators.row_kernels import UNDOUBTED, Axes
 from fusiond.estimators.tilt_axes_carried import (
     ESTIMATE_SIZE,
     carry_over_all,
@@ -111,9 +111,9 @@ class TiltAxesFilter(KalmanEstimator):
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
         self._slots = self._biases[0]
         self._gyros = gyro_slots(model) if known else self._slots
-        self._lever, self._late = antenna_slots(model)
+        self._lever, self._time = antenna_slots(model)
         self._astray = self._lever.size > 0
-        self._runs = self._new_run(Axes(self._biases, self._gyros, self._lever, self._late))
+        self._runs = self._new_run(Axes(self._biases, self._gyros, self._lever, self._time))
         self.undoubted = True
         if known:
             self.kernel_options |= TURN_TILT
@@ -157,9 +157,9 @@ class TiltAxesFilter(KalmanEstimator):
     def release(self) -> None:
         """Feed back what was carried."""
         before = self._estimate()
-        apart = self._astray or may_part(self._covariance, self._slots)
+        carries = self._astray or may_part(self._covariance, self._slots)
         super().release()
-        if apart:
+        if carries:
             self._carry_over(before)
 
     def _estimate(self) -> Array:
@@ -185,7 +185,7 @@ class TiltAxesFilter(KalmanEstimator):
     @property
     def _kept(self) -> tuple[Indices, Indices, Indices]:
         gyros = self._gyros if self._keeps_turn else self._gyros[:0]
-        return gyros, self._lever, self._late
+        return gyros, self._lever, self._time
 
     def _keep(self, rows: Array, before: Array) -> None:
         """M (n, k) <- T M: what is known of the gyros, and of the antenna's place."""

@@ -19,14 +19,14 @@ import numpy as np
 
 from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.candidates import Candidate
-from fusiond.estimators.aid_run import INNOVATION, JUDGE, KEEP, RESULT
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
+from fusiond.estimators.row_kernels import INNOVATION, JUDGE, KEEP, RESULT
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
-from fusiond.navigator.aid_rows import AidRows, outcome_of, raw_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
+from fusiond.navigator.measurement_rows import MeasurementRows, outcome_of, raw_of
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
 Key = tuple[int, str, int]
@@ -104,7 +104,7 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.diagnosis = Diagnosis(kinds)
         self._isolates = estimator.isolates
-        self._rows = AidRows(estimator)
+        self._rows = MeasurementRows(estimator)
 
     def start(self, used: Collection[Candidate] = ()) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that

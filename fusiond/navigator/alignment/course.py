@@ -169,8 +169,12 @@ def _moved_off(
         max(sd, LEAST_YAW_SD_RAD),
         rate,
         "GNSS course" + (BACKWARD if backward else ""),
-        rest_bias(by.noise, standstill, at_rest, lat),
-        Levelled(at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)),
+        (
+            rest_bias(by.noise, standstill, at_rest, lat),
+            Levelled(
+                at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)
+            ),
+        ),
     )
 
 
@@ -305,17 +309,9 @@ def _on_the_move(
     if ratio < -DECIDED:
         if _reversing(by, velocity):
             return None
-        return _build(
-            by,
-            imu,
-            velocity,
-            place,
-            backward_fit.dcm,
-            LEAST_YAW_SD_RAD,
-            rate,
-            "GNSS course, on the move" + BACKWARD,
-            fitted=_fitted(backward_fit, doubt),
-        )
+        at = by, imu, velocity, place, backward_fit.dcm, LEAST_YAW_SD_RAD, rate
+        how = "GNSS course, on the move" + BACKWARD
+        return _build(*at, how, fitted=_fitted(backward_fit, doubt))
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
     patience = FORWARD_AFTER_S[0 if fast else 1]
@@ -324,17 +320,8 @@ def _on_the_move(
     if ratio < DECIDED and not assumed:
         by.known.doubted(reason("direction", seconds=patience))
         return None
-    return _build(
-        by,
-        imu,
-        velocity,
-        place,
-        forward_fit.dcm,
-        LEAST_YAW_SD_RAD,
-        rate,
-        "GNSS course, on the move",
-        fitted=_fitted(forward_fit, doubt),
-    )
+    at = by, imu, velocity, place, forward_fit.dcm, LEAST_YAW_SD_RAD, rate
+    return _build(*at, "GNSS course, on the move", fitted=_fitted(forward_fit, doubt))
 
 
 def _sd_late_s(by: Basis, velocity: VelocityCandidate) -> float:
@@ -355,11 +342,11 @@ def _build(
     sd_yaw: float,
     rate: Array,
     how: str,
-    bias: tuple[Array, float] | None = None,
-    levelled: Levelled | None = None,
+    rested: tuple[tuple[Array, float], Levelled] | None = None,
     fitted: Fitted | None = None,
 ) -> Start:
-    """With the antenna's velocity taken to the body."""
+    """With the antenna's velocity taken to the body; `rested`: bias and level of a standstill."""
+    bias, levelled = (None, None) if rested is None else rested
     velocity, sd = velocity_of(candidate)
     velocity = velocity - dcm @ np.cross(rate, candidate.lever)
     force = sensed_motion.samples_at(imu, candidate.t_ns)[3:]

@@ -191,7 +191,7 @@ class LatencySearch:
         self.on_time: set[str] = set()
         """Known receivers whose stamps are taken as they are."""
         self.waiting: deque[tuple[str, Sequence[Aid]]] = deque(maxlen=MOST_WAITING)
-        """Aids of receivers that are `on_time`, counted when somebody looks."""
+        """Measurements of receivers that are `on_time`, taken in when somebody looks."""
         self._due_ns = self._fitted_ns = 0
         self._looking: Generator[None, None, Found | None] | None = None
         self._looks: deque[int] = deque(maxlen=MOST_LOOKS)

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, NAMES, SIZE
-from fusiond.estimators.aid_run import (
+from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
+from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
+from fusiond.estimators.row_kernels import (
     BECAME,
     FUSED,
     GATED,
@@ -22,8 +25,6 @@ from fusiond.estimators.aid_run import (
     OF_STATE,
     WHITENED,
 )
-from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
-from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import Series
 from fusiond.navigator.raw_innovation import RawInnovation, of_rows
@@ -39,8 +40,8 @@ _PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZ
 
 @dataclass(slots=True)
 class Span:
-    """Part of a batch that is of one series: its number, instant and value of the last, and at
-    how many the vehicle moved."""
+    """A series' part of a batch: its number, instant and value of the last, and at how many the
+    vehicle moved."""
 
     one: Series
     number: int
@@ -49,37 +50,37 @@ class Span:
     moved: int = 0
 
 
-class AidRows:
+class MeasurementRows:
     """Rows for one estimator; none for one that takes aids one by one."""
 
     def __init__(self, estimator: Estimator) -> None:
         runs = estimator.runs
-        self._bank = None if runs is None else runs.bank
+        self._bank = None if runs is None else estimator.hypotheses
         self._model = estimator.model
         self._known: dict[str, tuple[int, int, int, int]] = {}
         """By source: number of its series, what its rows are and its device, what is asked."""
         self._noise = np.zeros((0, NOISE_SIZE))
         self._spans: dict[str, Span] = {}
 
-    def packed(self, aid: Aid) -> tuple[bytes, object]:
+    def packed(self, measurement: Aid) -> tuple[bytes, object]:
         """An aid's row, empty where it has none, and what a frozen sensor would repeat of it."""
-        packed = None if self._bank is None or aid.robust else aid.packed(self._model)
-        if packed is None:
+        bank = None if measurement.robust else self._bank
+        packed = None if bank is None else measurement.packed(self._model)
+        if bank is None or packed is None:
             return b"", None
-        known = self._known.get(aid.source) or self._new(aid)
+        known = self._known.get(measurement.source) or self._new(measurement, bank)
         kind, rows, body = packed
-        row = HEADER.pack(kind, aid.t_ns, rows, THRESHOLDS[aid.gate, rows], *known)
-        shown = None if aid.constraint else type(aid).shown
-        return row + body + _PADDING[len(body)], None if shown is None else shown(aid)
+        row = HEADER.pack(kind, measurement.t_ns, rows, THRESHOLDS[measurement.gate, rows], *known)
+        shown = None if measurement.constraint else type(measurement).shown
+        return row + body + _PADDING[len(body)], None if shown is None else shown(measurement)
 
-    def _new(self, aid: Aid) -> tuple[int, int, int, int]:
-        """Register the source of an aid: its number, device and rows."""
-        assert self._bank is not None
+    def _new(self, measurement: Aid, bank: Hypotheses) -> tuple[int, int, int, int]:
+        """Constants of an aid's source."""
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))
-        if not aid.constraint:
-            asked = MEASURED if aid.locates else MEASURED | MOTION_ASKED
-        known = self._known[aid.source] = number, *self._bank.of(aid), asked
+        if not measurement.constraint:
+            asked = MEASURED if measurement.locates else MEASURED | MOTION_ASKED
+        known = self._known[measurement.source] = number, *bank.of(measurement), asked
         return known
 
     def batch(
@@ -94,10 +95,10 @@ class AidRows:
             entry = entries[k]
             if not entry.row:
                 break
-            aid, value = entry.aid, entry.value
-            source = aid.source
+            measurement, value = entry.aid, entry.value
+            source = measurement.source
             if source not in spans:
-                one = diagnosis.plain(aid)
+                one = diagnosis.plain(measurement)
                 if one is None:
                     break
                 number = self._known[source][0]
@@ -128,7 +129,7 @@ class AidRows:
 
 
 def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:
-    """Outcome of an aid with a row, by what a run has made of it."""
+    """Outcome of an measurement with a row, by what a run has made of it."""
     became, degrees = int(result[BECAME]), HEADER.unpack_from(row)[2]
     if became == FUSED:
         whitened = tuple(result[WHITENED : WHITENED + degrees])
@@ -141,7 +142,7 @@ def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:
 
 
 def raw_of(result: Sequence[float], degrees: int) -> RawInnovation | None:
-    """Raw innovation of an aid, by what a run has made of it; None where it did not apply."""
+    """Raw innovation of one, by what a run has made of it; None where it did not apply."""
     if degrees == 0:
         return None
     columns = [list(result[at : at + 6]) for at in range(OF_STATE, OF_STATE + 6 * degrees, 6)]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,6 @@ from fusiond.estimators.fault_odds import judge
 from fusiond.estimators.fault_opened import judge_and_widen
 from fusiond.estimators.fault_suspects import any_likely, judge_what_waits
 from fusiond.estimators.gated_update import fold_and_account
-from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import (
     BANK,
     LINE,
@@ -52,7 +51,6 @@ from fusiond.estimators.memory import (
     SUMS_AT,
     WIDER_AT,
     XI_AT,
-    Memory,
 )
 from fusiond.estimators.memory import SIZE as STATES
 from fusiond.estimators.noise_scale import learn
@@ -65,10 +63,8 @@ from fusiond.estimators.tilt_axes_carried import (
     may_part,
     remember_estimate,
 )
-from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import PHI, WIDTHS
-from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 
 Array = NDArray[np.float64]
@@ -85,11 +81,23 @@ DONE, KEEP, JUDGE, OTHERWISE = range(4)
 """Ways in which a call ends: all is done; a checkpoint is due before the next aid; the last one is
 to be judged; the next one is no row of this kernel."""
 KNOWN, TURNED, SETTLES, UNDOUBTED, PLAIN, LARGE, KNOWS = range(7)
-"""Layout of a filter's state beside its memory: 1 if its heading has been known; by how much (rad)
-the last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the
+"""State of a filter beside its memory: 1 if its heading has been known; by how much (rad) the
+last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the
 heading's variances below and above which it is known, and is not."""
-_Y, _Z, _R, _BEFORE, _H = 0, 3, 6, 9, 9 + ESTIMATE_SIZE
+_Y, _Z, _R, _BEFORE, AT_H = 0, 3, 6, 9, 9 + ESTIMATE_SIZE
 """Layout of work space, g behind H."""
+
+
+StateParts = tuple[Array, Array, Array, Array, Array]
+"""Navigation state (10,), parameters (n,), last step, P (w, w), error estimate (n,)."""
+BankParts = tuple[Array, Indices, Array, Array, Array, Single, Array]
+"""Bank, the three parts of its table, `found`, and work space for rows and for what is open."""
+OpenedParts = tuple[Array, Array, Array]
+"""Axes and clock of publication (3,), mounting (2, 2), and what sigmas are wider by (9,)."""
+AxesParts = tuple[Indices, Indices, Indices, Indices]
+"""Parts of `Axes`."""
+ModelParts = tuple[Indices, Array, bool]
+"""Columns of the states, their sigmas at the start (n,), whether height is held."""
 
 
 class Axes(NamedTuple):
@@ -99,54 +107,38 @@ class Axes(NamedTuple):
     biases: Indices
     gyros: Indices
     lever: Indices
-    late: Indices
+    time: Indices
 
 
 NO_AXES = Axes(np.zeros((2, 0), dtype=np.int64), *(np.zeros(0, dtype=np.int64),) * 3)
 
 
-class Ran(NamedTuple):
-    """Number of aids that are done, `DONE` or why there are no more, and results (k, RESULT)."""
+_STATE = "Tuple((f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1]))"
+_BANK = "Tuple((f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f4[::1], f8[::1]))"
+_OPENED = "Tuple((f8[::1], f8[:, ::1], f8[::1]))"
+_MODEL = "Tuple((i8[::1], f8[::1], b1))"
+_AXES = "Tuple((i8[:, ::1], i8[::1], i8[::1], i8[::1]))"
 
-    done: int
-    how: int
-    results: Array
 
-
-@compiled(
-    "void(b1, i8, i8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[::1],"
-    " f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
-)
+@compiled(f"void(b1, b1, {_STATE}, {_BANK}, {_OPENED})")
 def conclude(
-    later: bool,
-    next_: int,
-    aids: Indices,
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    lanes: Array,
-    n: int,
-    nav: Array,
-    xi: Array,
-    step: Array,
-    published: Array,
-    mounting: Array,
-    work: Array,
-    wider: Array,
-    found: Array,
+    later: bool, waits: bool, state: StateParts, of_bank: BankParts, opened: OpenedParts
 ) -> None:
-    """Judge what waits for it, before the `next_` of `aids`; what is open of what is published is
-    said `later`, or now. Odds that nobody reads before they are others wait."""
+    """Judge what waits for it; what is open of what is published is said `later`, or now. It
+    `waits` where nobody reads odds before they are others."""
+    nav, xi, step, _, dx = state
+    bank, ints, numbers, lanes, found, _, work = of_bank
     judge_what_waits(bank, ints, numbers, lanes, found)
     epoch_s = bank[UNJUDGED]
     if epoch_s < np.inf:
-        if later and aids[next_, KIND] <= VELOCITY and not any_likely(bank, lanes):
+        if waits and not any_likely(bank, lanes):
             bank[UNJUDGED], bank[UNWEIGHED] = np.inf, epoch_s
         elif later:
             judge(bank, ints, numbers, lanes, epoch_s, found)
         else:
+            published, mounting, wider = opened
             judge_and_widen(
-                *(bank, ints, numbers, lanes, n, epoch_s, True, True),
+                *(bank, ints, numbers, lanes, dx.shape[0], epoch_s, True, True),
                 *(nav, xi, step, published, mounting, work, wider, found),
             )
 
@@ -163,60 +155,88 @@ def _said_later(ints: Indices, first: int, until_ns: int) -> bool:
     return False
 
 
+@compiled(f"void({_STATE}, f8[::1], {_AXES}, f8[::1], f8[::1])", allocates=True)
+def _carry_over(
+    state: StateParts, bank: Array, axes: AxesParts, before: Array, knows: Array
+) -> None:
+    """P and V after an update of an estimate `before`, as fusiond.estimators.tilt_axes says."""
+    nav, xi, step, cov, dx = state
+    biases, gyros, lever, time = axes
+    n, width = dx.shape[0], cov.shape[1]
+    kept = gyros if knows[UNDOUBTED] > 0.0 and step[STEP_RESTS_S] == 0.0 else gyros[:0]
+    turned = carry_over_all(cov[:n, :n], before, nav, xi, biases, kept, lever, time)
+    knows[TURNED] = turned
+    at = int(bank[BANK_PHI])
+    phi = bank[at : at + width * width].reshape((width, width))
+    carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, time)
+    bank[WAITS] = 1.0
+    settle(bank, n)
+
+
+@compiled(f"i8(i8[::1], f8[::1], {_STATE}, {_BANK}, {_OPENED}, f8[::1])")
+def _judged(
+    of: Indices,
+    y: Array,
+    state: StateParts,
+    of_bank: BankParts,
+    opened: OpenedParts,
+    noise: Array,
+) -> int:
+    """`JUDGE` of a fused measurement whose odds cannot wait; else `DONE`, its innovation y learned
+    from."""
+    nav, xi, step, _, dx = state
+    bank, ints, numbers, lanes, found, _, work = of_bank
+    m, t_s = of[ROWS], of[T_NS] * 1e-9
+    if of[ASKED] & MEASURED:
+        if bank[SUSPECTS] != 0.0:
+            return JUDGE
+        bank[UNJUDGED] = t_s
+        learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
+    else:
+        published, mounting, wider = opened
+        judge_and_widen(
+            *(bank, ints, numbers, lanes, dx.shape[0], t_s, False, True),
+            *(nav, xi, step, published, mounting, work, wider, found),
+        )
+    return DONE
+
+
 @compiled(
-    "i8(f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], i8[:, ::1],"
-    "f8[:, ::1], f8[::1], i8[::1], b1, f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[:, ::1],"
-    "f8[::1], f8[::1], f8[::1], f8[::1], f4[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
+    f"i8(f8[::1], {_STATE}, {_BANK}, {_OPENED}, {_MODEL}, {_AXES}, f8[::1], f8[::1], f8[::1],"
+    " f8[::1])",
     allocates=True,
 )
-def take_aid(
+def fold_row(
     x: Array,
-    of: Indices,
-    nav: Array,
-    xi: Array,
-    step: Array,
-    cov: Array,
-    dx: Array,
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    lanes: Array,
-    column_of: Indices,
-    hold_height: bool,
-    initial: Array,
-    biases: Indices,
-    gyros: Indices,
-    lever: Indices,
-    late: Indices,
-    mounting: Array,
-    published: Array,
-    wider: Array,
+    state: StateParts,
+    of_bank: BankParts,
+    opened: OpenedParts,
+    model: ModelParts,
+    axes: AxesParts,
     noise: Array,
     work: Array,
-    of_rows: Single,
-    bank_work: Array,
     knows: Array,
-    found: Array,
     result: Array,
 ) -> int:
-    """Fold in the aid of a row `x`, as integers `of`, at its instant; its series has that `noise`;
-    write `result` (RESULT,). `DONE`, or `JUDGE`, or `OTHERWISE` with nothing done."""
+    """Fold in the measurement of a row `x` at its instant, whose series has that `noise`; write
+    `result` (RESULT,). `DONE`, or `JUDGE`, or `OTHERWISE` with nothing done."""
+    nav, xi, step, cov, dx = state
+    bank, ints, numbers, lanes, found, of_rows, _ = of_bank
+    of = x.view(np.int64)
     n, width, m = dx.shape[0], cov.shape[1], of[ROWS]
-    p = cov[:n, :n]
     heading = cov[PHI + 2, PHI + 2]
     if knows[SETTLES] > 0.0:
         if knows[KNOWN] > 0.0 and heading > knows[LARGE]:
             return OTHERWISE
         if heading < knows[PLAIN]:
             knows[KNOWN] = 1.0
-    measured, t_s = (of[ASKED] & MEASURED) != 0, of[T_NS] * 1e-9
     result[NIS], result[MOVES] = np.nan, 0.0
     if of[ASKED] & MOTION_ASKED:
-        result[MOVES] = surely_moves(cov, nav, step, published, np.zeros(WIDER))
+        result[MOVES] = surely_moves(cov, nav, step, opened[0], np.zeros(WIDER))
     y, z, r = work[_Y : _Y + m], work[_Z : _Z + m], work[_R : _R + m]
-    before, h = work[_BEFORE:_H], work[_H : _H + m * n].reshape((m, n))
-    g = work[_H + LENT_ROWS * n : _H + LENT_ROWS * n + m * width].reshape((m, width))
-    applies = packed_rows(x, of, nav, xi, step, column_of, hold_height, initial, p, z, h, r)
+    h = work[AT_H : AT_H + m * n].reshape((m, n))
+    g = work[AT_H + LENT_ROWS * n : AT_H + LENT_ROWS * n + m * width].reshape((m, width))
+    applies = packed_rows(x, (nav, xi, step), model, cov[:n, :n], z, h, r)
     result[BECAME], knows[TURNED] = applies, 0.0
     if applies != APPLIES:
         return DONE
@@ -225,9 +245,10 @@ def take_aid(
         result[INNOVATION + a] = z[a]
         for i in range(6):
             result[OF_STATE + 6 * a + i] = h[a, 3 + i]
-    apart = lever.size > 0 or may_part(p, biases[0])
-    if apart:
-        remember_estimate(nav, xi, biases, gyros, lever, before)
+    before = work[_BEFORE:AT_H]
+    carried = axes[2].size > 0 or may_part(cov[:n, :n], axes[0][0])
+    if carried:
+        remember_estimate(nav, xi, axes[0], axes[1], axes[2], before)
     nis = fold_and_account(
         *(nav, xi, step, cov, dx, z, h, r, x[GATE], y, g, bank, ints, numbers, lanes),
         *(of[T_NS], of[MEASURES], of[OF_DEVICE], of_rows, found),
@@ -239,32 +260,14 @@ def take_aid(
     result[BECAME] = FUSED
     for a in range(m):
         result[WHITENED + a] = y[a]
-    if apart:
-        undoubted = knows[UNDOUBTED] > 0.0 and step[STEP_RESTS_S] == 0.0
-        kept = gyros if undoubted else gyros[:0]
-        turned = carry_over_all(p, before, nav, xi, biases, kept, lever, late)
-        knows[TURNED] = turned
-        at = int(bank[BANK_PHI])
-        phi = bank[at : at + width * width].reshape((width, width))
-        carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, late)
-        bank[WAITS] = 1.0
-        settle(bank, n)
-    if not measured:
-        judge_and_widen(
-            *(bank, ints, numbers, lanes, n, t_s, False, True),
-            *(nav, xi, step, published, mounting, bank_work, wider, found),
-        )
-        return DONE
-    if bank[SUSPECTS] != 0.0:
-        return JUDGE
-    bank[UNJUDGED] = t_s
-    learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
-    return DONE
+    if carried:
+        _carry_over(state, bank, axes, before, knows)
+    return _judged(of, y, state, of_bank, opened, noise)
 
 
 @cache
 def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
-    """`run` for covariances of `width` rows."""
+    """`run_rows` for covariances of `width` rows."""
     propagate, square = propagate_for(width), width * width
 
     @compiled(
@@ -274,10 +277,10 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
         variant=width,
         allocates=True,
     )
-    def run(
+    def run_rows(
         state: Array,
         imu: Array,
-        aids: Array,
+        measurements: Array,
         results: Array,
         series: Array,
         ints: Indices,
@@ -288,7 +291,7 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
         biases: Indices,
         gyros: Indices,
         lever: Indices,
-        late: Indices,
+        time: Indices,
         mounting: Array,
         work: Array,
         of_rows: Single,
@@ -303,41 +306,43 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
         kept_ns: int,
         every_ns: int,
     ) -> tuple[int, int, int, int]:
-        """Run the filter over `aids` (k, SIZE) with the noise of their `series` (s, .), from `now`
-        and the next `sample`, and on to the first that comes `every_ns` after the last checkpoint;
-        next sample, new time, number of aids done and how it ended."""
+        """Run the filter over `measurements` (k, SIZE), with the noise of their `series` (s, .).
+
+        It goes from `now` and the next `sample` on to the first that comes `every_ns` after the
+        last checkpoint. Next sample, new time, number of rows done and how it ended.
+        """
         head = state[:LINE].view(np.int64)
         n, room = head[STATES], head[ROOM]
-        wider, published = state[WIDER_AT : WIDER_AT + WIDER], state[PUBLISHED_AT:WIDER_AT]
-        nav, step = state[NAV_AT:STEP_AT], state[STEP_AT:SUMS_AT]
-        xi, dx = state[XI_AT : XI_AT + n], state[XI_AT + n : XI_AT + 2 * n]
         upto = XI_AT + n + room * n
         rest = state[(upto + LINE - 1) // LINE * LINE :]
-        cov = rest[:square].reshape((width, width))
         bank = rest[room * square : room * square + head[BANK]]
-        of_all = aids.view(np.int64)
+        parts = (
+            state[NAV_AT:STEP_AT],
+            state[XI_AT : XI_AT + n],
+            state[STEP_AT:SUMS_AT],
+            rest[:square].reshape((width, width)),
+            state[XI_AT + n : XI_AT + 2 * n],
+        )
+        of_bank = bank, ints, numbers, lanes, found, of_rows, bank_work
+        opened = state[PUBLISHED_AT:WIDER_AT], mounting, state[WIDER_AT : WIDER_AT + WIDER]
+        model, axes = (column_of, initial, hold_height), (biases, gyros, lever, time)
+        of_all = measurements.view(np.int64)
         recorded, i = (options & RECORD) != 0, 0
-        while i < aids.shape[0]:
-            x, of = aids[i], of_all[i]
+        while i < measurements.shape[0]:
+            of = of_all[i]
             later = not recorded and _said_later(of_all, i, kept_ns + every_ns)
+            waits = later and of[KIND] <= VELOCITY
             if of[T_NS] > now or passing:
-                conclude(
-                    *(later, i, of_all, bank, ints, numbers, lanes, n, nav, xi, step, published),
-                    *(mounting, bank_work, wider, found),
-                )
+                conclude(later, waits, parts, of_bank, opened)
                 sample, now = propagate(state, imu, sample, now, of[T_NS], options)
                 passing = False
                 if now - kept_ns >= every_ns:
                     return sample, now, i, KEEP
             if not of[ASKED] & MEASURED:
-                conclude(
-                    *(later, i, of_all, bank, ints, numbers, lanes, n, nav, xi, step, published),
-                    *(mounting, bank_work, wider, found),
-                )
-            how = take_aid(
-                *(x, of, nav, xi, step, cov, dx, bank, ints, numbers, lanes, column_of),
-                *(hold_height, initial, biases, gyros, lever, late, mounting, published, wider),
-                *(series[of[SERIES]], work, of_rows, bank_work, knows, found, results[i]),
+                conclude(later, waits, parts, of_bank, opened)
+            how = fold_row(
+                *(measurements[i], parts, of_bank, opened, model, axes),
+                *(series[of[SERIES]], work, knows, results[i]),
             )
             if how == OTHERWISE:
                 return sample, now, i, OTHERWISE
@@ -346,53 +351,8 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
                 return sample, now, i, JUDGE
         return sample, now, i, DONE
 
-    return run
+    return run_rows
 
 
 for _width in WIDTHS:
     run_for(_width)
-
-
-class Filter(Protocol):
-    """State that a run moves on, of a filter beside its memory."""
-
-    t_ns: int
-    sample: int
-    passing: bool
-    turned: float
-    kernel_options: int
-
-
-class AidRun:
-    """`run` of one filter: its memory, its bank and its axes, with what it `knows` (KNOWS,)."""
-
-    def __init__(
-        self,
-        filter_: Filter,
-        memory: Memory,
-        model: Model,
-        bank: Hypotheses,
-        axes: Axes,
-        knows: Array,
-    ) -> None:
-        work = np.zeros(_H + LENT_ROWS * (model.size + model.width))
-        self._filter, self._memory, self._kernel = filter_, memory.array, run_for(model.width)
-        self._given = (
-            *(*bank.table[:3], model.column_of, model.initial, *axes),
-            *(bank.mounting, work, bank.rows, bank.work, knows, bank.found),
-        )
-        self._hold_height, self._knows, self.bank = model.hold_height, knows, bank
-
-    def __call__(
-        self, imu: ImuBuffer, aids: Array, series: Array, record: bool, kept: tuple[int, int]
-    ) -> Ran:
-        """Fold in packed `aids` (k, SIZE) with the noise of their `series` (s, .), each at its
-        instant; `kept`: when (ns) the last checkpoint was, and after what time the next is due."""
-        f, results = self._filter, np.empty((len(aids), RESULT))
-        options = f.kernel_options | (RECORD if record else 0)
-        f.sample, f.t_ns, done, how = self._kernel(
-            *(self._memory, imu.packed, aids, results, series, *self._given),
-            *(f.sample, f.t_ns, options, self._hold_height, f.passing, *kept),
-        )
-        f.passing, f.turned = False, self._knows.item(TURNED)
-        return Ran(done, how, results)
