@@ -151,7 +151,7 @@ class Vibration:
         self._memory = np.zeros((LEVELS, 6, 6))
         self._lately = np.zeros((6, PARTS + 1, _PART_SIZE))
         self.shares = FromInstants()
-        """Which share of the density of each axis (6,) is noise."""
+        """Share of the density of each axis (6,) that is noise."""
         self.shaken = False
         """True if the last samples have shown more than the sheet's."""
 
