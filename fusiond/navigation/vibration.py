@@ -156,8 +156,10 @@ class Vibration:
         """True if the last samples have shown more than the sheet's."""
 
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
-        """Write to `densities` (m, 6) that beyond the sheet's, (rad/s)^2/Hz and (m/s^2)^2/Hz, after
-        each of samples (m, 6), rate and force of the same axes, at `times` (m,) ns."""
+        """Write to `densities` (m, 6) the noise beyond the sheet's.
+
+        After each of samples (m, 6), rate and force of the same axes, at `times` (m,) ns;
+        (rad/s)^2/Hz and (m/s^2)^2/Hz."""
         of_axes = self._sheet, self._memory, self._lately
         _follow(samples, self._period_s, MEMORY_S, *of_axes, densities)
         self.shaken = bool(densities[-1].any())

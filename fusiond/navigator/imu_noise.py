@@ -1,4 +1,4 @@
-"""Noise of an inertial unit, as it shows while it navigates, and how much of it counts.
+"""Noise of an inertial unit as its navigation shows it.
 
 Which share of what the samples show is noise (fusiond.navigator.noise_share), and how good the unit
 is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was

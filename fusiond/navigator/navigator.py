@@ -152,7 +152,7 @@ class Navigator:
             self._imu_noise.take_up(self.imu, noise.predictions, noise.shares)
 
     def shown_noise(self, utc_s: float | None) -> SavedNoise:
-        """Noise of receivers and the inertial unit, as shown until that time (POSIX)."""
+        """Noise of receivers and inertial unit as shown until that time (POSIX)."""
         return SavedNoise(utc_s, self._intake.fixes_shown, *self._imu_noise.shown)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:

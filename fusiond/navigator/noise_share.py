@@ -57,8 +57,8 @@ HEADING_SD_RAD = math.radians(5.0)
 FORGETS = 60.0
 """Predictions, ten minutes of them: streets and loads change."""
 FIRST = 2.0
-"""Number of predictions that the prior counts for, that all is noise, before any has been judged:
-a filter that has once been too sure of its tilt stays so."""
+"""Predictions that it counts that all is noise, before any has been judged: a filter that has once
+been too sure of its tilt stays so."""
 RARE = 25.0
 """Five sigma: what is beyond is no noise."""
 _NOTHING = 1e18
@@ -99,12 +99,11 @@ class NoiseShares:
         self._counted = [(0, np.ones(3))]
         """From when on (ns) which shares count, those that a prediction may still be made of."""
         self._begins_ns = -1
-        """Instant at which the present prediction began; -1 where none is."""
+        """Begin of the prediction that is under way; -1 where none is."""
 
     @property
     def shown(self) -> tuple[float, tuple[float, ...]]:
-        """Number of predictions judged, and the log likelihoods of `GRID` of each axis,
-        for the next start."""
+        """Number of predictions, and log likelihoods of `GRID` of each axis, for the next start."""
         log = self._log - self._log.max(axis=1, keepdims=True)
         return self._count, tuple(log.ravel().tolist())
 
@@ -135,25 +134,25 @@ class NoiseShares:
     def end(self, e: Estimator) -> Array | None:
         """Judge the prediction by the filter's state at its end; the shares (6,) that count after
         `COUNTS_NS`, None where it has told nothing."""
-        p, begun_ns = self._predictor, self._begins_ns
+        p, since_ns = self._predictor, self._begins_ns
         self._begins_ns = -1
-        if begun_ns < 0 or e.t_ns - begun_ns != EVERY_NS or p.t_ns != e.t_ns:
+        if since_ns < 0 or e.t_ns - since_ns != EVERY_NS or p.t_ns != e.t_ns:
             return None
         level = _level_axes(e.nav)
-        apart = level @ (p.nav[VN : VN + 3] - e.nav[VN : VN + 3])
+        error = level @ (p.nav[VN : VN + 3] - e.nav[VN : VN + 3])
         known, without, whole = (
             np.diagonal(level @ each @ level.T)
             for each in (e.covariance[_VELOCITY, _VELOCITY], *p.of_velocity)
         )
         if known.sum() > KNOWN * whole.sum():
             return None
-        counted = next(shares for at, shares in reversed(self._counted) if at <= begun_ns)
+        counted = next(shares for at, shares in reversed(self._counted) if at <= since_ns)
         of_noise = (whole - without) / counted
         variance = (without - known)[:, None] + of_noise[:, None] * GRID
         variance = np.maximum(variance, known[:, None])
         kept = 1.0 - 1.0 / FORGETS
         self._log *= kept
-        squares = np.minimum(apart[:, None] ** 2 / variance, RARE)
+        squares = np.minimum(error[:, None] ** 2 / variance, RARE)
         self._log -= 0.5 * (np.log(variance) + squares)
         self._count = kept * self._count + 1.0
         shares = self._shares()

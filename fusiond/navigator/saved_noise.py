@@ -1,4 +1,4 @@
-"""Noise that a drive has shown, for the next start, where it counts less, and less with age.
+"""Noise that a drive has shown, for the next start: it counts less then, and less with age.
 
 Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
 divide (fusiond.aiding.fix_errors), and which share of what the samples show is noise
@@ -41,7 +41,8 @@ class SavedNoise:
     shares: Shown
 
     def at(self, now_utc_s: float | None) -> SavedNoise:
-        """Share of it that counts for a start then; of unknown age, as much as of a week."""
+        """The part that counts for a start at that time; where nobody knows how old it is, as of a
+        week."""
         age_s = FADES_S
         if now_utc_s is not None and self.utc_s is not None:
             age_s = max(now_utc_s - self.utc_s, 0.0)

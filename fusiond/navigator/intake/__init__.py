@@ -92,7 +92,7 @@ class Intake:
 
     @property
     def fixes_shown(self) -> dict[str, tuple[float, ...]]:
-        """Errors that each receiver's fixes have shown, for the next start."""
+        """Sums of each receiver's fixes about their errors, for the next start."""
         return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
 
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:

@@ -54,7 +54,7 @@ class Sections:
         self.fix_errors: dict[tuple[str, bool], FixErrors] = {}
         """Of each receiver whose fixes share an error, by code or by phase."""
         self.fixes_shown: Mapping[str, tuple[float, ...]] = {}
-        """Errors that another drive has shown, by `shown_as`."""
+        """The same of another drive, by `shown_as`."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
