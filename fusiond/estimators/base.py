@@ -71,28 +71,18 @@ def gate_threshold(probability: float, degrees: int) -> float:
     return THRESHOLDS[probability, degrees]
 
 
-class Looked(NamedTuple):
-    """An innovation that was not fused: z (m,), H (m, n), r (m,), and the covariance (n, n) of what
-    is published."""
-
-    z: Array
-    h: Array
-    r: Array
-    covariance: Array
-
-
 class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
     L^-1 nu with S = L L^T). `rows`: of a screened aid, what became of each row
-    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `looked`: of one
-    that is out, and not screened, all of it."""
+    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
+    that is out, the NIS if each of the faults for which it may be out lasts."""
 
     name: str
     nis: float = float("nan")
     degrees: int = 0
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
-    looked: Looked | None = None
+    lasting: tuple[float, ...] = ()
 
 
 class Snapshot(NamedTuple):
@@ -172,9 +162,9 @@ class Estimator(Protocol):
         """Fold one aid in, or name why not; the variances of its rows, up to three, count `noise`
         times (3,)."""
 
-    def look(self, aid: Linearised) -> Outcome:
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
-        in."""
+        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -353,9 +343,9 @@ class ErrorStateFilter:
         anew, in `cov` too."""
         return screened(aid, rows, self.model, gate_threshold(aid.gate, 1), cov, dx)
 
-    def look(self, aid: Linearised) -> Outcome:
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
-        in."""
+        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -367,10 +357,13 @@ class ErrorStateFilter:
             s = self._screen(aid, rows, cov, dx)
             codes = tuple(s.codes.tolist())
             return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
-        y, nu = np.zeros(z.shape[0]), z - h @ dx
-        nis = normalised_innovation_squared(cov, nu, h, r, y)
-        looked = Looked(nu, h.copy(), r.copy(), cov)
-        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), looked)
+        y = np.zeros(z.shape[0])
+        nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
+        if lasting is None:
+            return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
+        lefts = [z - h @ dx - added[: z.shape[0]] for added in lasting]
+        lasts = tuple(normalised_innovation_squared(cov, nu, h, r, y.copy()) for nu in lefts)
+        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts)
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""

@@ -64,7 +64,7 @@ its own turn to begin anew has come: twenty to one."""
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
 attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,
-from the start on; of what a source's fault has done to the filter."""
+from the start on; of what a source's faults, as they are weighed, have done to the filter."""
 POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(4, 12)
 """Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
 positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's

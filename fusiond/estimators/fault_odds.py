@@ -237,8 +237,6 @@ def _odds(
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
         if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
             by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
-            if ints[kind, SIGNATURE] == FOLLOWED and m[9] <= 0.0:
-                bank[at + UNEXPLAINED] = np.inf  # it goes on, and is not over
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -250,9 +248,7 @@ def _odds(
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
-    """By how much a group is ahead of those of a kind; infinite where nobody need choose. That a
-    fault is over says the opposite of any that begins: who accuses a source has to be as sure that
-    it is not that as that anything is wrong."""
+    """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
     own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
@@ -270,8 +266,6 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
     if fit > 0.0 and not alike:
         missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
-    if ints[kind, SIGNATURE] == FOLLOWED:
-        ahead -= DECIDED - APART
     return ahead
 
 

@@ -1,15 +1,9 @@
 r"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
 
 As fusiond.estimators.fault_bank says. One of them is that a source's fault is over, which the
-filter has followed: its error is then what the likeliest of those faults has done to it, V_f b_f
-with b_f ~ N(b, M), and as likely to begin as all of them together. Its three numbers c are of unit
-variance,
+filter has followed: its error is then what those faults f have done to it, as they are weighed,
 
-    V = V_f B,   B B^T = b b^T + M,   B = [b sqrt(1 + 1 / x), R],   x = b^T M^-1 b
-    R R^T = M - b b^T / x                                                           of rank two
-
-so that the first is the share of what the fault is estimated to have done, and the others are what
-the estimate leaves open beside it.
+    V = sum w_f V_f b_f / w,   w = sum w_f,   which is as likely to begin as w
 """
 
 from __future__ import annotations
@@ -24,10 +18,6 @@ from fusiond.estimators.fault_bank import (
     ANY_FAULT,
     BEGINS_AT,
     COUNTS_BY,
-    E1,
-    E2,
-    E_AT,
-    EXPLAINED,
     FOLLOWED,
     LANES,
     LEVEL_OF,
@@ -75,53 +65,27 @@ COUNTS = 1e-3
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
 def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Array) -> None:
-    """Write what a source's fault has done to the filter, V (3, n) row by row, and behind it the
-    weight of all of them."""
+    """Write what faults of sources have done to the filter (n,), and behind it their weight."""
     followed[:] = 0.0
     if not bank[ANY_FAULT] > COUNTS:
         return
-    likeliest, most = -1, 0.0
-    for number in range(int(bank[ALL])):
-        weight = bank[group_at(bank, number) + WEIGHT]
-        if ints[number // RESTARTS, SIGNATURE] <= FOLLOWED or weight < COUNTS:
-            continue
-        followed[3 * n] += weight
-        explains = weight * bank[group_at(bank, number) + EXPLAINED]
-        if explains > most:
-            likeliest, most = number, explains
-    if likeliest < 0:
-        return
-    at, size = group_at(bank, likeliest), 3 if likeliest < int(bank[THREES]) else 1
-    m, of = np.empty(12), np.zeros((3, 3))
-    solve(bank, at, size, numbers[likeliest // RESTARTS], 1.0, m)
-    # M^-1 b is e where no mean is expected, as of three numbers.
-    x = m[9] * m[9] / m[0]
-    if size == 3:
-        x = m[9] * bank[at + E_AT] + m[10] * bank[at + E1] + m[11] * bank[at + E2]
-    x = max(x, 1e-9)
-    for i in range(size):
-        of[i, 0] = m[9 + i] * math.sqrt(1.0 + 1.0 / x)
-        for j in range(size):
-            m[3 * i + j] -= m[9 + i] * m[9 + j] / x
-    for c in range(1, size):  # what is left, by its largest variance first
-        k = 0
-        for i in range(1, size):
-            if m[4 * i] > m[4 * k]:
-                k = i
-        if m[4 * k] <= 0.0:
-            break
-        for i in range(size):
-            of[i, c] = m[3 * i + k] / math.sqrt(m[4 * k])
-        for i in range(size):
-            for j in range(size):
-                m[3 * i + j] -= of[i, c] * of[j, c]
-    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
+    v, m = bank[int(bank[SENSITIVITIES]) :].view(np.float32), np.empty(12)
     columns = v.shape[0] // n
-    for d in range(size):
-        first = column_of(bank, likeliest, d)
+    for number in range(int(bank[ALL])):
+        kind, at = number // RESTARTS, group_at(bank, number)
+        weight = bank[at + WEIGHT]
+        if ints[kind, SIGNATURE] <= FOLLOWED or weight < COUNTS:
+            continue
+        size = 3 if number < int(bank[THREES]) else 1
+        solve(bank, at, size, numbers[kind], 1.0, m)
+        followed[n] += weight
         for c in range(size):
+            first = column_of(bank, number, c)
             for i in range(n):
-                followed[c * n + i] += of[d, c] * v[first + i * columns]
+                followed[i] += weight * m[9 + c] * v[first + i * columns]
+    if followed[n] > 0.0:
+        for i in range(n):
+            followed[i] /= followed[n]
 
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8, f8[::1], f8[::1], f8[::1])")
@@ -137,7 +101,7 @@ def _begin_group(
     followed: Array,
 ) -> None:
     """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`;
-    `followed` (3 n + 1,) as `_followed` leaves it."""
+    `followed` (n + 1,) as `_followed` leaves it."""
     number, size = RESTARTS * kind + restart, ints[kind, SIZE]
     at = group_at(bank, number)
     for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
@@ -145,7 +109,7 @@ def _begin_group(
     bank[at + ONSET] = t_s
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     if ints[kind, SIGNATURE] == FOLLOWED:
-        bank[at + COUNTS_BY] = math.log(max(followed[3 * n], UNLIKELY))
+        bank[at + COUNTS_BY] = math.log(max(followed[n], UNLIKELY))
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     for c in range(size):
@@ -175,7 +139,7 @@ def _begin_group(
                     v[first + slots[j] * columns] = -1.0
         elif of == FOLLOWED:
             for i in range(n):
-                v[first + i * columns] = followed[c * n + i]
+                v[first + i * columns] = followed[i]
 
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])", allocates=True)
@@ -185,7 +149,7 @@ def begin_all(
     """Begin all hypotheses anew; what the path was remains."""
     begin_transition(bank, n, width)
     bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED], bank[UNWEIGHED] = 0.0, 0.0, np.inf, np.inf
-    followed = np.zeros(3 * n + 1)
+    followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
             _begin_group(bank, ints, n, kind, restart, t_ns * 1e-9, nav, step, followed)
@@ -233,7 +197,7 @@ def begin_again(
     step: Array,
 ) -> None:
     """Begin those hypotheses anew that are of rows which return to service."""
-    followed = np.zeros(3 * n + 1)
+    followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         if concerns(ints, kind, measures, device):
             for restart in range(RESTARTS):
@@ -253,7 +217,7 @@ def restart_due(
         if bank[RESTARTED + level] != turn:
             bank[RESTARTED + level] = turn
             if followed.shape[0] == 0:
-                followed = np.zeros(3 * n + 1)
+                followed = np.zeros(n + 1)
                 _followed(bank, ints, numbers, n, followed)
             slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +19,7 @@ from fusiond.estimators.fault_bank import (
     column_of,
     group_at,
 )
-from fusiond.estimators.fault_odds import APART, judge, solve
+from fusiond.estimators.fault_odds import judge, solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, keep_fed_back, sensitivity_rows
 from fusiond.estimators.fault_suspects import judge_what_waits, restarts
@@ -32,9 +30,6 @@ Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
-AMBIGUOUS = 1.0 / (1.0 + math.exp(APART))
-"""Probability of a story from which on another is not `APART` ahead of it."""
-
 
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f4[::1])", allocates=True)
 def nis_if_sensors_fail(
@@ -42,10 +37,10 @@ def nis_if_sensors_fail(
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
     and those of sources that are over leave open, as they are weighed; `work` as
-    `sensitivity_rows` leaves it. Infinite unless they are likelier than all else together, or what
-    is over is so likely that nobody can be accused instead."""
+    `sensitivity_rows` leaves it. Infinite unless they are likelier than all else
+    together."""
     rows = y.shape[0]
-    c, m, likely, over = np.eye(rows), np.empty(12), 0.0, 0.0
+    c, m, likely = np.eye(rows), np.empty(12), 0.0
     for number in range(int(bank[ALL])):
         kind, at = number // RESTARTS, group_at(bank, number)
         weight = bank[at + WEIGHT]
@@ -53,8 +48,6 @@ def nis_if_sensors_fail(
         if not ours or weight < LEAST_WEIGHT:
             continue
         likely += weight
-        if ints[kind, SIGNATURE] == FOLLOWED:
-            over += weight
         size = ints[kind, SIZE]
         solve(bank, at, size, numbers[kind], 1.0, m)
         for a in range(rows):
@@ -65,7 +58,7 @@ def nis_if_sensors_fail(
                         x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
                         s_b = work[b * columns + column_of(bank, number, j)]
                         c[a, b] += s_a * s_b * x
-    if likely < 0.5 and over < AMBIGUOUS:
+    if likely < 0.5:
         return np.inf
     # y^T C^-1 y by elimination.
     left, nis = y.copy(), 0.0

@@ -88,10 +88,10 @@ class SeparatedEstimator(KalmanEstimator):
     def _renew(self, renewal: Renewal) -> None:
         """Nothing more: `update` does it before it linearises."""
 
-    def look(self, aid: Linearised) -> Outcome:
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is
         published changes. The subsets judge for themselves: there the aid may be the sound one."""
-        outcome = super().look(aid)
+        outcome = super().look(aid, lasting)
         innovation = self._linearise(aid)
         if not isinstance(innovation, NotApplicable):
             self._fold_into_subsets(aid, innovation)

@@ -71,6 +71,8 @@ TOGETHER = "all receivers"
 """The device of a kind that is of all of them."""
 LAGGED_S = 0.5
 """One sigma of a lag that nobody knows of."""
+FOLLOWED_SPREAD = 0.3
+"""One sigma of a share of what a fault has done: it is told from noise at three sigma or so."""
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
 """Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
 no longer than what the state for it admits is that state's."""
@@ -279,12 +281,13 @@ def row_kinds(
 
 def over_kind() -> Kind:
     """That a source's fault is over, which the solution has followed until then: as likely as that
-    fault, which lasts a minute in the mean. Its size is the share of what was followed, and two
-    numbers that the fault's own sigma leaves open, all of unit variance."""
+    fault, which lasts a minute in the mean. Its size is the share of what was followed."""
     return Kind(
         *("over", "a source's fault that the solution followed is over:", "%", FOLLOWED, OVER),
-        *((1.0, 1.0, 1.0), 3600.0 / LASTS_S, 100.0),
-        axes=("", "", ""),
+        *((FOLLOWED_SPREAD,), 3600.0 / LASTS_S, 100.0),
+        mean=1.0,
+        bounded=True,
+        axes=("",),
     )
 
 

@@ -42,12 +42,10 @@ from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, iden
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.device_agreement import Agreement
-from fusiond.integrity.fault_finding import Finding
-from fusiond.integrity.lasting import Effect, Lasting
+from fusiond.integrity.fault_finding import Finding, Lasting
 from fusiond.integrity.service import (
     DISAGREES,
     FORGET_NS,
-    LASTS_S,
     REPEATS,
     STILL,
     Series,
@@ -226,18 +224,12 @@ class Diagnosis:
         """One that is out was compared with what is published."""
         correction, t_ns, bank = None, aid.t_ns, estimator.hypotheses
         passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-        over, known = math.nan, self._lasting.get(one.source)
-        if bank is not None and known and known.findings and outcome.looked is not None:
-            of_aid = bank, estimator.nav, outcome.degrees
-            terms = [self._adds(aid, f, *of_aid) for f in known.findings]
-            of = outcome.looked, terms, estimator.model.noise
-            known = known.looked(t_ns, *of, gate_threshold(aid.gate, outcome.degrees))
+        if outcome.lasting:
+            known = self._lasting[one.source].judged(outcome.lasting)
             self._lasting = {**self._lasting, one.source: known}
-            # That it lasts for so long is as unlikely in the end as what was set aside when it was
-            # identified: that the filter had followed something before.
-            lasted = (t_ns - one.out_ns) * 1e-9 / LASTS_S
-            over = max(known.log_odds + self._over_by_others(one), lasted)
-        one.looked_at(t_ns, passes and one.repeats == 0, over)
+        lasts = min(outcome.lasting, default=math.nan)
+        others = self._over_by_others(one)
+        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others)
         if self._goes_its_own_way(one):
             correction = _somewhere_else(aid, estimator)
             one.readmit(t_ns)
@@ -264,7 +256,7 @@ class Diagnosis:
         others = [f for f in self.findings if f.kind.text != finding.kind.text]
         self.findings = (*others, finding)
         if not finding.kind.corrected:
-            self._leave_out(finding, bank, fits.max(), mean)
+            self._leave_out(finding, bank, fits.max())
         return Correction(mean, spread)
 
     def _finding(self, t_ns: int, told: Estimated) -> Finding:
@@ -273,43 +265,38 @@ class Diagnosis:
         sd = tuple((np.sqrt(np.diagonal(told.covariance)) * kind.per_unit).tolist())
         return Finding(kind, t_ns, told.onset_s, size, sd, told.log_odds)
 
-    def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float, taken: Array) -> None:
+    def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float) -> None:
         """Series that a fault removes from service, and those of faults of its device that fit as
         well: nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a
-        straight may be off, or late, and the velocity with it. What is `taken` (n,) out of the
-        state was done by one of them."""
+        straight may be off, or late, and the velocity with it."""
         fits = bank.explains & (bank.log_odds > max(0.0, finding.log_odds - DECIDED))
         fits &= bank.log_likelihood >= fit - APART
-        found = list[tuple[Finding, Effect]]()
+        found = []
         for row in np.flatnonzero(fits.any(axis=1)).tolist():
             kind = self._kinds[row]
             if kind.device == finding.kind.device and not kind.corrected:
                 restart = int(np.argmax(np.where(fits[row], bank.log_odds[row], -np.inf)))
-                number = RESTARTS * row + restart
-                told = bank.estimated(number)
-                effect = Effect(told.mean - taken, bank.effect(number) @ told.covariance)
-                found.append((self._finding(finding.t_ns, told), effect))
+                told = bank.estimated(RESTARTS * row + restart)
+                found.append(self._finding(finding.t_ns, told))
         self._exclude(
             finding.t_ns,
             finding.text,
-            lambda s: any(f.kind.spoils(s.device, s.locates, s.moves) for f, _ in found),
+            lambda s: any(f.kind.spoils(s.device, s.locates, s.moves) for f in found),
         )
         lasting = dict(self._lasting)
         for name, s in self._series.items():
             if s.out and s.reason == finding.text:
-                of = [e for e in found if e[0].kind.spoils(s.device, s.locates, s.moves)]
-                findings, effects = zip(*of, strict=True)
-                lasting[name] = Lasting(findings, effects, finding.t_ns)
+                of = (f for f in found if f.kind.spoils(s.device, s.locates, s.moves))
+                lasting[name] = Lasting.of(of)
         self._lasting = lasting
 
     def _over_by_others(self, one: Series) -> float:
         """Log likelihood that a fault for which a series is out is over, by what else it has
         spoiled: a fault is one story of all of it."""
-        own = set(self._lasting[one.source].findings)
+        known = set(self._lasting.get(one.source, Lasting()).findings)
+        others = [s for n, s in self._series.items() if s.out and n != one.source]
         return sum(
-            known.log_likelihood
-            for name, known in self._lasting.items()
-            if name != one.source and self._series[name].out and own & set(known.findings)
+            s.over for s in others if known & set(self._lasting.get(s.source, Lasting()).findings)
         )
 
     def _is_over(self, one: Series) -> None:
@@ -323,12 +310,16 @@ class Diagnosis:
                 self._changed(name).reason = STILL
         self._lasting = lasting
 
-    def _adds(self, aid: Aid, finding: Finding, bank: Hypotheses, nav: Array, rows: int) -> Array:
-        """D (m, p) of a fault in the rows of an aid."""
-        kind, age_s = finding.kind, aid.t_ns * 1e-9 - finding.since_s
-        of = self._kinds.index(kind)
-        each = [bank.adds(aid, of, b, age_s, nav)[:rows] for b in np.eye(kind.size)]
-        return np.array(each).T
+    def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
+        """Terms of each fault in an innovation of a series that may be out (k, 3), if it lasts;
+        None where none is known."""
+        bank, added = estimator.hypotheses, []
+        if bank is None:
+            return None
+        for f in self._lasting.get(one.source, Lasting()).findings:
+            b, age_s = np.array(f.size) / f.kind.per_unit, aid.t_ns * 1e-9 - f.since_s
+            added.append(bank.adds(aid, self._kinds.index(f.kind), b, age_s, estimator.nav))
+        return np.array(added) if added else None
 
     def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
         """Those of the class and device of a kind that explain it nearly as well."""

@@ -10,8 +10,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
     from                  to           when
     nominal               suspected    `gate`: a measurement fails
     suspected             nominal      one passes
-    suspected             out          the third in a row fails, for a second at least, and no fault
-                                       of the inertial unit explains it
+    suspected             out          the third in a row fails, and no fault of the inertial unit
+                                       explains it
     probation             out          a measurement fails: what was wrong comes again
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
                                        itself to the bit while the vehicle moves
@@ -21,9 +21,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
                                        a fault is over is asked of all that it has spoiled
     probation             nominal      it has been in service for as long as it was out
 
-Three failures of a gate of 0.9999 in a row are 1e-12 by chance, if each errs anew; a receiver's
-errors of a second are one error, however often it sends. Five that pass while a fault of four sigma
-lasts are one case in a thousand. Time alone re-admits nothing.
+Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
+four sigma lasts are one case in a thousand. Time alone re-admits nothing.
 """
 
 from __future__ import annotations
@@ -44,17 +43,15 @@ from fusiond.aiding.candidates import (
     SpeedCandidate,
     VelocityCandidate,
 )
-from fusiond.estimators.fault_bank import LASTS_S as LIKELY_FOR_S
-from fusiond.estimators.fault_odds import APART
 from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
 
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
-ONE_ERROR_NS = round(LIKELY_FOR_S * 1e9)
-LASTS_S, MOST_TOLD = 60.0, 12.0
-"""A fault's mean duration, an engineer's, and the most (chi-square) that one measurement tells of
-its end."""
+LASTS_S, RETURNS, MOST_TOLD, MOST_SURE = 60.0, 2.0, 12.0, 24.0
+"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
+to one; the most (chi-square) that one measurement tells of that; and the most (log likelihood) that
+one series does, four such measurements."""
 REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -90,13 +87,13 @@ class Series:
     heard_ns: int = 0
     reason: str = ""
     failed: int = 0
-    failing_ns: int = 0
-    """Instant (ns) of the first of those that have failed in a row."""
     passed: int = 0
     out_ns: int = 0
     """Instant (ns) of its last exclusion."""
     proven_ns: int = 0
     """Until when (ns) it is on probation: for as long as it was out."""
+    over: float = 0.0
+    """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: object = None
     repeats: int = 0
     unchanged: bool = False
@@ -133,12 +130,9 @@ class Series:
 
     def gated(self, t_ns: int, explained: bool) -> None:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
-        if self.failed == 0:
-            self.failing_ns = t_ns
         self.failed += 1
         again = self.state is Service.PROBATION
-        lasts = self.failed >= REFUSED_IN_A_ROW and t_ns - self.failing_ns >= ONE_ERROR_NS
-        if again or (lasts and not explained):
+        if again or (self.failed >= REFUSED_IN_A_ROW and not explained):
             self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
@@ -153,15 +147,23 @@ class Series:
         if t_ns > self.proven_ns and self.state is not Service.NOMINAL:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
-    def looked_at(self, t_ns: int, passes: bool, over: float = math.nan) -> None:
-        """One that is out was compared with what is published. `over`: log odds that the fault for
-        which it is out is over (fusiond.integrity.lasting), `APART` of which decide as between two
-        classes; not a number where none is known."""
+    def looked_at(
+        self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
+    ) -> None:
+        """One that is out was compared with what is published. `lasting`: by how much more
+        chi-square its innovation is if the fault for which it is out lasts; not a number where none
+        is known. `others`: log likelihood that it is over by what else it has spoiled.
+
+        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
+        """
         if self.unchanged and self.reason == REPEATS:
             passes = False
         self.passed = self.passed + 1 if passes else 0
-        if math.isfinite(over):
-            if over < APART:
+        if math.isfinite(lasting):
+            self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
+            self.over = max(-MOST_TOLD, min(self.over, MOST_SURE))
+            prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
+            if self.over + others + prior < RETURNS:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
                 self.reason = STILL

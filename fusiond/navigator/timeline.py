@@ -281,7 +281,10 @@ class Timeline:
             if self._isolates:
                 return estimator.update(aid)
             one = diagnosis.comes(aid, estimator)
-            outcome = estimator.look(aid) if one.out else estimator.update(aid, one.noise)
+            if one.out:
+                outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
+            else:
+                outcome = estimator.update(aid, one.noise)
             if aid.constraint and aid.rests_s:
                 estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
             if outcome.name in JUDGED:

@@ -6,12 +6,12 @@ import pytest
 
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.estimators.fault_odds import APART
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import (
     DISAGREES,
     FORGET_NS,
+    MOST_SURE,
     READMIT_COUNT,
     REFUSED_IN_A_ROW,
     STILL,
@@ -99,24 +99,26 @@ def test_time_alone_readmits_nothing() -> None:
     assert one.out
 
 
-def test_one_that_passes_is_back_only_if_its_fault_is_over() -> None:
-    one = series()
-    one.exclude(0, "gnss is carried off")
-    for k in range(3 * READMIT_COUNT):
-        one.looked_at((60 + k) * S, passes=True, over=APART - 0.1)
-    assert one.out
-    one.looked_at(90 * S, passes=True, over=APART + 0.1)
-    assert one.state is Service.PROBATION
+def test_a_fault_is_over_where_what_else_it_has_spoiled_says_so() -> None:
+    """A position that stays where it was carried says nothing of that; the velocity does."""
+    place, other = series(), series()
+    for one in (place, other):
+        one.exclude(0, "gnss is carried off")
+    for k in range(READMIT_COUNT + 1):
+        place.looked_at((60 + k) * S, passes=False, lasting=-12.0)
+        other.looked_at((60 + k) * S, passes=False, lasting=-12.0, others=24.0)
+    assert place.reason != STILL
+    assert other.reason == STILL
+    assert place.out
+    assert other.out
 
 
-def test_one_whose_fault_is_over_and_that_is_elsewhere_says_so() -> None:
+def test_nothing_says_endlessly_that_a_fault_is_over() -> None:
     one = series()
     one.exclude(0, "gnss is carried off")
-    one.looked_at(60 * S, passes=False, over=APART - 0.1)
-    assert one.reason != STILL
-    one.looked_at(61 * S, passes=False, over=APART + 0.1)
-    assert one.reason == STILL
-    assert one.out
+    for k in range(100):
+        one.looked_at((60 + k) * S, passes=False, lasting=12.0)
+    assert one.over == MOST_SURE
 
 
 def test_what_was_not_heard_of_for_long_is_judged_anew() -> None:
