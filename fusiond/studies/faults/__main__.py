@@ -1,6 +1,6 @@
 """Run the fault matrix or rows of it, how well faults are detected, how often none is one, what
-becomes of those that happen now and then, how long they cost service, how sharp sigma is, or what
-is told of recorded drives."""
+becomes of those that happen now and then, how long they cost service, how soon any test could tell
+them, how sharp sigma is, or what is told of recorded drives."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from fusiond.studies.faults.bounds import bound_run
+from fusiond.studies.faults.bounds import jobs as bound_jobs
 from fusiond.studies.faults.faulty_hours import faulty_hour_of
 from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
@@ -43,10 +45,11 @@ def main() -> int:
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--faulty", type=int, metavar="HOURS", help="hours with faults in them")
     parser.add_argument("--service", type=int, metavar="DRIVES", help="time without service")
+    parser.add_argument("--bounds", type=int, metavar="DRIVES", help="how soon any test could tell")
     parser.add_argument("--sharpness", type=int, metavar="DRIVES", help="sigma, so many a cell")
     parser.add_argument("--real", type=Path, metavar="DATA", help="recorded drives, none wrong")
     parser.add_argument(
-        "--seeds", choices=SHARES, default=SHARES[0], help="drives of sharpness, service"
+        "--seeds", choices=SHARES, default=SHARES[0], help="drives of bounds, sharpness, service"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
@@ -103,6 +106,7 @@ STUDIES = {
         partial(sharpness_run, share=asked.seeds),
         sharpness_jobs(drives),
     ),
+    "bounds": lambda drives, asked: (partial(bound_run, share=asked.seeds), bound_jobs(drives)),
     "real": lambda data, _: (real_run, real_jobs(data)),
 }
 """By option: what makes a row, and of what."""

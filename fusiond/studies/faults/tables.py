@@ -40,6 +40,17 @@ POWER = (
     "lies",
     "longest, s",
 )
+BOUNDS = (
+    "fault",
+    "receiver or phase",
+    "runs",
+    "beyond five sigma after, s",
+    "open to who knows it, s",
+    "can be told after, s",
+    "lies over 2 s until open",
+    "longest, s",
+    "error until told, m",
+)
 ALARMS = ("vehicle", "hours", "alarm", "times", "in 24 h", "99 % interval", "stated in 24 h")
 HAPPENED = (
     "fault",
@@ -186,6 +197,23 @@ def _beyond(found: Rows) -> str:
     return f"Beyond five sigma in mode `navigating`: {counted}; at most {lie_s:g} s together."
 
 
+def bounds(found: Rows) -> str:
+    """A line a fault and receiver or phase: of its runs each, but the longest lie, in order."""
+    lines = []
+    for key in dict.fromkeys((row["fault"], row["where"]) for row in found):
+        rows = [row for row in found if (row["fault"], row["where"]) == key]
+        instants = [
+            ", ".join(number(row[name], "never") for row in rows)
+            for name in ("beyond_s", "open_s", "detected_s")
+        ]
+        lies = sum(row["lies"] for row in rows)
+        longest = number(max(row["lie_s"] for row in rows), "-")
+        least = number(max(row["least_m"] for row in rows), "-")
+        lines.append((*key, str(len(rows)), *instants, str(lies), longest, least))
+    lies = sum(row["lies"] for row in found)
+    return f"{table(BOUNDS, lines)}\n\n{len(found)} runs; in {lies} no test keeps from a lie.\n"
+
+
 TABLES: Mapping[str, Callable[[Rows], str]] = {
     "matrix": matrix,
     "power": power,
@@ -194,6 +222,7 @@ TABLES: Mapping[str, Callable[[Rows], str]] = {
     "recorded": recorded,
     "service": service,
     "sharpness": sharpness,
+    "bounds": bounds,
     "real": real,
 }
 
