@@ -370,7 +370,7 @@ class WheelSpeedAid(Aid):
         measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
         names = (self.rounding,)
         rounding = model.listed.get(names) or model.list_slots(names, (1,))
-        body = _SPEED_BODY.pack(*self.lever, *measured, self.signed, *slots, *rounding)
+        body = _SPEED_BODY.pack(*self.lever, *measured, bool(self.signed), *slots, *rounding)
         return Packed(SPEED, 1, body)
 
     def candidates(self) -> tuple[SpeedCandidate, ...]:

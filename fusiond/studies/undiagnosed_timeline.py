@@ -11,6 +11,10 @@ from fusiond.integrity.service import Series
 class Trusting(Diagnosis):
     """Leaves all to the filter: its gate, and what detects faults in a federated one."""
 
+    def plain(self, aid: Aid) -> Series | None:
+        """Each measurement is handed over by itself."""
+        return None
+
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """All is in service."""
         return self.own(aid)

@@ -80,7 +80,8 @@ def test_any_damage_ends_in_frames_a_count_or_a_sentence(name: str, tmp_path: Pa
         except TableError as error:
             assert str(path) in str(error)  # noqa: PT017
             continue
-        assert all(each.reason in ("unreadable", "cut") for each in refused.all())
+        counted = {"unreadable", "cut", "length_or_type_odd"}
+        assert counted >= {each.reason for each in refused.all()}
         assert len(found) <= 16 * len(frames)  # pieces may be repeated
 
 

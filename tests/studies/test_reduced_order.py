@@ -220,7 +220,7 @@ def test_azimuth_of_the_points_stays_where_the_text_says() -> None:
     angles = []
     for k, scene in enumerate(flight.scenes(600.0)):
         state = State(nav[k + 1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
-        angles.append(flight.rows(flight.aids(scene, np.zeros(scene.rows)), state).z[8])
+        angles.append(flight.rows(flight.measurements(scene, np.zeros(scene.rows)), state).z[8])
     degrees = np.degrees(np.abs(angles))
     assert 52.0 < degrees.min() < 54.5
     assert 125.5 < degrees.max() < 128.0
