@@ -67,7 +67,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Trusted:
-    """Solution published by a filter that trusts all, and its innovations by instant (ns) and source."""
+    """Solution of a filter that trusts all, and its innovations by instant (ns) and source."""
 
     run: Published
     whitened: Mapping[tuple[int, str], tuple[float, ...]]
