@@ -140,11 +140,8 @@ async def test_a_server_that_goes_silent_is_a_silent_device() -> None:
         await until(lambda: receiver.state == "silent")
         assert receiver.detail == "no bytes for 0.3 s"
         server.send(b"HTTP/1.1 400 Bad Request\r\n" * 3)
-        await until(lambda: receiver.detail.startswith("bytes arrive"))
-        assert receiver.detail == (
-            f"bytes arrive, but no NMEA sentence verifies from {server.address}:"
-            " does it serve what the receiver sends?"
-        )
+        await until(lambda: "arrive" in receiver.detail)
+        assert "text arrives that is no NMEA, such as 'HTTP/1.1 400 Bad Request'" in receiver.detail
         (advice,) = open_findings("gnss", receiver.driver, receiver.options, 5.0)
         assert "baud" not in advice
         server.send(gga(29) + rmc(29))
