@@ -69,6 +69,7 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
+    SIZE,
     SUSPECTS,
     THREES,
     UNEXPLAINED,
@@ -89,6 +90,9 @@ MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
 missed is as near as half the youngest period."""
+BY_CHANCE = 2.05
+"""Sigmas of chi-square that chance exceeds once in fifty, as `APART` has it: what is lost is left
+unexplained, but for so much."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
 MOST_OF_UNIT = 10.0
@@ -254,17 +258,21 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
         return np.inf
     step = ints[kind, SIGNATURE] <= FOLLOWED
     alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
-    fit, ahead, same = 0.0, np.inf, False
+    fit, left, ahead, same = 0.0, 0.0, np.inf, False
     for restart in range(RESTARTS):
         other = group_at(bank, RESTARTS * kind + restart)
         if bank[other + UNEXPLAINED] > 0.0:
             continue
         ahead = min(ahead, bank[group + LOG_ODDS] - bank[other + LOG_ODDS])
         if bank[other + LOG_ODDS] > 0.0:
-            fit = max(fit, bank[other + EXPLAINED])
+            if bank[other + EXPLAINED] > fit:
+                fit = bank[other + EXPLAINED]
+                degrees = max(bank[other + N_AT] - ints[kind, SIZE], 1.0)
+                chance = UNEXPLAINED_SIGMAS + BY_CHANCE
+                left = bank[other + UNEXPLAINED] + chance * math.sqrt(2.0 * degrees)
             same = same or abs(bank[other + ONSET] - bank[group + ONSET]) < ALIKE_S
     if fit > 0.0 and not alike:
-        missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
+        missed = 0.0 if same else min(MISSED * bank[group + EXPLAINED], max(left, 0.0))
         ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
     return ahead
 
