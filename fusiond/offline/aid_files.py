@@ -296,6 +296,11 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     corrected = [_corrected(c, of_week) for c in corrections]
     if not epochs and corrected:
         return corrected, log.notes
+    if not epochs and decoder.counters["week_unknown"]:
+        raise TableError(
+            f"{path}: SSR corrections say no week, nor does an IMU file in seconds of the week:"
+            " append them to the file of the epochs, or give the IMU's times as POSIX time"
+        )
     if not epochs:
         nothing = "no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)"
         raise TableError(f"{path}: {kind_of(log.data) or nothing}")
