@@ -35,7 +35,7 @@ from fusiond.outputs.topics import NAV, TOPICS
 from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 
-PIECES = {"sent": "_send_one", "heard": "_hear_one", "turn": "_turn", "look": "_look"}
+PIECES = {"sent": "_send_one", "heard": "_receive_one", "turn": "_turn", "look": "_look"}
 _OF_QUEUES = ("sent", "heard")
 
 

@@ -164,7 +164,7 @@ class UdpPort(_SocketPort):
         super().__init__(opened)
         self._counters = counters
         self._sender: tuple[Any, ...] | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
 
     @property
     def writable(self) -> bool:
@@ -175,10 +175,10 @@ class UdpPort(_SocketPort):
         now_s = monotonic()
         # By host alone: some send each datagram from a fresh port.
         foreign = self._sender is not None and self._sender[0] != sender[0]
-        if foreign and now_s - self._heard_s < SENDER_HELD_S:
+        if foreign and now_s - self._received_s < SENDER_HELD_S:
             self._counters["other_sender"] += 1
             raise BlockingIOError
-        self._sender, self._heard_s = sender, now_s
+        self._sender, self._received_s = sender, now_s
         if not data:
             raise BlockingIOError  # a datagram without a byte is no end of anything
         return data

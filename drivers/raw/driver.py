@@ -79,7 +79,7 @@ class GnssDecoder:
             else None
         )
         self._trust = TimeTrust()
-        self._nmea_told_ns: int | None = None
+        self._nmea_utc_ns: int | None = None
         """UTC of RMC or ZDA when last told, else of the first epoch of RXM-RAWX."""
         self._delays: set[int] = set()
         """BeiDou satellites whose B-CNAV has come."""
@@ -104,8 +104,8 @@ class GnssDecoder:
         nothing tells."""
         if not any(self.counters[name] for name in ALIVE_BY):
             return nothing_verified(self.counters, self._splitter.unread)
-        heard = self._nmea.heard
-        return self._nmea.cause if heard.talkers and not heard.used else ""
+        received = self._nmea.received
+        return self._nmea.cause if received.talkers and not received.used else ""
 
     @property
     def gga(self) -> bytes:
@@ -161,7 +161,7 @@ class GnssDecoder:
     def _take_nmea(self, measurements: list[Measurement], found: list[Found]) -> None:
         for measurement in measurements:
             if isinstance(measurement, TimeReport):
-                self._nmea_told_ns = measurement.utc_ns
+                self._nmea_utc_ns = measurement.utc_ns
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
             if isinstance(measurement, PositionFix) and not self._own_fix(measurement):
@@ -183,7 +183,7 @@ class GnssDecoder:
             if isinstance(measurement, TimeReport):
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
-                if not self._told_by_nmea(measurement.utc_ns):
+                if not self._known_from_nmea(measurement.utc_ns):
                     found.append(measurement)
                 continue
             if isinstance(measurement, PositionFix):
@@ -222,17 +222,17 @@ class GnssDecoder:
         if not isinstance(epoch.stamp, UtcStamp):
             return
         utc_ns = epoch.stamp.utc_ns
-        if self._told_by_nmea(utc_ns):
+        if self._known_from_nmea(utc_ns):
             return
         trusted = self._trust.report(utc_ns, epoch.t_seen_ns, valid=True)
         if trusted is not None:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
 
-    def _told_by_nmea(self, utc_ns: int) -> bool:
+    def _known_from_nmea(self, utc_ns: int) -> bool:
         """True if RMC or ZDA have told the time lately, or may yet."""
-        if self._nmea_told_ns is None:
-            self._nmea_told_ns = utc_ns
-        return abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS
+        if self._nmea_utc_ns is None:
+            self._nmea_utc_ns = utc_ns
+        return abs(utc_ns - self._nmea_utc_ns) < NMEA_TIME_NS
 
 
 class GnssDriver(ReceiverDriver):

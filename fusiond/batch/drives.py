@@ -19,11 +19,11 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.parquet_rows import Row, flat
 from fusiond.files.tables import read_solution, read_truth
-from fusiond.offline.aid_files import READERS
 from fusiond.offline.compare import NothingToCompareError, compare
+from fusiond.offline.measurement_files import READERS
 from fusiond.offline.process import process
 
-AID_FILES = {
+MEASUREMENT_FILES = {
     **{f"{kind}.csv": kind for kind in READERS if kind not in ("nmea", "raw")},
     "gnss.nmea": "nmea",
     "gnss.ubx": "raw",
@@ -72,7 +72,9 @@ def _recording(config_path: Path, files: list[Path]) -> Row:
 
 def _tables(config: Config, folder: Path) -> Row:
     measurements = [
-        (kind, folder / name) for name, kind in AID_FILES.items() if (folder / name).exists()
+        (kind, folder / name)
+        for name, kind in MEASUREMENT_FILES.items()
+        if (folder / name).exists()
     ]
     if not (folder / TRUTH).exists():
         return _processed(process(config, folder / IMU, measurements))

@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.bench.delayed_fix import delayed_fix
 from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.raw_epoch import raw_epoch
@@ -212,9 +212,9 @@ def _single(_: int) -> Callable[[], int]:
     return work
 
 
-def _fix(source: str, t_ns: int) -> PositionAid:
+def _fix(source: str, t_ns: int) -> PositionMeasurement:
     lever, lat = (0.3, 0.0, -1.0), LAT + 1e-20 * t_ns  # a receiver that hangs takes another way
-    return PositionAid(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
+    return PositionMeasurement(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
 
 
 def _rewind(number: int) -> Callable[[], int]:
@@ -244,7 +244,7 @@ def _one_source() -> list[Linearised]:
     for second in range(1, STEP_SECONDS + 1):
         t_ns = second * 1_000_000_000
         measurements.append(_fix("gnss", t_ns))
-        measurements.append(VelocityAid("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
+        measurements.append(VelocityMeasurement("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
     return measurements
 
 
@@ -262,7 +262,7 @@ def _step_ratio(
 ) -> float:
     """Processor time of an estimator's second over the centralised filter's, taken in turns.
 
-    100 IMU samples and the aids, in order of validity; median over the repetitions.
+    100 IMU samples and the measurements, in order of validity; median over the repetitions.
     """
     model, centralised, buffer = _filter(STEP_SECONDS * STEP_RATE_HZ, STEP_RATE_HZ)
     nav, xi, p = centralised.nav.copy(), centralised.xi.copy(), centralised.covariance.copy()

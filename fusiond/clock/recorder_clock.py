@@ -67,7 +67,7 @@ class RecorderClock:
         self.t_ns = 0
         self.stamp_ns = 0
         self.steps: list[Step] = []
-        self._begun = False
+        self._started = False
         self._went_back = False
         """Time itself did, as UTC says: what was recorded before is refused until it is over."""
         self._denied_ns: int | None = None
@@ -85,7 +85,7 @@ class RecorderClock:
         """True if `take` has to look at what follows."""
         change = stamp_ns - self.stamp_ns
         if 0 <= change < LEAP_NS:
-            return not self._begun
+            return not self._started
         own_ns = self._of_channel.get(of[0], stamp_ns)
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
@@ -106,10 +106,10 @@ class RecorderClock:
         `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
         say nothing. It is asked where a step is possible.
         """
-        if not self._begun:
+        if not self._started:
             if 2 * sum(f < stamp_ns - AHEAD_NS for f in following) > len(following):
                 return "time_ahead"
-            self._begun = True
+            self._started = True
             self.t_ns = self.stamp_ns = stamp_ns
         change = stamp_ns - self.stamp_ns
         if change < 0:

@@ -24,7 +24,7 @@ _ROOT_HOUR = 60.0
 
 
 def model_report(name: str, config: Config | None) -> dict[str, Any]:
-    """The model with a configuration's IMU and aids, or with the defaults; SI units.
+    """The model with a configuration's IMU and measurements, or with the defaults; SI units.
 
     `states`: one record a state: `name`, `unit`, `initial_sigma` (None: set by the alignment),
     `white_noise` (unit/sqrt(s)), and `markov_sigma` with `correlation_s` where it decays.

@@ -147,7 +147,7 @@ def model(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Such as ins21.")],
     config: Annotated[
         Path | None,
-        typer.Option(metavar="CONFIG", help="Whose IMU and aids; the defaults if none."),
+        typer.Option(metavar="CONFIG", help="Whose IMU and measurements; the defaults if none."),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -45,7 +45,7 @@ class Aiding(Section):
     """Common options of aiding sections: place, how it is gated."""
 
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
-    """Body axes (forward, right, down), from the IMU to the aid's reference point."""
+    """Body axes (forward, right, down), from the IMU to the device's reference point."""
     gate_probability: Probability = 0.9999
     """A consistent innovation fails the gate with one minus this probability."""
     sigma_scale: PositiveFloat = 1.0
@@ -60,7 +60,7 @@ class GnssAiding(Aiding):
 
     kind: Literal["gnss"] = "gnss"
     use_velocity: bool = True
-    """True if the receiver's velocity is an aid too."""
+    """True if the receiver's velocity is a measurement too."""
     range_error_m: PositiveFloat = 3.0
     """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
@@ -162,7 +162,8 @@ class AttitudeAiding(Aiding):
 
 
 class Misaligned(Aiding):
-    """An aid whose sensor is mounted a little askew: three small angles that the filter estimates.
+    """A measurement whose sensor is mounted a little askew: three small angles that the filter
+    estimates.
 
     The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
     device.

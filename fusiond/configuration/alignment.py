@@ -33,7 +33,7 @@ class Alignment(Section):
     heading_sd_deg: PositiveFloat = 5.0
     """One sigma of it."""
     position_deg_m: Vector | None = None
-    """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
+    """Latitude, longitude, height where the vehicle starts, if no measurement will say it."""
     position_sd_m: PositiveFloat = 100.0
     """One sigma of it."""
     levelling_s: PositiveFloat = 2.0

@@ -49,7 +49,8 @@ GIVES: dict[str, tuple[str, ...]] = {
     "sbf": ("gnss", "heading"),
     "ubx": ("gnss", "heading"),
 }
-"""Kinds of aid that come of each shipped driver; of drivers in other packages nothing is known."""
+"""Kinds of measurement that come of each shipped driver; of drivers in other packages nothing is
+known."""
 
 
 def doubts(config: Config) -> list[str]:
@@ -124,7 +125,7 @@ def _aiding(config: Config) -> Iterator[str]:
         if source is None or kinds is None or section.kind in kinds:
             continue
         if not kinds:
-            yield f"aiding.{name}: driver {source.driver} is no aid: leave the section out"
+            yield f"aiding.{name}: driver {source.driver} gives no measurement: leave the section out"
             continue
         yield (
             f"aiding.{name}.kind = {section.kind!r}: driver {source.driver} gives "

@@ -190,7 +190,7 @@ class Vehicle:
                 self._innovation(one, t_ms, at_s - (now_ms - t_ms) / 1000.0)
 
     def _innovation(self, said: Said, key: float | None, at_s: float) -> None:
-        """A rewind applies an aid again: the last one counts, in its old place. `key` is the
+        """A rewind applies a measurement again: the last one counts, in its old place. `key` is the
         instant of its validity."""
         source, outcome = said.get("source"), said.get("outcome")
         if not (isinstance(source, str) and isinstance(outcome, str) and key is not None):

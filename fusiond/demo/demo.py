@@ -69,8 +69,8 @@ def demo(
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
     full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
     are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
-    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if
-    something is not installed.
+    and `rejected` count measurements (IMU samples stand in `fused_by_source`). Raises `DemoError`
+    if something is not installed.
     """
     with (
         DemoBroker() as broker,
@@ -157,7 +157,7 @@ class _Run:
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
-        self._score.add(solution, self._daemon.navigator.serving.covariance)
+        self._score.add(solution, self._daemon.navigator.active_filter.covariance)
 
     async def _subscribe(self) -> None:
         """Listen as a dashboard does."""

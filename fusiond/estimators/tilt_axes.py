@@ -137,20 +137,20 @@ class TiltAxesFilter(KalmanEstimator):
     def undoubted(self, true: bool) -> None:
         self._knows[UNDOUBTED] = true
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
         if self.turns and not self._holding:
-            return self._turn_in(aid)
+            return self._turn_in(measurement)
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
-            return self._fold_in(aid, noise)
+            return self._fold_in(measurement, noise)
         before = self._estimate()
-        outcome = self._fold_in(aid, noise)
+        outcome = self._fold_in(measurement, noise)
         if outcome.name == "fused":
             self._carry_over(before)
         return outcome
 
-    def _turn_in(self, aid: Linearised) -> Outcome:
+    def _turn_in(self, measurement: Linearised) -> Outcome:
         """The same while the heading may be far off."""
         raise NotImplementedError
 

@@ -170,7 +170,7 @@ def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | Non
         damaged(path, "a folder")
         return None
     except OSError as error:
-        _tell(f"{path} cannot be read ({error})")
+        _report(f"{path} cannot be read ({error})")
         return None
     kept = data[_DIGEST_SIZE:]
     if hashlib.sha256(kept).digest() != data[:_DIGEST_SIZE]:
@@ -217,8 +217,8 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
     alone, which no kernel here is compiled in."""
     known = _known_environment(name)
     if known is None:
-        loaded = sys.modules.get(module)
-        known = _Environment({"__name__": module} if loaded is None else loaded.__dict__)
+        imported = sys.modules.get(module)
+        known = _Environment({"__name__": module} if imported is None else imported.__dict__)
         known.consts[:] = constants
         known.env_name = name
         _Environment._memo[name] = known
@@ -339,11 +339,11 @@ def kept_in(folder: Path) -> set[str]:
 
 
 def _leave(path: Path, reason: str) -> None:
-    _tell(f"{path} is damaged ({reason}): install the package again")
+    _report(f"{path} is damaged ({reason}): install the package again")
 
 
 def _discard(path: Path, reason: str) -> None:
-    _tell(f"{path} is damaged ({reason})")
+    _report(f"{path} is damaged ({reason})")
     with contextlib.suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -351,5 +351,5 @@ def _discard(path: Path, reason: str) -> None:
             path.unlink()
 
 
-def _tell(what: str) -> None:
+def _report(what: str) -> None:
     warnings.warn(f"{what}: the kernel is compiled anew", RuntimeWarning, stacklevel=2)

@@ -19,7 +19,7 @@ class ServiceEvents:
         self._found_ns: dict[tuple[str, str], int] = {}
         """By kind and device: the last finding that was seen."""
 
-    def tell(self) -> bool:
+    def report(self) -> bool:
         """`sensor_fault` for each step that was corrected, `fault_over` for a source's fault that
         the solution had followed, `isolated` and `readmitted` for each
         series that has left or is back in service; whether there are new findings."""

@@ -50,7 +50,7 @@ class HomeAssistantDiscovery:
         )
         self._description = Description(description(node, around.vehicle, around.sources))
         self.counters: Counter[str] = Counter()
-        self._mqtt.listen(f"{section.prefix}/status", self._heard)
+        self._mqtt.listen(f"{section.prefix}/status", self._on_status)
         self._mqtt.take(self._topic, self._description)
 
     @property
@@ -63,7 +63,7 @@ class HomeAssistantDiscovery:
     async def run(self) -> None:
         await asyncio.get_running_loop().create_future()
 
-    def _heard(self, payload: bytes) -> None:
+    def _on_status(self, payload: bytes) -> None:
         if payload == b"online":
             self.counters["births"] += 1
             self._mqtt.take(self._topic, self._description)

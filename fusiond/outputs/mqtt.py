@@ -30,7 +30,7 @@ from fusiond.outputs.mqtt_version import MqttVersion
 from fusiond.outputs.reconnection import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
-_PATIENCE_S = 1.0
+_TIMEOUT_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
 _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
@@ -87,7 +87,7 @@ class MqttPublisher:
         self._retained: dict[Topic, BaseModel] = {}
         self._due: dict[Topic, None] = {}
         self._events: deque[EventMessage] = deque(maxlen=MOST_KEPT)
-        self._heard: dict[str, Callable[[bytes], None]] = {}
+        self._listeners: dict[str, Callable[[bytes], None]] = {}
         self._latest_ready = asyncio.Event()
         self._confirmed_ready = asyncio.Event()
         self._flowing = asyncio.Event()
@@ -107,9 +107,9 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ for the tick
 
-    def listen(self, address: str, heard: Callable[[bytes], None]) -> None:
-        """Let `heard` have what others publish at `address`; before `run`."""
-        self._heard[address] = heard
+    def listen(self, address: str, listener: Callable[[bytes], None]) -> None:
+        """Let `listener` have what others publish at `address`; before `run`."""
+        self._listeners[address] = listener
 
     def take(self, topic: Topic, message: BaseModel) -> None:
         """Put a message into its place: with QoS 0 the latest counts, what is retained is
@@ -309,7 +309,7 @@ class MqttPublisher:
     ) -> None:
         """Publish with QoS 1; the QoS 0 flow stops while the confirmation is overdue."""
         loop = asyncio.get_running_loop()
-        overdue = loop.call_later(_PATIENCE_S, self._flowing.clear)
+        overdue = loop.call_later(_TIMEOUT_S, self._flowing.clear)
         try:
             await self._publish(client, address, payload, qos=1, retain=retain)
         finally:
@@ -320,7 +320,7 @@ class MqttPublisher:
 
     async def _listen(self, client: aiomqtt.Client) -> None:
         """Keep subscribed to what others publish to us, but for a while after a flood."""
-        addresses = [*self._heard]
+        addresses = [*self._listeners]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")
         coming = subscriptions.Incoming(client, self.counters, self._quiet)
@@ -344,9 +344,9 @@ class MqttPublisher:
             payload = message.payload
             if not isinstance(payload, bytes):
                 continue
-            heard = self._heard.get(message.topic.value)
-            if heard is not None:
-                heard(payload)
+            listener = self._listeners.get(message.topic.value)
+            if listener is not None:
+                listener(payload)
             elif self._commands is not None:
                 name = message.topic.value.removeprefix(prefix)
                 reply = self._commands.answer(name, payload, message.retain)

@@ -319,8 +319,8 @@ class Recorder:
         self._count = self._sequence = 0
         self._readings.clear()
         for name, inputs in self._inputs.items():
-            inputs.heard = partial(self.record_input, self._numbers[name])
-        self._clock.readings.heard = self._record_reading
+            inputs.on_input = partial(self.record_input, self._numbers[name])
+        self._clock.readings.on_reading = self._record_reading
         start = {
             "from_start": restored is not None,
             "system_clock": self._clock.system_state(),
@@ -331,8 +331,8 @@ class Recorder:
 
     def _detach(self) -> None:
         for inputs in self._inputs.values():
-            inputs.heard = None
-        self._clock.readings.heard = None
+            inputs.on_input = None
+        self._clock.readings.on_reading = None
         self._started = None
         self._ring.clear()
         self._message, self._message_bytes = [], 0

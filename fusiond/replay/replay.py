@@ -148,7 +148,7 @@ class Replay:
         self.chain.sources.on_arrival = self._on_arrival
         of_drivers = self.chain.sources.inputs
         for name, inputs in of_drivers.items():
-            inputs.heard = self._listener(name)
+            inputs.on_input = self._listener(name)
         self._driver_inputs = [of_drivers.get(name) for name in self._sources]
         self.exact = self._same and from_start and self._log.first_part and not self._afresh
         self._finish()

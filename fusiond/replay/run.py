@@ -18,7 +18,7 @@ import numpy as np
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.live.publishing import Publishing
-from fusiond.live.scheduler import SECOND_NS, LatenessHistogram
+from fusiond.live.scheduler import SECOND_NS, LatencyHistogram
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.event import EventMessage
@@ -123,7 +123,7 @@ class _Run:
         self._modes: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._lateness = LatenessHistogram()
+        self._lateness = LatencyHistogram()
         self._overruns = 0
 
     def add(self, tick: ReplayedTick) -> None:

@@ -41,7 +41,7 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Innovations:
-    """The aids of one source, a row each, by instant of validity.
+    """The measurements of one source, a row each, by instant of validity.
 
     `delay_s` is from validity until the filter first met it. `whitened` (n, k) is NaN where there
     was no innovation. `raw` (n, j) in `unit`, estimate minus measurement, along `axes` (of

@@ -59,7 +59,7 @@ def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _aiding(section: object) -> dict[str, Any]:
-    """Defaults of an aid's kind; the kind itself is always told."""
+    """Defaults of a measurement's kind; the kind itself is always told."""
     kind = section.get("kind") if isinstance(section, dict) else None
     try:
         default = _AIDING.validate_python({"kind": kind}).model_dump(mode="json")

@@ -27,7 +27,7 @@ from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "papers.md").read_text(encoding="utf-8")
-AIDS = {
+MEASUREMENTS = {
     "000": ("rdss",),
     "001": ("gnss", "gnss_velocity", "star_tracker"),
     "002": ("gnss", "star_tracker", "sar"),
@@ -87,7 +87,7 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
     estimator = PAPERS[number].lines["estimator"]
     assert run.daemon.navigator.model.name == estimator["model"]
     async with running(run.daemon, run.vehicle):
-        await until(lambda: all(run.fused(name) >= 5 for name in AIDS[number]))
+        await until(lambda: all(run.fused(name) >= 5 for name in MEASUREMENTS[number]))
         await until(lambda: run.usable)
         run.judge()
         if number == "003":
@@ -95,7 +95,7 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
             assert {name[0] for name in run.used} == {"C"}
         health = run.health
     assert set(PAPERS[number].devices) <= set(health)
-    for name in AIDS[number]:
+    for name in MEASUREMENTS[number]:
         assert health[name].rejected.get("isolated", 0) == 0, (name, health[name])
     if number == "000":  # fed back at the instants of arrival
         assert health["rdss_feedback"].rejected["fed_back"] >= 5
@@ -109,11 +109,13 @@ async def test_two_receivers_navigate_until_the_inertial_unit_comes(tmp_path: Pa
     async with running(run.daemon, run.vehicle):
         await asyncio.sleep(0)  # the vehicle plugs all in with its first step
         run.vehicle.unplug("imu")
-        await until(lambda: run.usable and all(run.fused(name) >= 3 for name in AIDS["004"]))
+        await until(
+            lambda: run.usable and all(run.fused(name) >= 3 for name in MEASUREMENTS["004"])
+        )
         s = run.seen[-1]
         assert "no inertial unit" in s.reason
         assert math.isnan(s.rpy_rad[2])
-        assert run.daemon.navigator.serving.isolates
+        assert run.daemon.navigator.active_filter.isolates
         run.judge()
         run.vehicle.plug("imu")
         await until(lambda: run.usable and not math.isnan(run.seen[-1].rpy_rad[2]))

@@ -18,8 +18,8 @@ from fusiond.outputs.messages.event_catalogue import EVENTS, UNKNOWN, entry_of
 from tests.places import REPOSITORY
 from tools.event_page import PAGE, page
 
-REPORTING = {"_event", "on_event", "_on_event", "event", "DeviceEvent", "Notice", "_notify", "tell"}
-REPORTING |= {"_tell", "report", "navigator_event"}
+REPORTING = {"_event", "on_event", "_on_event", "event", "DeviceEvent", "Notice", "_notify"}
+REPORTING |= {"_report", "report", "navigator_event"}
 SERVERS = ("nmea", "gpsd", "prometheus", "foxglove")
 NOT_TOLD = {"message_sent", "message_delivered", "message_superseded"}
 """Ends of a message that are no event: it arrived, or a later one replaced it."""

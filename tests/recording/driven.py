@@ -38,7 +38,7 @@ class Drive(Rig):
     def _hear_requests(self) -> None:
         """What the driver sends goes to the terminal, and where it goes anyhow."""
         inputs = self.inputs["rdss"]
-        recorded = inputs.heard
+        recorded = inputs.on_input
 
         def heard(kind: str, t_ns: int, payload: Any) -> None:
             if kind == "sent":
@@ -46,7 +46,7 @@ class Drive(Rig):
             if recorded is not None:
                 recorded(kind, t_ns, payload)
 
-        inputs.heard = heard
+        inputs.on_input = heard
 
     @property
     def t_s(self) -> float:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.studies.faults.aid_faults import velocity_bias
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
 from fusiond.studies.faults.judge import LIE_S, longest_lie_s
 from fusiond.studies.faults.library import FAULTS, Fault
+from fusiond.studies.faults.measurement_faults import velocity_bias
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
 from fusiond.studies.faults.recording import Drive

@@ -153,8 +153,8 @@ def test_measured_values_are_those_of_the_true_state() -> None:
     xi[of.slots_of("clock_offset")], xi[of.slots_of("clock_drift")] = 2e5, -120.0
     xi[of.slots_of("sar_misalignment")] = 1e-4, -2e-4, 3e-4
     true = State(nav, xi, np.zeros(STEP_SIZE), of)
-    aids = flight.measured(scene, true, np.zeros(scene.rows))
-    np.testing.assert_allclose(flight.rows(aids, true).z, 0.0, atol=1e-7)
+    measurements = flight.measured(scene, true, np.zeros(scene.rows))
+    np.testing.assert_allclose(flight.rows(measurements, true).z, 0.0, atol=1e-7)
     z = flight.rows(flight.measured(scene, true, np.ones(scene.rows)), true).z
     sd = [5.0] * 4 + [0.05] * 4 + [1e-3] * 2
     np.testing.assert_allclose(z, -np.array(sd), rtol=1e-6)

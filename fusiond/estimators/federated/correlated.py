@@ -5,8 +5,8 @@ process noise: no sharing factors, no bound. What the estimates share is carried
 each pair i, j:
 
     P_ij <- Phi P_ij Phi^T + Q                                   in between
-    P_ij <- (I - K_i H) P_ij                                     an aid of i alone
-    P_ij <- (I - K_i H) P_ij (I - K_j H)^T + K_i R K_j^T         an aid that is common to all
+    P_ij <- (I - K_i H) P_ij                                     a measurement of i alone
+    P_ij <- (I - K_i H) P_ij (I - K_j H)^T + K_i R K_j^T         a measurement that is common to all
 
 and the master is the best linear combination of them, for any number of filters:
 
@@ -178,7 +178,7 @@ class CorrelatedFilter(FederatedFilter):
                     self._joint[k, other] = new
                     self._joint[other, k] = new.T
         if local is not None:
-            self._faults.heard(local, self.t_ns)
+            self._faults.received(local, self.t_ns)
         return self._fuse_all(local)
 
     def _of(self, members: Sequence[int]) -> Array:
@@ -237,8 +237,8 @@ class CorrelatedFilter(FederatedFilter):
         scale = np.sqrt(np.diag(joint[0, 0])[tail])
         values, vectors = np.linalg.eigh(s[tail, tail] / np.outer(scale, scale))
         along = vectors.T @ (d[tail] / scale)
-        told = values > SAME
-        return float(np.sum(along[told] ** 2 / values[told]))
+        distinct = values > SAME
+        return float(np.sum(along[distinct] ** 2 / values[distinct]))
 
     # ------------------------------------------------------------------ faults, feedback, snapshots
 

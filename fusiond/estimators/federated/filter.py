@@ -1,11 +1,11 @@
-r"""Federated filter: a local filter for each source of aids, a master, fault isolation.
+r"""Federated filter: a local filter for each source of measurements, a master, fault isolation.
 
 Every local filter estimates the whole error state of the one common navigation state from its own
-source's aids; the master fuses the estimates and feeds the result back. What all share, the initial
-estimate, the process noise and aids of no source of its own (standstill, an operator), is split by
-the sharing factors beta_i, sum beta_i = 1:
+source's measurements; the master fuses the estimates and feeds the result back. What all share, the
+initial estimate, the process noise and measurements of no source of its own (standstill, an
+operator), is split by the sharing factors beta_i, sum beta_i = 1:
 
-    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common aid
+    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common measurement
 
 so that the sum of the information is that of one filter. P_i is then an upper bound that makes the
 estimates as good as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1 one of the
@@ -127,26 +127,26 @@ class FederatedFilter(ErrorStateFilter):
 
     # ------------------------------------------------------------------ update
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not.
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not.
 
         NIS and whitened innovation of the outcome are those of what is published; those of a
-        screened aid are of the filter that judges its rows.
+        screened measurement are of the filter that judges its rows.
         """
-        i = self._linearise(aid)
+        i = self._linearise(measurement)
         if isinstance(i, NotApplicable):
             return Outcome(i.outcome)
-        if aid.source not in self._local_of:
-            self._local_of[aid.source] = local_of(aid.source, self.names)
-        local = self._local_of[aid.source]
+        if measurement.source not in self._local_of:
+            self._local_of[measurement.source] = local_of(measurement.source, self.names)
+        local = self._local_of[measurement.source]
         isolated = local is not None and self._faults.is_isolated(local)
         self._bring_up()
         judge = None if isolated else local
         cov, dx = self._judge(judge)
-        if aid.screened:
-            return self._update_by_rows(aid, i, local, cov, dx)
+        if measurement.screened:
+            return self._update_by_rows(measurement, i, local, cov, dx)
         degrees = i.z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
+        threshold = gate_threshold(measurement.gate, degrees)
         y = np.zeros(degrees)
         nis = published = normalised_innovation_squared(cov, i.z - i.h @ dx, i.h, i.r, y)
         if judge is not None and self.options.mode == "no_reset":
@@ -163,7 +163,7 @@ class FederatedFilter(ErrorStateFilter):
 
     def _update_by_rows(
         self,
-        aid: Linearised,
+        measurement: Linearised,
         rows: Innovation,
         local: int | None,
         cov: Array,
@@ -175,13 +175,13 @@ class FederatedFilter(ErrorStateFilter):
         not: single bad satellites are the screening's business.
         """
         trial = cov.copy()
-        s = self._screen(aid, rows, trial, dx)
+        s = self._screen(measurement, rows, trial, dx)
         kept = s.codes == KEPT
         count, most = int(kept.sum()), 2 * int(kept.sum()) >= len(kept)
         degrees = count if most else len(kept)
         nis = s.nis if most else math.inf
         codes = tuple(s.codes.tolist())
-        if not self._believes(local, nis, degrees, gate_threshold(aid.gate, degrees)):
+        if not self._believes(local, nis, degrees, gate_threshold(measurement.gate, degrees)):
             return Outcome("isolated", s.nis, count, (), codes)
         if not kept.any():
             return Outcome("gated", s.nis, 0, (), codes)
@@ -216,7 +216,7 @@ class FederatedFilter(ErrorStateFilter):
         """Make the bank ready for an update."""
 
     def _judge(self, local: int | None) -> tuple[Array, Array]:
-        """Covariance and error estimate by which an aid is gated."""
+        """Covariance and error estimate by which a measurement is gated."""
         return self._covs[0], self._dxs[0]
 
     def _kept(self) -> list[tuple[Array, float]]:

@@ -8,9 +8,9 @@ an update the local filters, common to which is all the process noise but its sh
 Gate and innovation test are the local filter's own in `no_reset`; in `rescale`, where it has given
 most of what it knows away, the master's.
 
-A local filter whose aids do not observe some states grows without bound in them. Beyond `MOST`
-times the best variance it gets `LITTLE` of what all others know, and all others give it up: the sum
-stays. `no_reset` keeps local filters apart but for this part in a million.
+A local filter whose measurements do not observe some states grows without bound in them. Beyond
+`MOST` times the best variance it gets `LITTLE` of what all others know, and all others give it up:
+the sum stays. `no_reset` keeps local filters apart but for this part in a million.
 
 A local filter that is taken back gets x_g and P_g / beta_i, and the others give that share up: P_j
 <- P_j / (1 - beta_i).
@@ -131,7 +131,7 @@ class NoResetFilter(FederatedFilter):
                 self._fuse_into(self._bank[k], self._bank_dxs[k], i, share)
         else:
             self._fuse_into(self._bank[local], self._bank_dxs[local], i)
-            self._faults.heard(local, self.t_ns)
+            self._faults.received(local, self.t_ns)
         return self._fuse_all(local)
 
     def _fuse_all(self, updated: int | None) -> str:

@@ -1,6 +1,7 @@
 r"""Node of a filter at an instant, so that a smoother can come back to it.
 
-A node is an instant t_j at which aids were fused, or one between them where they are far apart:
+A node is an instant t_j at which measurements were fused, or one between them where they are far
+apart:
 
     Phi_j   transition of the error state from node j - 1 to node j
     rows    of each scalar measurement at t_j in their order: h, k, s, nu

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -69,18 +69,18 @@ class Aligner:
         """True if anything has come since the reason was said, and when (`SAID_NS`) that was."""
         self._basis = Basis(options, noise, model, saved, self.known, self._track)
 
-    def aids(self, aids: Sequence[Aid]) -> None:
-        """A measurement has arrived, as the aids it stands for."""
-        self.known.aids(aids)
-        self._track.hear(aids)
+    def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
+        """Receive the aiding measurements of one device measurement."""
+        self.known.receive(measurements)
+        self._track.receive(measurements)
         self._news = True
 
-    def sensed(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
+    def sensed(self, windows: Sequence[Window], measurements: Sequence[AidingMeasurement]) -> None:
         """Windows of the standstill detector have ended; constraints that hold."""
         for window in windows:
             self.known.window(window)
             self._news = True
-        self._track.hear(aids)
+        self._track.receive(measurements)
 
     def waits(self, start: Start, latency: LatencySearch) -> bool:
         """True if a start that was found must wait: while it is looked whether the fixes that it is

@@ -81,14 +81,14 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         return None
     fix, where, sd, _ = place
     if fix is not None:
-        apart = where[:2] - np.array(by.saved.position[:2])
-        apart[1] = math.remainder(float(apart[1]), 2.0 * math.pi)
-        metres = apart / as_geodetic(np.ones(3), float(where[0]))[:2]
+        moved = where[:2] - np.array(by.saved.position[:2])
+        moved[1] = math.remainder(float(moved[1]), 2.0 * math.pi)
+        metres = moved / as_geodetic(np.ones(3), float(where[0]))[:2]
         away = math.hypot(*metres.tolist())
         if away > CONTRADICTION_SIGMAS * math.hypot(sd, by.saved.sd_position_m):
             text = reason("parked_elsewhere", distance=away)
             by.known.poor_claims[SAVED] = text
-            by.known.tell("saved_elsewhere", text)
+            by.known.report("saved_elsewhere", text)
             return None
     start = _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
     return start and replace(start, confirmed=by.saved.confirmed)

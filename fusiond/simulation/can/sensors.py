@@ -11,6 +11,7 @@ from drivers.can.aids import (
     CanBearingDecoder,
     CanBearingOptions,
 )
+
 from drivers.can.decoder import CanDecoder
 from drivers.can.height import CanHeightOptions
 from drivers.can.python_can import can

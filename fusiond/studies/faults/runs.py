@@ -169,11 +169,11 @@ def driven(
     events: list[Event] = []
     now_s = 0.0
 
-    def hear(code: str, text: str) -> None:
+    def receive(code: str, text: str) -> None:
         events.append(Event(now_s, code, text))
 
-    navigator = Navigator(config, on_event=hear)
-    units = _Units(config, recording, lambda source, code, text: hear(code, text))
+    navigator = Navigator(config, on_event=receive)
+    units = _Units(config, recording, lambda source, code, text: receive(code, text))
     taken = 0
     received = recording.received
     for tick in range(1, round(duration_s * TICKS_PER_S) + 1):

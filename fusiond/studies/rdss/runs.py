@@ -251,7 +251,7 @@ class Navigation:
         t_ns, seen_ns = (round(t[k] * 1e9) for t in (fixes.t_s, fixes.arrival_s))
         lat, lon = (float(x) for x in fixes.position[k])
         fix = DelayedFix("rdss", seen_ns, MonotonicStamp(t_ns), lat, lon, YANTAI_DEG_M[2], CLASS_M)
-        found = self._intake.aids(fix, t_ns, 0.0, seen_ns)
+        found = self._intake.measurements_of(fix, t_ns, 0.0, seen_ns)
         if isinstance(found, str):
             raise ValueError(f"fix refused: {found}")
         for measurement in found:

@@ -10,8 +10,6 @@ from collections import Counter
 
 import can
 import pytest
-
-from drivers.base import PermanentDriverError
 from drivers.can.aids import (
     CanAttitudeDecoder,
     CanAttitudeDriver,
@@ -20,6 +18,8 @@ from drivers.can.aids import (
     CanBearingDriver,
     CanBearingOptions,
 )
+
+from drivers.base import PermanentDriverError
 from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDriver, CanImuOptions
 from drivers.measurements import (

@@ -1,4 +1,4 @@
-"""Faults of what aids the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
+"""Faults of what measurements the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
 
 from __future__ import annotations
 
@@ -332,7 +332,7 @@ def wheels_locked(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _wheels_times(r, begin_s, length_s, 0.0)
 
 
-def wheels_late(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
+def wheels_delayed(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
     """Speeds that are older than their stamps."""
     ns = round(late_s * 1e9)
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
