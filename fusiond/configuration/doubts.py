@@ -125,7 +125,7 @@ def _aiding(config: Config) -> Iterator[str]:
         if source is None or kinds is None or section.kind in kinds:
             continue
         if not kinds:
-            yield f"aiding.{name}: driver {source.driver} gives no measurement: leave the section out"
+            yield f"aiding.{name}: driver {source.driver} gives no measurement: leave it out"
             continue
         yield (
             f"aiding.{name}.kind = {section.kind!r}: driver {source.driver} gives "

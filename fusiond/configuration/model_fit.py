@@ -55,7 +55,8 @@ def model_doubts(config: Config) -> Iterator[str]:
             f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
             f"{force / MILLI_G:.3g} mg, one sigma, which is noise to it: sigma grows by "
             f"{_metres(known_m)} in a minute without measurements, where the bias does "
-            f"{_metres(moved_m)}, and the level is off by {math.atan(force / g) / DEG:.2g} deg; {instead}"
+            f"{_metres(moved_m)}, and the level is off by {math.atan(force / g) / DEG:.2g} deg; "
+            f"{instead}"
         )
 
 

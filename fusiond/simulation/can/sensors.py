@@ -11,7 +11,6 @@ from drivers.can.aids import (
     CanBearingDecoder,
     CanBearingOptions,
 )
-
 from drivers.can.decoder import CanDecoder
 from drivers.can.height import CanHeightOptions
 from drivers.can.python_can import can

@@ -10,6 +10,8 @@ from collections import Counter
 
 import can
 import pytest
+
+from drivers.base import PermanentDriverError
 from drivers.can.aids import (
     CanAttitudeDecoder,
     CanAttitudeDriver,
@@ -18,8 +20,6 @@ from drivers.can.aids import (
     CanBearingDriver,
     CanBearingOptions,
 )
-
-from drivers.base import PermanentDriverError
 from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDriver, CanImuOptions
 from drivers.measurements import (

@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from drivers.can.aids import CanAttitudeDriver, CanBearingDriver
 
+from drivers.can.aids import CanAttitudeDriver, CanBearingDriver
 from drivers.can.driver import CanDriver
 from drivers.can.gnss import CanGnssDriver
 from drivers.can.height import CanHeightDriver
