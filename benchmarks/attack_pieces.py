@@ -68,7 +68,7 @@ async def _feed(outputs: Sequence[Output]) -> None:
         for topic in TOPICS:
             if topic.name in EXAMPLES and (topic is NAV or number % 10 == 0):
                 for output in outputs:
-                    output.take(topic, EXAMPLES[topic.name])
+                    output.publish(topic, EXAMPLES[topic.name])
         number += 1
         await asyncio.sleep(0.1)
 

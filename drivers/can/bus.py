@@ -204,7 +204,7 @@ class CanBus:
         except NotImplementedError:
             fd = -1
         if fd < 0:
-            return await _ThreadReader(self, bus, gone).run()
+            return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
         read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
         loop.add_reader(fd, self._readable, fd, read, gone)
@@ -336,7 +336,7 @@ class _ThreadReader:
         self._scheduled = False
         self._stop = threading.Event()
 
-    async def run(self) -> str:
+    async def wait_until_gone(self) -> str:
         name = f"can-{self._owner.channel}"
         threading.Thread(target=self._pump, name=name, daemon=True).start()
         try:

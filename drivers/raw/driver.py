@@ -154,9 +154,9 @@ class GnssDecoder:
         if isinstance(item, Sentence):
             self._take_nmea(self._nmea.take(item, self._t_seen_ns), found)
         elif item.kind == "ubx" and item.raw[2] == CLASS_NAV:
-            self._take_ubx(self._ubx.take(item.raw, self._t_seen_ns), found)
+            self._take_ubx(self._ubx.decode(item.raw, self._t_seen_ns), found)
         elif self._raw is not None:
-            self._take_raw(self._raw.take(item, self._t_seen_ns), found)
+            self._take_raw(self._raw.decode(item, self._t_seen_ns), found)
 
     def _take_nmea(self, measurements: list[Measurement], found: list[Found]) -> None:
         for measurement in measurements:

@@ -225,12 +225,12 @@ def _rewind(number: int) -> Callable[[], int]:
     timeline.start()
     for t_ns in range(FIX_NS, steps * STEP_NS + 1, FIX_NS):
         timeline.insert(_fix("gnss", t_ns))
-    timeline.run()
+    timeline.advance()
     delayed = _fix("rdss", buffer.latest_ns - DELAY_NS)
 
     def work() -> int:
         timeline.insert(delayed)
-        timeline.run()
+        timeline.advance()
         assert timeline.counters.rewinds == 1
         return 1
 

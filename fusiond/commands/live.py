@@ -37,7 +37,7 @@ def run(config: ConfigPath, record: RecordPath = None) -> None:
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415
 
     with gathered() as missing:
-        from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+        from fusiond.live.daemon import run_daemon  # noqa: PLC0415
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
         with suppress(ConfigError):  # the daemon's own will say so

@@ -81,7 +81,7 @@ def study(
         _runs(runs or ABOUT[name].runs, workers, cluster, timeout, kept) as lost,
         progress_bar(name) as progress,
     ):
-        result = module.run(runs, seed, progress=progress)
+        result = module.run_study(runs, seed, progress=progress)
     if lost:
         result["lost_runs"] = [asdict(run) for run in lost]
         for run in lost:

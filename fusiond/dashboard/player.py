@@ -38,7 +38,7 @@ class Player:
     def _elapsed_s(self) -> float:
         return (time.monotonic() - self._began) * self.speed
 
-    async def run(self, hub: Hub) -> None:
+    async def play(self, hub: Hub) -> None:
         """Play to the end, then stand there until cancelled."""
         first_ns: int | None = None
         hub.linked("up")

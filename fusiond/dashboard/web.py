@@ -63,7 +63,7 @@ def application(
         viewer = Viewer(hub, socket, token)
         viewers.add(viewer)
         try:
-            await viewer.run()
+            await viewer.serve()
         finally:
             viewers.discard(viewer)
 

@@ -82,7 +82,7 @@ def demo(
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
         live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
-        return asyncio.run(_Run(play, live, view, Path(folder), record).run())
+        return asyncio.run(_Run(play, live, view, Path(folder), record).drive())
 
 
 def demo_play() -> Play:
@@ -100,7 +100,7 @@ def demo_play() -> Play:
 class View(Protocol):
     """Shows what has come out of the broker."""
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Show until cancelled."""
 
 
@@ -122,7 +122,7 @@ class _Run:
         self._live = live
         self._view = view
 
-    async def run(self) -> dict[str, Any]:
+    async def drive(self) -> dict[str, Any]:
         """Drive until the end, Ctrl-C or SIGTERM; then the summary."""
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -134,7 +134,7 @@ class _Run:
             asyncio.create_task(self._vehicle.run(), name="vehicle"),
             asyncio.create_task(self._subscribe(), name="subscriber"),
             asyncio.create_task(self._outages(), name="outages"),
-            asyncio.create_task(self._view.run(self._live), name="view"),
+            asyncio.create_task(self._view.show(self._live), name="view"),
         ]
         ended = asyncio.create_task(stop.wait())
         try:

@@ -122,7 +122,7 @@ class HeadlessView:
     def __init__(self, out: TextIO) -> None:
         self._out = out
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Write until cancelled."""
         if live.page is not None:
             print(f"dashboard: {live.page}", file=self._out, flush=True)
@@ -135,7 +135,7 @@ class HeadlessView:
 class LiveView:
     """The terminal, redrawn four times a second by a thread: drawing must not hold up a tick."""
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Draw until cancelled."""
         console = Console()
         before = sys.getswitchinterval()

@@ -115,7 +115,7 @@ class Front:
         mqtt = self.outputs.get("mqtt")
         if mqtt is None:
             return
-        mqtt.take(
+        mqtt.publish(
             STATUS,
             status_message(
                 Solution(t_ns, Mode.WAITING, text),

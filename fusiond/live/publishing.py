@@ -97,7 +97,7 @@ class Publishing:
 
     def _publish(self, topic: Topic, message: Message) -> None:
         for output in self._outputs.values():
-            output.take(topic, message)
+            output.publish(topic, message)
 
     def _publish_nav(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         due = [output for output, every in self._nav if every.due(t_ns)]
@@ -110,7 +110,7 @@ class Publishing:
         if utc_ns is not None and not self._clock.sets_others:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:
-            output.take(NAV, settled if output.sets_clocks else message)
+            output.publish(NAV, settled if output.sets_clocks else message)
 
     def _publish_messages(self) -> None:
         for topic, message in self._messaging.take_waiting():

@@ -298,7 +298,7 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._heading = reason("heading_from", how=start.how)
             self._event("aligned", self._heading)
-        self.timeline.run(record)
+        self.timeline.advance(record)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
             self._verdicts_ns = e.t_ns

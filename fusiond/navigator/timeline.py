@@ -177,7 +177,7 @@ class Timeline:
             self._give_up(1, "no_imu" if self._checkpoints else "no_alignment")
         return entry
 
-    def run(self, record: bool = False) -> None:
+    def advance(self, record: bool = False) -> None:
         """Apply every measurement whose instant the IMU has reached, and propagate to its last
         sample."""
         latest, imu, kept = self.imu.latest_ns, self.imu, self._checkpoints

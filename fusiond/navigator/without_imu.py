@@ -256,7 +256,7 @@ class WithoutImu:
         if count > 0:
             times = self._imu.latest_ns + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
             self._imu.append(times, np.repeat(_sensed(e.nav), count, axis=0))
-        self._timeline.run()
+        self._timeline.advance()
         if not (np.isfinite(e.nav).all() and np.isfinite(e.covariance).all()):
             self._event("filter_not_finite", "Without an IMU: starting again")
             self.stop()

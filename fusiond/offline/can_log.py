@@ -118,7 +118,7 @@ class _LogTime:
 
 def read_can_log(path: Path, config: Config) -> CanLog:
     """Take the log apart by the drivers of the configuration. Raises `TableError`."""
-    return _Replay(path, config).run()
+    return _Replay(path, config).read()
 
 
 class _Replay:
@@ -148,7 +148,7 @@ class _Replay:
         now_ns = self._host.monotonic_ns
         return {name: make(name, o, emit, now_ns) for name, (make, o) in self._sources.items()}
 
-    def run(self) -> CanLog:
+    def read(self) -> CanLog:
         """Read the log to its end."""
         self._on_buses = buses = self._buses()
         refusals, refused = Refusals(), Counter[str]()

@@ -34,7 +34,7 @@ class Output(Protocol):
     @property
     def status(self) -> DriverStatus: ...
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """Keep a message, of which the task may send the latest; never waits, never raises."""
 
     async def run(self) -> None:

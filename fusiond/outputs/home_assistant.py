@@ -51,13 +51,13 @@ class HomeAssistantDiscovery:
         self._description = Description(description(node, around.vehicle, around.sources))
         self.counters: Counter[str] = Counter()
         self._mqtt.listen(f"{section.prefix}/status", self._on_status)
-        self._mqtt.take(self._topic, self._description)
+        self._mqtt.publish(self._topic, self._description)
 
     @property
     def status(self) -> DriverStatus:
         return self._mqtt.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """Nothing to do: the entities read what MQTT publishes."""
 
     async def run(self) -> None:
@@ -66,7 +66,7 @@ class HomeAssistantDiscovery:
     def _on_status(self, payload: bytes) -> None:
         if payload == b"online":
             self.counters["births"] += 1
-            self._mqtt.take(self._topic, self._description)
+            self._mqtt.publish(self._topic, self._description)
 
 
 def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, Any]:

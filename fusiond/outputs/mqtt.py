@@ -1,6 +1,6 @@
 """MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
 
-`take` puts a message in its place and returns: it never waits and never raises. One task sends
+`publish` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
 the next); both belong to one connection and end with it. A broker that accepts bytes and does
 nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
@@ -111,7 +111,7 @@ class MqttPublisher:
         """Let `listener` have what others publish at `address`; before `run`."""
         self._listeners[address] = listener
 
-    def take(self, topic: Topic, message: BaseModel) -> None:
+    def publish(self, topic: Topic, message: BaseModel) -> None:
         """Put a message into its place: with QoS 0 the latest counts, what is retained is
         confirmed and sent again after each connection, all else is queued."""
         if topic.qos == 0:

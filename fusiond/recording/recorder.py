@@ -207,7 +207,7 @@ class Recorder:
         detail = self.recording.file or self.state
         return DriverStatus("failed" if self.state == "failed" else "running", detail)
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """A message of a topic goes into the log; an event of `recording.events` starts it where
         that is wanted. `innovations` does not: the log has each of them by itself."""
         t_ns = self._clock.now_ns()

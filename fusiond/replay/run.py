@@ -187,7 +187,7 @@ class _Run:
 async def _publish(run: _Run, config: Config, speed: float) -> None:
     """At `speed` times real time, what the daemon would publish."""
     mqtt = MqttPublisher(config.mqtt, config.vehicle, on_event=lambda code, text: None)
-    run.listeners.append(partial(mqtt.take, EVENT))
+    run.listeners.append(partial(mqtt.publish, EVENT))
     sending = asyncio.create_task(mqtt.run())
     loop = asyncio.get_running_loop()
     publishing: Publishing | None = None

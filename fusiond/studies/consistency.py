@@ -187,7 +187,9 @@ def _quiet(
     return rows
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """Study with `runs` windows for each false-alarm rate and a fortieth (at least 50) of them
     as runs of 1,800 epochs for each power. The same arguments give the same result.
     """

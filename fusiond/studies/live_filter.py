@@ -76,4 +76,4 @@ class LiveFilter:
             self._given = end
         for measurement in measurements:
             self._timeline.insert(measurement)
-        self._timeline.run()
+        self._timeline.advance()

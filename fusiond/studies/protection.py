@@ -176,7 +176,9 @@ def drive(case: Case, watched: bool, seed: int) -> dict[str, Array]:
     }
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` drives a case. All but `cost_ratio` repeats exactly.
 
     ValueError for fewer than 1 run."""

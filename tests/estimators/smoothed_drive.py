@@ -228,7 +228,7 @@ def run(
         while given < len(measurements) and measurements[given][0] <= second + 1.0:
             timeline.insert(measurements[given][1])
             given += 1
-        timeline.run()
+        timeline.advance()
     outcomes = timeline.counters.outcomes
     unused = ("gated", "isolated", "too_old")
     assert not any(counts[name] for counts in outcomes.values() for name in unused), outcomes

@@ -330,7 +330,7 @@ def test_a_rewind_gives_the_same_bits(mode: Mode, fault: study.FaultKind) -> Non
             ) <= int(times[min(first + row + 4, last - 1)]):
                 timeline.insert(waiting[k])
                 k += 1
-            timeline.run()
+            timeline.advance()
         assert k == len(waiting)
         assert (timeline.counters.rewinds > 0) == (late_ns > 0)
         results.append(estimator)

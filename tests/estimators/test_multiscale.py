@@ -162,11 +162,11 @@ def test_an_arrival_out_of_order_is_exact() -> None:
         timeline.start()
         for measurement in order:
             timeline.insert(measurement)
-        timeline.run()
+        timeline.advance()
         for measurement in flat:
             if measurement not in order:
                 timeline.insert(measurement)
-                timeline.run()
+                timeline.advance()
         found.append((estimator, timeline))
     (a, _), (b, rewound) = found
     assert rewound.counters.rewinds == len(flat) - len(late)

@@ -217,7 +217,7 @@ def test_a_parked_vehicle_is_told_nothing_of_its_tilt(turns: bool) -> None:
         t_ns, gyros = t_s * runs.SECOND, (still[0], still[1], still[2])
         timeline.insert(ZeroAngularRateUpdate("rate", t_ns, 0.9999, gyros, math.radians(0.1), rest))
         timeline.insert(ZeroVelocityUpdate("velocity", t_ns, 0.9999, 0.05, rest))
-    timeline.run()
+    timeline.advance()
     print(sigmas[59], sigmas[-1])
     assert (sigmas[59] > 2.0).all()
     assert (sigmas[-1] > 0.9 * sigmas[59]).all()
@@ -275,5 +275,5 @@ def test_rest_that_is_refused_ends_at_once() -> None:
     for t_s, most_m_s in ((1, 0.5), (2, -1.0)):
         rest = runs.rest(max_speed_m_s=most_m_s, end_s=t_s)
         timeline.insert(ZeroVelocityUpdate("rest", t_s * runs.SECOND, 0.9999, 0.05, rest))
-    timeline.run()
+    timeline.advance()
     assert left == [1.5, 0.0]

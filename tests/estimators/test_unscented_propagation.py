@@ -194,10 +194,10 @@ def test_a_rewind_gives_the_bits_of_arrival_in_order(propagation: bool) -> None:
         timeline.start()
         for measurement in measurements[:5] + measurements[6:] if late else measurements:
             timeline.insert(measurement)
-        timeline.run()
+        timeline.advance()
         if late:
             timeline.insert(measurements[5])
-            timeline.run()
+            timeline.advance()
             assert timeline.counters.rewinds == 1
         assert timeline.counters.outcomes["gnss"]["fused"] >= len(measurements)
         ends.append((u.nav.copy(), u.covariance.copy(), u.xi.copy()))

@@ -14,7 +14,7 @@ import pytest
 
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
-from fusiond.live.daemon import run
+from fusiond.live.daemon import run_daemon
 from fusiond.live.reload import difference
 from fusiond.navigation.solution import Mode
 from fusiond.replay.run import Wish, replay
@@ -152,7 +152,7 @@ def test_sighup_reads_the_file_again_and_systemd_hears_of_it(
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
             manager.bind(str(tmp_path / "notify"))
             manager.setblocking(False)
-            run(load_config(path), path, lambda: load_config(path))
+            run_daemon(load_config(path), path, lambda: load_config(path))
             assert manager.recv(256).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
     finally:
         log.removeHandler(operator)

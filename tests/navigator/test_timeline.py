@@ -202,8 +202,8 @@ def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
             entries.setdefault(i, entry)
             following += 1
             if not lazy:
-                timeline.run()
-        timeline.run()
+                timeline.advance()
+        timeline.advance()
 
     reference, outcomes = in_order()
     assert_same_state(timeline.estimator, reference)
@@ -224,10 +224,10 @@ def test_order_of_arrival_within_one_instant_is_not_seen() -> None:
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
         timeline = d.timeline()
         timeline.imu.append(d.times, d.samples)
-        timeline.run()
+        timeline.advance()
         for i in order:
             timeline.insert(last[i])
-            timeline.run()
+            timeline.advance()
         states.append(timeline.estimator)
     assert_same_state(states[0], states[1])
     assert_same_state(states[0], states[2])
@@ -245,7 +245,7 @@ def test_rows_of_one_instant_are_judged_together_as_each_by_itself(
     timeline = d.timeline(keep_s=60.0)
     timeline.imu.append(d.times, d.samples)
     entries = [timeline.insert(measurement) for measurement in d.measurements]
-    timeline.run()
+    timeline.advance()
     assert 0 < judged.total() < 0.8 * each
     assert [entry.outcome for entry in entries] == outcomes
     timeline.estimator.propagate(timeline.imu, timeline.imu.latest_ns)
@@ -279,13 +279,13 @@ def test_a_measurement_at_the_oldest_instant_is_exact_and_before_it_too_old(chun
             rows = slice(first, min(first + chunk, arrival))
             timeline.imu.append(d.times[rows], d.samples[rows])
             if rows.stop < arrival:
-                timeline.run()
+                timeline.advance()
         oldest = timeline.oldest_ns
         assert oldest <= timeline.imu.latest_ns - round(KEEP_S * 1e9)
         assert timeline.insert(replace(late, t_ns=oldest - 1)).outcome == Outcome("too_old")
         measurement = replace(late, t_ns=oldest)
         assert timeline.insert(measurement).outcome is None
-        timeline.run()
+        timeline.advance()
 
         reference = d.estimator()
         buffer = runs.filled_buffer(IMU, d.times[:arrival], d.samples[:arrival])
@@ -308,7 +308,7 @@ def test_before_the_start() -> None:
     assert timeline.counters.outcomes[early.source] == {"no_alignment": 1}
     assert timeline.insert(early).outcome == Outcome("too_old")
     timeline.imu.append(d.times, d.samples)
-    timeline.run()
+    timeline.advance()
     assert timeline.counters.outcomes[d.measurements[1].source]["fused"] == 1
 
 
@@ -345,7 +345,7 @@ def test_memory_does_not_grow_on_a_long_run() -> None:
         times = int(d.times[0]) + step * np.arange(1 + 50 * second, 51 + 50 * second)
         timeline.imu.append(times, still)
         timeline.insert(replace(d.measurements[0], t_ns=int(times[25]) - 3 * runs.SECOND))  # type: ignore[type-var]
-        timeline.run()
+        timeline.advance()
         sizes.append((len(timeline._entries), len(timeline._checkpoints), len(timeline.imu.times)))
     assert max(s[0] for s in sizes) < 20
     assert max(s[1] for s in sizes) < 40
@@ -371,11 +371,11 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
         upto = int(np.searchsorted(d.times, fix.t_ns + round(delay_s * 1e9), side="right"))
         timeline.imu.append(d.times[sample:upto], d.samples[sample:upto])
         sample = upto
-        timeline.run()
+        timeline.advance()
         entries.append(timeline.insert(fix))
-        timeline.run()
+        timeline.advance()
     timeline.imu.append(d.times[sample:], d.samples[sample:])
-    timeline.run()
+    timeline.advance()
     names = [e.outcome.name for e in entries if e.outcome]
     assert set(names[:10]) == {"fused"}
     assert names[10:12] == ["gated"] * 2
@@ -399,7 +399,7 @@ def test_a_wrong_heading_is_left_out() -> None:
         )
         for a in d.measurements
     ]
-    timeline.run()
+    timeline.advance()
     names = [
         e.outcome.name
         for e in entries
@@ -430,7 +430,7 @@ def test_a_wrong_heading_is_out_from_the_fourth_on() -> None:
         )
         for a in d.measurements
     ]
-    timeline.run()
+    timeline.advance()
     names = [
         e.outcome.name
         for e in entries
@@ -448,7 +448,7 @@ def test_a_heading_that_nothing_else_can_check_is_published_as_open() -> None:
     for a in d.measurements:
         if isinstance(a, HeadingMeasurement):
             timeline.insert(replace(a, yaw_rad=a.yaw_rad + math.radians(40.0)))
-    timeline.run()
+    timeline.advance()
     truth = runs.true_nav(runs.town_truth(SECONDS, IMU.rate_hz), np.array([SECONDS]))[0]
     error = runs.nav_error(timeline.estimator.nav, truth)[2]
     assert not timeline.diagnosis.findings

@@ -44,7 +44,7 @@ async def test_a_broker_of_3_1_1_is_spoken_to_in_its_version(
         ):
             await it.until(lambda r: r.codes() == ["mqtt_connected"])
             assert old.versions == [5, 4]
-            it.publisher.take(EVENT, event("by 3.1.1"))
+            it.publisher.publish(EVENT, event("by 3.1.1"))
             await listener.until(heard("event"))
             while not heard("reply")(listener):
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"1"}', qos=1)
@@ -60,7 +60,7 @@ async def test_the_broker_of_the_demo_is_spoken_to_in_its_version() -> None:
     with DemoBroker() as demo:
         async with running(_options(demo.port)) as it:
             await it.until(lambda r: r.codes() == ["mqtt_connected"])
-            it.publisher.take(EVENT, event("taken"))
+            it.publisher.publish(EVENT, event("taken"))
             await it.until(lambda r: r.publisher.counters["mqtt_published"] >= 2)
 
 

@@ -48,7 +48,7 @@ class Bench:
         self.event(code, "recording")
 
     def event(self, code: str, source: str = "navigator") -> None:
-        self.recorder.take(EVENT, event_message(None, source=source, code=code, text=code))
+        self.recorder.publish(EVENT, event_message(None, source=source, code=code, text=code))
 
     def tick(self, count: int = 1, payload: bytes = b"$GNGGA") -> None:
         """Ticks of 10 ms, each after a read."""

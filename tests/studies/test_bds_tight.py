@@ -31,7 +31,7 @@ def result() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (runs, bds_tight):
             patch.setattr(module, "ORBIT_ERRORS_M", sizes)
-        return bds_tight.run(2)
+        return bds_tight.run_study(2)
 
 
 def test_keys_of_the_issue() -> None:

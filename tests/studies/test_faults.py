@@ -25,7 +25,7 @@ from fusiond.studies.faults.judge import (
 from fusiond.studies.faults.library import FAULTS, PHASES
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recording import Drive, Received, Recording
-from fusiond.studies.faults.runs import VEHICLE, Row, rows, run, run_row
+from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
 
 GOOD = (1.0,) * len(QUANTITIES)
 BEGIN_S, END_S = 10.0, 20.0
@@ -279,7 +279,7 @@ def test_a_spare_says_that_it_may_sit_askew() -> None:
     """It does, by half a degree: its own tilt is soon known to a tenth of that."""
     drive = Drive(spare=True, duration_s=46.0)
     fault = replace(FAULTS["imu_silent_spare"], begin_s=26.0, drive=drive)
-    found = run(fault, "navigating", seed=0)
+    found = run_fault(fault, "navigating", seed=0)
     assert found["verdict"] == "degraded and said so", found
     assert [event["code"] for event in found["events"]] == ["imu_spare"]
     assert found["largest_ratio"] < 5.0

@@ -24,7 +24,7 @@ from fusiond.studies.ukf import study as ukf
 
 @cache
 def result() -> dict[str, Any]:
-    return ukf.run(2)
+    return ukf.run_study(2)
 
 
 def test_keys_of_the_issue() -> None:

@@ -96,7 +96,9 @@ class HeadingBank:
     def _best(self) -> Cell:
         return max(self._cells, key=lambda cell: cell.weight)
 
-    def run(self, imu: ImuBuffer, measurements: Sequence[AidingMeasurement], until_ns: int) -> None:
+    def advance(
+        self, imu: ImuBuffer, measurements: Sequence[AidingMeasurement], until_ns: int
+    ) -> None:
         """To `until_ns`, with `measurements` that are valid until then, in their order."""
         for measurement in measurements:
             if measurement.t_ns < self._received_ns.get(measurement.source, 0) + INTERVAL_NS:

@@ -133,7 +133,7 @@ class Track:
         del self._measurements[: len(due)]
         if self._own_slip:
             due = self._with_slip(due, bank.t_ns, until_ns)
-        bank.run(imu, due, until_ns)
+        bank.advance(imu, due, until_ns)
         if bank.lost:
             self._bank = None
             if bank.backwards:

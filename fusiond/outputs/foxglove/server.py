@@ -74,7 +74,7 @@ class FoxgloveServer:
         self.server = TcpServer(self.name, self.port, around.guests, self._greet, MOST_VIEWERS)
         self.counters = self.server.counters
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         self._latest[topic] = message
         if not self.server.clients:
             self._encoded.clear()

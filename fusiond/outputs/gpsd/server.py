@@ -100,7 +100,7 @@ class GpsdServer:
     def status(self) -> DriverStatus:
         return self.server.port.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):
             self._activated = self._activated or message.t_utc
             self._epoch = _Epoch(message, self)

@@ -22,7 +22,7 @@ from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S
 from fusiond.studies.faults.library import PHASES, Fault
 from fusiond.studies.faults.recording import Alter, Drive
-from fusiond.studies.faults.runs import run
+from fusiond.studies.faults.runs import run_fault
 
 LASTS_S = 60.0
 BEGINS = 10
@@ -96,7 +96,7 @@ def power_run(job: tuple[str, float, int]) -> dict[str, Any]:
     name, size, seed = job
     alter = SWEEPS[name].altered_by(size)
     begin_s = PHASES["navigating"].fix_s + seed % BEGINS
-    found = run(Fault(alter, LASTS_S, begin_s=begin_s, drive=DRIVE), "navigating", seed)
+    found = run_fault(Fault(alter, LASTS_S, begin_s=begin_s, drive=DRIVE), "navigating", seed)
     kept = ("verdict", "noticed_s", "largest_horizontal_m", "largest_ratio", "largest_ratio_of")
     return {
         "fault": name,

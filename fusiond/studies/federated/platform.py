@@ -140,7 +140,7 @@ def _run(estimator: Estimator, samples: Array, fixes: list[Measurement]) -> Arra
             for measurement in measurements:
                 timeline.insert(measurement)
             following += 1
-        timeline.run()
+        timeline.advance()
         if t >= COUNTED_FROM_S:
             errors.append(nav_error(estimator.nav, true[i])[6:8])
     return np.array(errors)

@@ -204,7 +204,7 @@ def _run(
         ):
             timeline.insert(measurements[next_measurement])
             next_measurement += 1
-        timeline.run()
+        timeline.advance()
         new = set(estimator.isolated) - known
         known = set(estimator.isolated)
         if new:

@@ -38,7 +38,7 @@ from fusiond.studies.multiscale.runs import (
     times_per_step_us,
 )
 
-__all__ = ["plot", "run", "tables"]
+__all__ = ["plot", "run_study", "tables"]
 
 
 DEFAULT_RUNS = 100
@@ -97,7 +97,9 @@ def _paper() -> dict[str, Any]:
     return out
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat."""
     count = runs or DEFAULT_RUNS
     if count < 2:

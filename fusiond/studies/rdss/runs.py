@@ -244,7 +244,7 @@ class Navigation:
             times = np.arange(self._given + 1, end + 1, dtype=np.int64) * self._period_ns
             self.imu.append(times, self._samples[self._given : end])
             self._given = end
-        self.timeline.run()
+        self.timeline.advance()
 
     def arrive(self, fixes: Fixes, k: int) -> None:
         """Fix k arrives."""
@@ -256,7 +256,7 @@ class Navigation:
             raise ValueError(f"fix refused: {found}")
         for measurement in found:
             self.timeline.insert(measurement)
-        self.timeline.run()
+        self.timeline.advance()
 
     def nees(self, true: Array, biases: Array) -> tuple[float, float]:
         """NEES of all errors (12,) and of the position (2,); true state (10,), biases (6,)."""

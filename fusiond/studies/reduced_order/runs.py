@@ -130,7 +130,7 @@ def live(
         for timeline in timelines:
             timeline.imu.append(times[second], samples[second])
             entries = [timeline.insert(measurement) for measurement in measurements]
-            timeline.run()
+            timeline.advance()
             for entry in entries:
                 if entry.outcome is None or entry.outcome.name != "fused":
                     raise ValueError(f"{entry.measurement.source} at {k + 1} s: {entry.outcome}")

@@ -59,7 +59,9 @@ CHECKED_S = 100
 """Errors of the live filters are taken at every 100th second."""
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study; `runs` (default 40) live flights of 600 s check the covariance analysis.
 
     All but times repeat exactly.

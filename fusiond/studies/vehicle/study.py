@@ -68,7 +68,9 @@ def rows_of(case: str, runs: list[Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """`runs` cars a case. The same arguments give the same result."""
     count = runs or DEFAULT_RUNS
     step = step_counter(progress, count * len(CASES))
