@@ -25,8 +25,10 @@ CONNECT_S = 5.0
 """For name and connection together a few round trips of a mobile network; the first packet is sent
 again after 1 s and 3 s (RFC 6298, section 2)."""
 KEEPALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte, of which a receiver that
-works leaves none; three probes, since mobile links lose one now and then."""
+"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte.
+
+A receiver that works leaves no such pause; three probes, since mobile links lose one now and
+then."""
 UNANSWERED_MS = 11_000
 """The same for bytes of ours that are not acknowledged (RFC 5482)."""
 SENDER_HELD_S = 5.0

@@ -27,8 +27,9 @@ NMEA_TIME_NS = 5_000_000_000
 """Another message tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. That of
 RXM-RAWX is up to some milliseconds off, as the receiver's clock is."""
 UBX_FIX_NS = 5_000_000_000
-"""Fixes of UBX-NAV, which have a velocity down and sigmas of their own, stand for the same ones by
-NMEA until none has come for this long."""
+"""Fixes of NMEA are left out until none of UBX-NAV has come for this long.
+
+Those of UBX-NAV are the same fixes with a velocity down and sigmas of their own."""
 SAME_FIX_NS = 20_000_000
 """NMEA prints hundredths of a second, of what UBX gives in nanoseconds; fixes come 50 ms apart at
 the least."""

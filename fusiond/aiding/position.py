@@ -138,9 +138,11 @@ def position_rows(
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,), H (m, n) and r (m,) for the first m of north, east, down, with what offset in
-    time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias` (up to 3,),
-    `time` (0 or 1,), `rest` (0 or 3,), `markov` (0 or 3,): slots in `xi`."""
+    """Write the rows of a position: z (m,), H (m, n) and r (m,).
+
+    Of north, east, down the first m. P (n, n) says what the offset in time and the lever arm leave
+    out; (0, 0) where none is known. Slots in `xi`: `bias` (up to 3,), `time` (0 or 1,), `rest`
+    (0 or 3,), `markov` (0 or 3,)."""
     m, n = h.shape
     h[:] = 0.0
     share = (s0, s1, s2)

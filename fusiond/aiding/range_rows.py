@@ -291,9 +291,11 @@ def by_clock(
     sums: Array,
     first: Indices,
 ) -> int:
-    """Write to `sums` (k, 2), for each clock that has both, the sum of what is `whitened` and
-    `kept` (m,) of its ranges and that of its rates, each over the root of its number; to `first`
-    (k,) the clocks' first satellites, by which they are ordered. How many clocks that are."""
+    """Sum the innovations of each receiver clock; the number of clocks.
+
+    `sums` (k, 2) takes, for each clock that has both, the sums of its ranges and of its rates that
+    are `kept` (m,) of `whitened` (m,), each over the root of its number; `first` (k,) the clocks'
+    first satellites, by which they are ordered."""
     found = 0
     for i in range(clock.shape[0]):
         new = clock[i] >= 0

@@ -192,8 +192,10 @@ class RestEvidence:
         return found
 
     def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
-        """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to
-        `end_ns`, both included, and the sigma of one of its measurements."""
+        """Mean velocity north, east (m/s) of one source, and the sigma of one of its measurements.
+
+        From `begin_ns` to `end_ns`, both included; the source is the one with the most
+        measurements."""
         self.catch_up()
         found: list[_Speed] = []
         for speeds in self._speeds.values():

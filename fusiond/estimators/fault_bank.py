@@ -58,8 +58,9 @@ LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(co
 BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
 PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
 PROMOTED = 3.0
-"""Log odds by which an onset must be likelier than one of the level above to take its place when
-its own turn to begin anew has come: twenty to one."""
+"""Log odds, twenty to one, by which an onset replaces one of the level above.
+
+Asked when its own turn to restart has come."""
 
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the

@@ -97,9 +97,11 @@ Indices = NDArray[np.int64]
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
-    the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
-    of an antenna where a lever arm is estimated (fusiond.estimators.antenna_place)."""
+    """Centralised filter that carries the tilt's axes along with the heading.
+
+    In its P the axes of a tilt turn with the heading, the gyros' part stays with the turn that it
+    is known of (fusiond.estimators.turn_rate), and, where a lever arm is estimated, so does the
+    place of an antenna (fusiond.estimators.antenna_place)."""
 
     def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
         super().__init__(model, gap_s, faults=faults)

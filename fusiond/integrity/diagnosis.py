@@ -351,8 +351,10 @@ class Diagnosis:
         return self._series[name]
 
     def _goes_its_own_way(self, one: Series) -> bool:
-        """True if a position whose fault is over has gone the way that the velocity of its device
-        says, which is in service, for a minute: it is the filter that is somewhere else."""
+        """True if the filter, not the device, is somewhere else.
+
+        A position whose fault is over has followed its device's velocity, which is in service, for
+        a minute."""
         if not (one.out and one.locates and one.reason == STILL):
             return False
         moves = [s for s in self._series.values() if s.device == one.device and s.moves]

@@ -80,8 +80,9 @@ def judge_sensed(
     left: Array,
     rows: Array,
 ) -> None:
-    """Residuals of a guess for k velocities, in sigmas (k, 3), and the slopes (k, 3, 13) of what it
-    says by phi, biases (6,) of force and rate, offset in time and first velocity
+    """Residuals of a guess for k velocities, in sigmas (k, 3), and their slopes (k, 3, 13).
+
+    The slopes are by phi, biases (6,) of force and rate, offset in time and first velocity
     (`fusiond.navigator.alignment.motion_fit`).
 
     Of a stretch of samples: seconds (k,), rate and force (k, 6) as sensed at the fixes; the

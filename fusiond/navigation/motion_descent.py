@@ -70,8 +70,9 @@ def judge_guess(
     z: Array,
     rows: Array,
 ) -> None:
-    """Write what a guess leaves (3 k + 10,) and the slopes (3 k + 10, 13) of what it says by its
-    steps, in sigmas; the rest as of `judge_sensed`."""
+    """Write a guess's residuals (3 k + 10,) and their slopes (3 k + 10, 13), in sigmas.
+
+    The slopes are by the steps of the guess; the rest as of `judge_sensed`."""
     k = t_s.shape[0]
     biases, first = guess[BIASES:DELAY], guess[FIRST:]
     # C_0, since which the axes have turned to C_T.

@@ -200,8 +200,9 @@ class WayTurns:
 
 
 def _directions(faced: Array) -> tuple[float, float]:
-    """The mean of directions (m,) that were faced one after the other, in their own turns, and what
-    one of them, any, is off by, one sigma (rad)."""
+    """Mean of directions (m,) and one sigma (rad) of any of them.
+
+    They were faced one after the other, each in its own turn."""
     begin = float(faced[0])
     mean = complex(np.exp(1j * (faced - begin)).mean())
     spread = float(faced.max() - faced.min())

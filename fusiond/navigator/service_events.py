@@ -20,9 +20,11 @@ class ServiceEvents:
         """By kind and device: the last finding that was seen."""
 
     def report(self) -> bool:
-        """`sensor_fault` for each step that was corrected, `fault_over` for a source's fault that
-        the solution had followed, `isolated` and `readmitted` for each
-        series that has left or is back in service; whether there are new findings."""
+        """Report changes of service; True if there are new findings.
+
+        Events: `sensor_fault` for each step that was corrected, `fault_over` for a source's fault
+        that the solution had followed, `isolated` and `readmitted` for each series that has left
+        service or is back."""
         diagnosis, found = self._timeline.diagnosis, False
         for finding in diagnosis.findings:
             key = finding.kind.name, finding.kind.device

@@ -245,8 +245,11 @@ class _Replay:
                 reports[k] = ahead_ns + set_ns
 
     def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
-        """By how much the recorder's clock was set before this frame, by the reports of UTC of the
-        sources that have told it before and go on to tell it: behind further leaps, too."""
+        """Step (ns) of the recorder's clock before this frame; None where no report of UTC says
+        one.
+
+        The reports are of the sources that gave UTC before and go on to give it: behind further
+        jumps, too."""
         known = {name for name, reports in self._reports.items() if reports}
         if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None

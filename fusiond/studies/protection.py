@@ -233,8 +233,10 @@ def _figures(case: Case, drives: list[dict[str, Array]]) -> dict[str, Any]:
 
 
 def correlation_s(ratio: Array) -> float:
-    """Integrated autocorrelation time 1 + 2 sum rho (s) of a series of seconds (k, m), the sum up
-    to the first rho that is not positive (Geyer, Statistical Science 7 (1992), section 3.3)."""
+    """Integrated autocorrelation time 1 + 2 sum rho (s) of a series of seconds (k, m).
+
+    The sum goes up to the first rho that is not positive (Geyer, Statistical Science 7 (1992),
+    section 3.3)."""
     x = ratio - ratio.mean(axis=0)
     power = float((x * x).sum())
     total = 1.0

@@ -80,8 +80,9 @@ def fit(
     sd_yaw: float,
     sd_delay_s: float = 0.0,
 ) -> Fit:
-    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, and velocities that are
-    late by 0, to within `sd_delay_s`, begun at `f`."""
+    """Best fit from `f`, with `yaw` (rad) at the last fix to within `sd_yaw`.
+
+    Velocities are delayed by 0, to within `sd_delay_s`."""
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     # The offset in its sigmas: one that is known has a column of zeros.
@@ -133,8 +134,10 @@ class Descent(NamedTuple):
 
 
 def _parts(m: Measured, rate_sd: float) -> list[Measured]:
-    """The last of the fixes over spans that double, from one in which a rate bias turns the axes by
-    `FIRST_RAD` at most, as long as they are shorter than that of all."""
+    """Last fixes over spans that double.
+
+    The first span is one in which a rate bias turns the axes by `FIRST_RAD` at most; the last is
+    shorter than that of all."""
     found: list[Measured] = []
     span_s = FIRST_RAD / (3.0 * rate_sd) if rate_sd > 0.0 else math.inf
     since_s = (m.instants[-1] - m.instants) * 1e-9

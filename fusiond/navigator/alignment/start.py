@@ -80,17 +80,19 @@ def velocity_of(candidate: VelocityCandidate) -> tuple[Array, Array]:
 
 
 class Levelled(NamedTuple):
-    """Attitude C_nb (3, 3) when gravity told roll and pitch, and one sigma (rad) of what has come
-    to them since and beside the force errors of then."""
+    """Attitude C_nb (3, 3) at the instant of levelling, and its sigma (rad).
+
+    The sigma is of what roll and pitch have gained since, beside the force errors of then."""
 
     dcm: Array
     sd: float = LEVEL_SD_RAD
 
 
 class Fitted(NamedTuple):
-    """Force and rate biases (6,) of a level found in motion, offset in time (s) of the velocities
-    that it was found from, and the covariance (10, 10) that they share with the attitude, which
-    comes first."""
+    """Force and rate biases (6,) of a level found in motion.
+
+    With the offset in time (s) of the velocities that it was found from, and the covariance
+    (10, 10) that they share with the attitude, which comes first."""
 
     biases: Array
     delay_s: float
@@ -240,7 +242,7 @@ def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocit
 
 
 def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
-    """Rows of the velocity in `by` (n, n), likewise (fusiond.aiding.velocity)
+    """Rows of the velocity in `by` (n, n) (fusiond.aiding.velocity).
 
     dv = e + a dtau + C [w x] dl - (C (w x l)) x phi
     """

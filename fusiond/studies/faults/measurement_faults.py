@@ -169,8 +169,9 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def late(r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S) -> Recording:
-    """Fixes that are older than their stamps, as of a line that is slow from its first byte on and
-    a receiver whose time nobody knows."""
+    """Fixes that are older than their stamps.
+
+    As of a line that is slow from its first byte on, and a receiver whose time nobody knows."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
     ns = round(late_s * 1e9)
     return r.with_received(

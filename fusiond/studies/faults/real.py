@@ -238,8 +238,9 @@ def _of_quality(recording: Recording, qualities: Mapping[int, int]) -> Recording
 def _at_ticks(
     table: TrajectoryTable, begin_s: float, length_s: float
 ) -> tuple[States, Array, Bools]:
-    """The reference at each tick, its sigmas (n, 9), zero where it states none, and which ticks are
-    as near to it as that it holds."""
+    """Reference at each tick, its sigmas (n, 9), and the ticks at which it holds.
+
+    A sigma is zero where the reference states none; it holds near its own rows."""
     t_s = np.arange(1.0, math.floor(length_s * TICKS_PER_S) + 0.5) * STEP_S
     there_s = t_s + begin_s
 
