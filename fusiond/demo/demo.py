@@ -37,6 +37,7 @@ from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -119,6 +120,9 @@ class _Run:
         self._score = Score()
         self._without_gnss: list[tuple[float, float]] = []
         self._daemon = Daemon(config, on_solution=self._on_solution)
+        publisher = self._daemon.outputs["mqtt"]
+        assert isinstance(publisher, MqttPublisher), "the demo's configuration has a broker"
+        publisher.begin_with_3_1_1()  # amqtt says nothing to 5: a second in which `nav` is lost
         self._live = live
         self._view = view
 

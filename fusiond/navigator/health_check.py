@@ -36,4 +36,4 @@ class FailedMeasurements:
         """A measurement of `source` is `failed` for `error`."""
         if source not in self._known:
             self._known.add(source)
-            self._report("aid_failed", f"{source} could not be used: {error}")
+            self._report("measurement_failed", f"{source} could not be used: {error}")

@@ -118,7 +118,7 @@ class Navigator:
             config, shared_blocks, self._event, self.last_fused_ns, self._on_outcome
         )
         self._last_position_ns = self._verdicts_ns = 0
-        self._heading = ""
+        self._basis = ""
         self.started: Start | None = None
         self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
@@ -296,8 +296,8 @@ class Navigator:
             self.started = start
             self._start_check = StartCheck(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._heading = reason("heading_from", how=start.how)
-            self._event("aligned", self._heading)
+            self._basis = reason("heading_from", how=start.how)
+            self._event("aligned", self._basis)
         self.timeline.advance(record)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
@@ -419,7 +419,7 @@ class Navigator:
         """Mode at `t_ns`, and why."""
         started = None
         if self.started is not None:
-            started = StartedNavigation(self._heading, self.unconfirmed, self._last_position_ns)
+            started = StartedNavigation(self._basis, self.unconfirmed, self._last_position_ns)
         return self._status.of(t_ns, started, self._aligner.reason)
 
     @property
@@ -452,6 +452,9 @@ class Navigator:
             if t_ns > self.last_fused_ns.get(source, -1):
                 self.last_fused_ns[source] = t_ns
             if measurement.locates and t_ns > self._last_position_ns:
+                unaided_s = (t_ns - self._last_position_ns) * 1e-9
+                if unaided_s > self.config.estimator.coast_after_s:
+                    self._basis = reason("fixes_back", source=source)
                 self._last_position_ns = t_ns
         if measurement.screened:
             measurement.judged(outcome.rows, outcome.whitened)

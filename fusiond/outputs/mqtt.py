@@ -105,6 +105,10 @@ class MqttPublisher:
         self._quiet = subscriptions.quiet()
         self.status = DriverStatus()
 
+    def begin_with_3_1_1(self) -> None:
+        """Try MQTT 3.1.1 first: for a broker that is known not to reply to version 5."""
+        self._version.is_5 = False
+
     # ------------------------------------------------------------------ for the tick
 
     def listen(self, address: str, listener: Callable[[bytes], None]) -> None:

@@ -44,7 +44,7 @@ def test_a_measurement_that_raises_costs_itself(error: Exception) -> None:
     rest_of_the_drive(navigator, row)
     assert outcomes_of(navigator)["odd"] == {"failed": 3}
     assert outcomes_of(navigator)["gnss"]["fused"] == 34
-    assert told.count(("aid_failed", f"odd could not be used: {error!r}")) == 1
+    assert told.count(("measurement_failed", f"odd could not be used: {error!r}")) == 1
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
@@ -67,7 +67,7 @@ def test_so_does_one_whose_judgement_raises(where: str, monkeypatch: pytest.Monk
     found = outcomes_of(navigator)["gnss_velocity"]
     assert found["failed"] > 0
     assert found["fused"] > found["failed"]
-    assert told.count("aid_failed") == 1
+    assert told.count("measurement_failed") == 1
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
@@ -83,7 +83,7 @@ def test_a_measurement_that_raises_at_the_door_is_refused(monkeypatch: pytest.Mo
     for _ in range(2):
         assert navigator.add(Height("baro", now, MonotonicStamp(now), 40.0), now) == "failed"
     assert navigator.refused == {"baro": {"failed": 2}}
-    assert [code for code, _ in told] == ["aligned", "aid_failed"]
+    assert [code for code, _ in told] == ["aligned", "measurement_failed"]
 
 
 def lose_state(navigator: Navigator) -> None:

@@ -106,7 +106,7 @@ def test_refusals_are_named_and_counted() -> None:
         (rdss, now, "multi_value"),
         (replace(rdss, multi_value=False, precision_class_m=0.0), now, "no_sigma"),
         (Attitude("star", now, stamp, (0.0, 0.0, 0.0), (0.1, 0.1, 0.0)), now, "no_sigma"),
-        (TimeReport("gnss", now, 0, True), now, "not_an_aid"),
+        (TimeReport("gnss", now, 0, True), now, "not_a_measurement"),
     ]
     expected: dict[str, Counter[str]] = {}
     for m, t_ns, name in cases:

@@ -55,7 +55,7 @@ def test_it_is_told_and_never_lied_about(
     assert found["verdict"] == "degraded and said so", found
     codes = {e["code"] for e in found["events"]}
     assert event in codes
-    assert "aid_failed" not in codes
+    assert "measurement_failed" not in codes
     if within_s is not None:
         assert found["recovered_s"] is not None
         assert found["recovered_s"] <= within_s

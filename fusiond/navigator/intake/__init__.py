@@ -88,7 +88,7 @@ class Intake:
                 if not sections.robust(m.source):
                     return found
                 return [replace(measurement, robust=True) for measurement in found]
-        return "not_an_aid"
+        return "not_a_measurement"
 
     @property
     def fixes_shown(self) -> dict[str, tuple[float, ...]]:
