@@ -23,7 +23,7 @@ What becomes of the local filters after a fusion, which is after every update:
                 hands the rest to the master's own estimate: P_i <- P_i / retained.
 
 The first and the last are in fusiond.estimators.federated.no_reset, those with a reset in
-fusiond.estimators.federated.reset; here is what they share.
+fusiond.estimators.federated.reset; this module has what they share.
 
 Source: Carlson, IEEE Trans. AES 26 (1990), 517; Carlson and Berarducci, NAVIGATION 41 (1994), 297;
 paper 004, section 3. Tests and isolation: fusiond.estimators.federated.isolation.
@@ -32,6 +32,7 @@ paper 004, section 3. Tests and isolation: fusiond.estimators.federated.isolatio
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.federated.bank import combine
-from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
+from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection, Record
 from fusiond.estimators.federated.options import FederatedOptions, local_of
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import normalised_innovation_squared, update
@@ -50,6 +51,11 @@ Array = NDArray[np.float64]
 
 # No adaptive factor falls below this part of an equal one: a filter that starves cannot come back.
 LEAST_PART = 0.1
+
+
+class _Own(NamedTuple):
+    arrays: tuple[Array, ...]
+    records: tuple[Record, ...]
 
 
 class FederatedFilter(ErrorStateFilter):
@@ -279,6 +285,21 @@ class FederatedFilter(ErrorStateFilter):
         """Factors proportional to 1 / `trace` (N,), scaled traces of the local covariances."""
         part = np.divide(1.0, trace, out=np.zeros_like(trace), where=trace > 0.0)
         self._share_out(np.maximum(part / part.sum(), LEAST_PART / len(part)))
+
+    # ------------------------------------------------------------------ snapshots
+
+    def _kept_arrays(self) -> tuple[Array, ...]:
+        """Arrays that a snapshot holds beside those of every filter."""
+        return (self._factors,)
+
+    def _own_snapshot(self) -> object:
+        return _Own(tuple(a.copy() for a in self._kept_arrays()), tuple(self._faults.records))
+
+    def _own_restore(self, extra: object) -> None:
+        assert isinstance(extra, _Own)
+        for array, kept in zip(self._kept_arrays(), extra.arrays, strict=True):
+            array[:] = kept
+        self._faults.records = list(extra.records)
 
     # ------------------------------------------------------------------ feedback
 

@@ -19,26 +19,18 @@ Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
 from fusiond.estimators.federated.bank import publish
 from fusiond.estimators.federated.filter import FederatedFilter
-from fusiond.estimators.federated.isolation import Record
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
 UPDATED, OTHERS = 0, 1
-
-
-class _Own(NamedTuple):
-    factors: Array
-    records: tuple[Record, ...]
 
 
 class ResetFilter(FederatedFilter):
@@ -83,11 +75,3 @@ class ResetFilter(FederatedFilter):
 
     def _leave_out(self, local: int) -> None:
         """Nothing: what is published has taken no part in this update."""
-
-    def _own_snapshot(self) -> object:
-        return _Own(self._factors.copy(), tuple(self._faults.records))
-
-    def _own_restore(self, extra: object) -> None:
-        assert isinstance(extra, _Own)
-        self._factors[:] = extra.factors
-        self._faults.records = list(extra.records)
