@@ -23,12 +23,13 @@ from fusiond.navigator.alignment.headings import (
     from_config,
     from_dual_antenna,
     from_gyrocompass,
+    from_positions,
     from_saved,
 )
 from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.missing import Journal, why_not
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.positions import Track, from_positions
+from fusiond.navigator.alignment.positions import Track
 from fusiond.navigator.alignment.start import Place, Start
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState

@@ -34,9 +34,10 @@ from fusiond.navigation.rotation import (
     wrap_angle,
 )
 from fusiond.navigator.alignment import motion_fit, sensed_motion
-from fusiond.navigator.alignment.basis import Basis, rest_bias
+from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.evidence import Fix, Standstill
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.rest import rest_bias
 from fusiond.navigator.alignment.start import (
     BACKWARD,
     BIAS_SETTLING_S,

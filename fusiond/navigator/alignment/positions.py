@@ -27,18 +27,18 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.invariant import InvariantFilter
+from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import MOUNTING, mounting
 from fusiond.navigation.alignment import level
 from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy, skew
-from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.evidence import FIXES_NS, Standstill
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standstill
 from fusiond.navigator.alignment.heading_bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
-from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.rest import REST_VELOCITY_SD, rest_bias
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 from fusiond.navigator.motion_constraints import GATE
 from fusiond.navigator.reasons import reason
@@ -118,14 +118,16 @@ class Track:
         """True if a bank seeks the heading."""
         return self._bank is not None
 
-    def start(self, by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    def start(
+        self, known: AlignmentEvidence, noise: ImuNoise, imu: ImuBuffer, place: Place
+    ) -> Start | None:
         """A start, once the heading is known."""
         until_ns = imu.latest_ns - DELAYED_NS
         if self._bank is None:
-            self._bank = self._begin(by, imu, place, until_ns)
+            self._bank = self._begin(known, noise, imu, place, until_ns)
         bank = self._bank
         if bank is None:
-            self._forget(imu, by.known.standstill)
+            self._forget(imu, known.standstill)
             return None
         if until_ns < bank.t_ns + PIECE_NS:
             return None
@@ -137,13 +139,13 @@ class Track:
         if bank.lost:
             self._bank = None
             if bank.backwards:
-                by.known.report("imu_backwards", reason("imu_backwards_by_fixes"))
+                known.report("imu_backwards", reason("imu_backwards_by_fixes"))
                 return None
-            by.known.doubted(reason("searching_again"))
+            known.doubted(reason("searching_again"))
             return None
         found = bank.mixture()
         if bank.positions < FEWEST_FIXES or found.sd_yaw > KNOWN_SD_RAD:
-            by.known.doubted(
+            known.doubted(
                 reason(
                     "searching",
                     sd=math.degrees(found.sd_yaw),
@@ -154,14 +156,20 @@ class Track:
             )
             return None
         if found.sd_speed > KNOWN_SD_M_S:
-            by.known.doubted(reason("searching_speed", sd=found.sd_speed, limit=KNOWN_SD_M_S))
+            known.doubted(reason("searching_speed", sd=found.sd_speed, limit=KNOWN_SD_M_S))
             return None
         n = self._size
         return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, turns=True)
 
-    def _begin(self, by: Basis, imu: ImuBuffer, place: Place, until_ns: int) -> HeadingBank | None:
+    def _begin(
+        self,
+        known: AlignmentEvidence,
+        noise: ImuNoise,
+        imu: ImuBuffer,
+        place: Place,
+        until_ns: int,
+    ) -> HeadingBank | None:
         """A bank, where there is something to begin with: the end of a rest, or the first fix."""
-        known = by.known
         if place.fix is not None and place.fix.height_m is not None:
             place = place._replace(sd_height=ANYWHERE_M)  # the bank is told the fixes themselves
         left = self._left or known.left
@@ -177,7 +185,7 @@ class Track:
                 if a.locates and left.start_ns <= a.t_ns <= left.end_ns
             ]
             begin_ns, fixes = left.end_ns, len(there)
-            cells = self._from_rest(by, imu, place, left, there[-MOST_AT_REST:])
+            cells = self._from_rest(noise, imu, place, left, there[-MOST_AT_REST:])
             if not known.confirmed_rest(left):
                 cells += self._on_the_move(imu, place, begin_ns, QUIET_AT_SPEED)
         else:
@@ -196,7 +204,7 @@ class Track:
 
     def _from_rest(
         self,
-        by: Basis,
+        noise: ImuNoise,
         imu: ImuBuffer,
         place: Place,
         left: Standstill,
@@ -218,7 +226,7 @@ class Track:
                 np.zeros(3),
                 REST_VELOCITY_SD,
                 HOW,
-                bias=rest_bias(by.noise, left, dcm, float(place.where[0])),
+                bias=rest_bias(noise, left, dcm, float(place.where[0])),
                 levelled=Levelled(dcm),
             )
             cell = self._cell(imu, start, 1.0)
@@ -295,16 +303,3 @@ class Track:
         old = [a for a in self._measurements if a.t_ns < since]
         kept = [a for a in old if a.locates and a.t_ns >= begin][-MOST_AT_REST:]
         self._measurements = kept + self._measurements[len(old) :]
-
-
-def from_positions(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Heading of positions alone; a velocity, where there is one, tells it sooner and better."""
-    fixes = by.known.fixes
-    if (
-        fixes
-        and "gnss_course" in by.options.heading
-        and imu.latest_ns - fixes[-1].velocity.t_ns < FIXES_NS
-    ):
-        by.track.give_up()
-        return None
-    return by.track.start(by, imu, place)
