@@ -5,140 +5,32 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import HeadingMeasurement
-from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.position import PositionMeasurement
-from fusiond.aiding.rdss_position import HeldFeedback, RdssPositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
-from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
 from fusiond.estimators import hypotheses
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.integrity.diagnosis import Diagnosis
-from fusiond.models.catalogue import make_model
-from fusiond.models.model import Model
-from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
-from fusiond.navigator.timeline import JUDGED, Entry, Timeline
+from fusiond.navigator.timeline import Entry, Timeline
 from tests import runs
-
-Array = NDArray[np.float64]
-
-IMU = Imu(rate_hz=50.0)
-SECONDS = 30.0
-START_NS = 5 * runs.SECOND
-KEEP_S = 10.0
-GATE = 0.9999
-
-
-def kinds(model: Model) -> list[Kind]:
-    """What may be wrong of all that the drive has."""
-    return kinds_of(model, {"gnss": "gnss", "compass": "compass", "rdss": "rdss"}, slips=False)
-
-
-class Drive:
-    """Half a minute of driving: samples, start and measurements in order of validity."""
-
-    def __init__(self) -> None:
-        truth = runs.town_truth(SECONDS, IMU.rate_hz)
-        self.times = runs.sample_times(truth, START_NS)
-        self.samples = runs.imu_run(IMU, truth, 7).samples
-        self.nav = runs.true_nav(truth, np.zeros(1))[0]
-        self.sd = np.radians([0.3, 0.3, 2.0])
-        rng = np.random.default_rng(8)
-        self.measurements: list[AidingMeasurement] = []
-        for t in np.arange(0.507, SECONDS - 1.0, 0.9):
-            nav = runs.true_nav(truth, np.array([t]))[0]
-            nav = runs.with_error(
-                nav, rng.standard_normal(9) * ([0.01] * 3 + [0.1] * 3 + [1.5] * 3)
-            )
-            lat, lon, height, n, e, d = (float(x) for x in nav[:6])
-            if 11.0 < t < 13.0:
-                lat += 1e-4  # an outlier of 640 m
-            t_ns = START_NS + round(t * 1e9)
-            lever_v = (0.0, 0.0, 0.0)
-            yaw = rpy_from_dcm(dcm_from_quaternion(nav[6:]))[2]
-            sd = (1.5, 1.5, 1.5)
-            lever = (0.4, -0.3, -1.2)
-            if round(t) % 4 == 0:  # carried without feedback for 1.3 s, across other measurements
-                late = t_ns + 1_300_000_000
-                held = RdssPositionMeasurement(
-                    "rdss", t_ns + 3, GATE, lat, lon, (400.0, 50.0, 300.0), lever_v, holds=True
-                )
-                self.measurements += [held, HeldFeedback("rdss_feedback", late, GATE)]
-            self.measurements += [
-                HeadingMeasurement("compass", t_ns, GATE, yaw, 0.01),
-                PositionMeasurement("gnss", t_ns, GATE, lat, lon, height, sd, lever),
-                VelocityMeasurement(
-                    "gnss_velocity", t_ns - 100_000_000, GATE, (n, e, d), sd, lever_v
-                ),
-            ]
-        self.measurements.sort(key=lambda a: (a.t_ns, a.source))
-
-    def estimator(self) -> KalmanEstimator:
-        """At the start, before the first sample."""
-        model = make_model("ins21", imu_noise(IMU))
-        estimator = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds(model)))
-        p = np.diag(runs.initial_sd(model, self.sd, 0.2, 3.0) ** 2)
-        estimator.initialise(START_NS, 0, self.nav, np.zeros(model.size), p)
-        return estimator
-
-    def timeline(self, keep_s: float = KEEP_S, checkpoint_s: float = 0.5) -> Timeline:
-        """Started, with no sample and no measurement yet; its buffer is moved every 20 s or so."""
-        buffer = ImuBuffer(1.0, keep_s, np.eye(3), 0.0, IMU.gap_s)
-        estimator = self.estimator()
-        given = keep_s, checkpoint_s, None, kinds(estimator.model)
-        timeline = Timeline(estimator, buffer, *given)
-        timeline.start()
-        return timeline
-
-
-@lru_cache(maxsize=1)
-def drive() -> Drive:
-    return Drive()
-
-
-@lru_cache(maxsize=1)
-def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference, of which there is one."""
-    return applied_in_order()
-
-
-def applied_in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference knows no timeline: propagate to each measurement in turn, apply and judge it,
-    go on."""
-    d = drive()
-    estimator = d.estimator()
-    diagnosis = Diagnosis(kinds(estimator.model))
-    buffer = runs.filled_buffer(IMU, d.times, d.samples)
-    outcomes = []
-    for measurement in d.measurements:
-        estimator.propagate(buffer, measurement.t_ns)
-        if isinstance(measurement, HeldFeedback):
-            estimator.release()
-        elif isinstance(measurement, RdssPositionMeasurement):
-            estimator.hold()
-        one = diagnosis.comes(measurement, estimator)
-        outcome = (
-            estimator.look(measurement) if one.out else estimator.update(measurement, one.noise)
-        )
-        outcomes.append(outcome)
-        if outcome.name in JUDGED:
-            correction = diagnosis.judge(measurement, one, outcome, estimator)
-            if correction is not None:
-                estimator.adopt(correction.mean, correction.spread)
-    estimator.propagate(buffer, buffer.latest_ns)
-    return estimator, outcomes
+from tests.navigator.timeline_drive import (
+    IMU,
+    KEEP_S,
+    SECONDS,
+    START_NS,
+    applied_in_order,
+    drive,
+    in_order,
+    kinds,
+)
 
 
 def assert_same_state(a: KalmanEstimator, b: KalmanEstimator) -> None:
@@ -316,9 +208,8 @@ def test_what_waits_is_bounded_and_ends_with_a_name() -> None:
     """Days without alignment, or without IMU: measurements come on and on, memory does not grow."""
     d = drive()
     count = 20_000
-    measurements = [
-        replace(d.measurements[0], t_ns=START_NS + k * 100_000_000) for k in range(count)
-    ]  # type: ignore[type-var]
+    first: Any = d.measurements[0]
+    measurements = [replace(first, t_ns=START_NS + k * 100_000_000) for k in range(count)]
     source = d.measurements[0].source
     for started, name in ((False, "no_alignment"), (True, "no_imu")):
         timeline = d.timeline()
@@ -387,24 +278,25 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
     assert finding.size[0] == pytest.approx(5e-5 * 6.35e6, rel=0.02)
 
 
-def test_a_wrong_heading_is_left_out() -> None:
-    """And told by how much it is off."""
+def with_wrong_heading() -> tuple[Timeline, list[str]]:
+    """The drive with a compass that is 40 deg off, and the outcomes of its headings."""
     d = drive()
     timeline = d.timeline()
     timeline.imu.append(d.times, d.samples)
     off = math.radians(40.0)
-    entries = [
-        timeline.insert(
-            replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingMeasurement) else a
-        )
+    turned = [
+        replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingMeasurement) else a
         for a in d.measurements
     ]
+    entries = [timeline.insert(measurement) for measurement in turned]
     timeline.advance()
-    names = [
-        e.outcome.name
-        for e in entries
-        if e.outcome and isinstance(e.measurement, HeadingMeasurement)
-    ]
+    headings = [e for e in entries if isinstance(e.measurement, HeadingMeasurement)]
+    return timeline, [e.outcome.name for e in headings if e.outcome]
+
+
+def test_a_wrong_heading_is_left_out() -> None:
+    """And told by how much it is off."""
+    timeline, names = with_wrong_heading()
     # Until motion shows that it is not the unit that has turned nobody is accused.
     assert set(names[:3]) == {"gated"}
     assert set(names[3:]) == {"gated", "isolated"}
@@ -420,22 +312,7 @@ def test_a_wrong_heading_is_left_out() -> None:
 
 @pytest.mark.xfail(strict=True, reason="a unit that has turned fits a heading's offset for seconds")
 def test_a_wrong_heading_is_out_from_the_fourth_on() -> None:
-    d = drive()
-    timeline = d.timeline()
-    timeline.imu.append(d.times, d.samples)
-    off = math.radians(40.0)
-    entries = [
-        timeline.insert(
-            replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingMeasurement) else a
-        )
-        for a in d.measurements
-    ]
-    timeline.advance()
-    names = [
-        e.outcome.name
-        for e in entries
-        if e.outcome and isinstance(e.measurement, HeadingMeasurement)
-    ]
+    timeline, names = with_wrong_heading()
     assert set(names[3:]) == {"isolated"}
 
 

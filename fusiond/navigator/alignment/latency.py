@@ -131,11 +131,7 @@ class _Received:
     def epochs(self) -> list[Epoch]:
         """Its velocities, each with its position."""
         if self.found is None:
-            candidates = [
-                candidate
-                for measurement in self.measurements
-                for candidate in measurement.candidates()
-            ]
+            candidates = [candidate for m in self.measurements for candidate in m.candidates()]
             position = next((o for o in candidates if isinstance(o, PositionCandidate)), None)
             self.found = [
                 Epoch(o, position) for o in candidates if isinstance(o, VelocityCandidate)
@@ -214,9 +210,7 @@ class LatencySearch:
         self._catch_up()
         receiver = self._receivers.get(source)
         if receiver is None:
-            if not any(
-                measurement.moves and not measurement.screened for measurement in measurements
-            ):
+            if not any(m.moves and not m.screened for m in measurements):
                 return measurements
             receiver = self._receivers[source] = _Receiver()
         receiver.received.append(_Received(tuple(measurements)))
@@ -225,11 +219,7 @@ class LatencySearch:
             self.on_time.discard(source)
         else:
             self.on_time.add(source)
-        return (
-            [_earlier(measurement, delay_ns) for measurement in measurements]
-            if delay_ns
-            else measurements
-        )
+        return [_earlier(m, delay_ns) for m in measurements] if delay_ns else measurements
 
     def kept(self) -> list[AidingMeasurement]:
         """The last measurements of all receivers, at the instants at which they were true."""
