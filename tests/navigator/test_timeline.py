@@ -312,7 +312,7 @@ def test_a_wrong_heading_is_left_out() -> None:
 
 @pytest.mark.xfail(strict=True, reason="a unit that has turned fits a heading's offset for seconds")
 def test_a_wrong_heading_is_out_from_the_fourth_on() -> None:
-    timeline, names = with_wrong_heading()
+    _, names = with_wrong_heading()
     assert set(names[3:]) == {"isolated"}
 
 
