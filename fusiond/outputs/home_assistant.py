@@ -73,6 +73,18 @@ def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, 
     """The entities of a vehicle: position, mode and its reason, accuracy, each device."""
     base = base_topic(vehicle)
     release = version("fusiond")
+    return {
+        "dev": {"ids": [node], "name": vehicle, "mf": "fusiond", "sw": release},
+        "o": {"name": "fusiond", "sw": release},
+        "avty_t": f"{base}/online",
+        "pl_avail": "online",
+        "pl_not_avail": "offline",
+        "cmps": dict(_entities(node, base, sources)),
+    }
+
+
+def _entities(node: str, base: str, sources: tuple[str, ...]) -> list[tuple[str, Component]]:
+    """Keys and entities."""
 
     def entity(key: str, platform: str, name: str | None, **more: Any) -> tuple[str, Component]:
         identity = {"p": platform, "uniq_id": f"{node}_{key}", "name": name}
@@ -122,11 +134,4 @@ def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, 
                 ent_cat="diagnostic",
             )
         )
-    return {
-        "dev": {"ids": [node], "name": vehicle, "mf": "fusiond", "sw": release},
-        "o": {"name": "fusiond", "sw": release},
-        "avty_t": f"{base}/online",
-        "pl_avail": "online",
-        "pl_not_avail": "offline",
-        "cmps": dict(entities),
-    }
+    return entities
