@@ -21,7 +21,7 @@ from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, health_message
 from fusiond.outputs.messages.innovations import innovations_message
 from fusiond.outputs.messages.nav import nav_message
-from fusiond.outputs.messages.status import RecordingStatus, status_message
+from fusiond.outputs.messages.status import DaemonState, RecordingStatus, status_message
 from fusiond.outputs.topics import (
     CALIBRATION,
     CONSISTENCY,
@@ -135,19 +135,21 @@ class Publishing:
             status_message(
                 solution,
                 utc_ns,
-                since_utc_ns=self._clock.utc_ns(self._since_ns),
-                version=self._version,
-                config_digest=self._digest,
-                uptime_s=(t_ns - self._started_ns) * 1e-9,
-                scheduler=self._scheduler(),
-                fused=fused,
-                rejected=rejected,
-                imu=self._sources.imu.used,
-                faults=self._sources.faults(t_ns),
-                calibrated=self._navigator.calibrating.settled,
-                recording=self._recording(),
-                injected=self._injection.active,
-                mqtt={} if mqtt is None else mqtt.counters,
+                DaemonState(
+                    since_utc_ns=self._clock.utc_ns(self._since_ns),
+                    version=self._version,
+                    config_digest=self._digest,
+                    uptime_s=(t_ns - self._started_ns) * 1e-9,
+                    scheduler=self._scheduler(),
+                    fused=fused,
+                    rejected=rejected,
+                    imu=self._sources.imu.used,
+                    faults=self._sources.faults(t_ns),
+                    calibrated=self._navigator.calibrating.settled,
+                    recording=self._recording(),
+                    injected=self._injection.active,
+                    mqtt={} if mqtt is None else mqtt.counters,
+                ),
             ),
         )
 
