@@ -63,7 +63,7 @@ class DeviceTime:
         self._delay = 0.0
         self._doubt: _Doubt | None = None
         self._lag: tuple[float, float] | None = None
-        """The lateness above RESTART_S that is watched, and for how long (ticks)."""
+        """Delay above RESTART_S that is watched, and its duration (ticks)."""
 
     def unwrap(self, raw: int, arrivals_ns: Arrivals) -> int | None:
         """Ticks in ns since the clock's own zero; None for a time that did not advance, or that

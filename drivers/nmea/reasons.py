@@ -51,7 +51,7 @@ OWN_SENTENCES = {
 """Owners of proprietary sentences, by their beginning, in which receivers tell place or
 attitude."""
 MOST_NAMES = 8
-"""Talkers and formatters that are remembered; the first ones are enough to name."""
+"""Most talkers and formatters to remember; the first are enough to name."""
 ROLLOVER = timedelta(weeks=1024)
 ROLLOVER_SPAN = timedelta(days=3653)
 """A date that is right but for the rollover is of the ten years from this software's on."""

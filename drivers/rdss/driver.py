@@ -82,7 +82,7 @@ class RdssOptions(DriverOptions):
     transmit: bool = True
     """False: the terminal is read, and never asked for a fix, with which it would transmit."""
     message_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of the transmissions that the card allows, what messages have while fixes wait too."""
+    """Share of the card's transmissions for messages while fixes wait, too."""
     message_expiry_s: PositiveFloat = 3600.0
     """A message that could not be sent or confirmed for so long is given up."""
     message_carriage: Carriage = "binary"

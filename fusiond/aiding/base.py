@@ -168,7 +168,7 @@ class AidingMeasurement:
 
     @property
     def rests_s(self) -> float:
-        """For how long (s) a vehicle of which it holds is taken to rest."""
+        """Duration (s) of rest that this measurement proves."""
         return 0.0
 
     @property

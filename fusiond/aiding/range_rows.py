@@ -256,8 +256,9 @@ WRONG = {
 
 @compiled("UniTuple(i8, 4)(f8[:, ::1], i8[::1], f8[::1])")
 def measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, int]:
-    """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
-    ranges and rates those are, how many clocks they have, and what is wrong with them."""
+    """Write the variances r (2 n,) of the finite ranges, then of the finite rates.
+
+    Returns the numbers of ranges and rates, the number of clocks, and what is wrong with them."""
     n = clock.shape[0]
     row = finite = timed = clocks = 0
     wrong = SOUND

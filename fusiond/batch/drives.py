@@ -38,7 +38,7 @@ _NOT_OF_THE_DRIVE = frozenset(
 
 
 def drive_row(config_path: Path, log: Path) -> Row:
-    """The figures of one log, flat: a name of parts is joined by dots.
+    """Figures of one log, flat; parts of a name are joined by dots.
 
     `not_navigated` says why there is no solution. Raises what the readers raise.
     """
@@ -93,7 +93,7 @@ def _tables(config: Config, folder: Path) -> Row:
 
 
 def _processed(result: dict[str, Any]) -> Row:
-    """Of what `process` found."""
+    """Figures of a run of `process`."""
     rows = result["solution_rows"]
     files = result["files"]
     return flat(

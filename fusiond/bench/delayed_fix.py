@@ -64,7 +64,7 @@ class Drive:
         return work
 
     def go_on(self, until_s: float) -> None:
-        """Drive on to that instant, at which an epoch comes next."""
+        """Advance to that instant, at which an epoch comes next."""
         until = round(until_s * RATE_HZ)
         while self._row < until:
             self.fix()
@@ -85,7 +85,7 @@ class Drive:
         self.navigator.add_imu(self._times[rows], self._samples[rows])
 
     def take_fix(self) -> None:
-        """The fix of that epoch comes, the filter runs, the solution is read."""
+        """Insert the fix of that epoch, run the filter, read the solution."""
         self.fix()
         self._row += TICK_SAMPLES
         self.navigator.advance()

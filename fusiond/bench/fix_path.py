@@ -27,7 +27,7 @@ class Way(NamedTuple):
 
     @property
     def functions(self) -> int:
-        """Number of different ones."""
+        """Number of different functions."""
         return len(self.calls)
 
     @property
@@ -37,7 +37,7 @@ class Way(NamedTuple):
 
 
 def ordinary_fix() -> Way:
-    """Of `FIXES` fixes of a drive that navigates the one with the median of functions."""
+    """Fix with the median number of functions, of `FIXES` fixes under way."""
     drive = Drive(1)
     drive.go_on(AT_S)
     found = [_way(drive) for _ in range(FIXES)]

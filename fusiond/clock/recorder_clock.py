@@ -35,14 +35,14 @@ ASKED_AGAIN_NS = 20 * SECOND_NS
 """Time for which a bus whose controllers disagree is not asked once more whether its clock was
 set."""
 ORDINARY = 3
-"""A pause of so many of the longest lately is one of a sparse bus."""
+"""Pause, in multiples of the longest lately, that a sparse bus may have."""
 FOLLOWING = 8
 """Frames by which damage is told from a clock that was set: most must agree."""
 _LATELY = 64
 _OWN_PERIOD = 512
 """Frames among which the last two of the same identifier are looked for."""
 REPORTS = 5
-"""Reports of UTC whose median is taken, on either side."""
+"""Reports of UTC before and after a jump whose medians are compared."""
 ENOUGH_REPORTS = 3
 """As many as UTC itself is followed by (`utc_envelope`): two may be one queue's."""
 
@@ -95,7 +95,7 @@ class RecorderClock:
         return change_ns < -AHEAD_NS or change_ns >= max(LEAP_NS, ORDINARY * spacing_ns)
 
     def next(self, stamp_ns: int, of: Of) -> None:
-        """The stamp of a frame, which is not odd."""
+        """Take the stamp of a frame that fits."""
         if stamp_ns >= self.stamp_ns:
             self._on(stamp_ns, stamp_ns - self.stamp_ns, of)
         self._of_channel[of[0]] = stamp_ns
@@ -176,7 +176,7 @@ class RecorderClock:
         return due_ns if 0 <= due_ns < LEAP_NS else spacing
 
     def _alone(self, stamp_ns: int, following: Sequence[int]) -> bool:
-        """Of a stamp that went back: whether most of what follows has not, or does not go on from
+        """True if a stamp that went back stands alone: most that follow go on from those before
         it."""
         on = [f for f in following if stamp_ns - AHEAD_NS <= f < self.stamp_ns]
         return 2 * len(on) <= len(following)

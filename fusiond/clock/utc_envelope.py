@@ -152,7 +152,7 @@ class UtcEnvelope:
 
     @property
     def open(self) -> bool:
-        """While reports that are held back are sure to say something, and not yet what."""
+        """True while the reports held back show a change that is not identified yet."""
         return bool(self._odd)
 
     @property

@@ -1,4 +1,4 @@
-"""Notice while kernels compile: once after an installation or an update, a minute and more.
+"""Progress of compiling kernels, once after an installation or an update.
 
 with compiling():
     from fusiond.live.daemon import run_daemon

@@ -104,7 +104,7 @@ study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
 
 @contextmanager
 def rows_kept(out: Path | None, name: str, seed: int) -> Iterator[KeptRuns | None]:
-    """The rows of a study in `out`; says in the end how many there are."""
+    """Rows of a study in `out`; prints at the end how many there are."""
     if out is None:
         yield None
         return

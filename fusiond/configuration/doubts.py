@@ -29,8 +29,9 @@ LONGEST_M: dict[VehicleClass, float] = {
 96/53/EC), a railway coach (27.5 m, UIC 567), a container ship (400 m), the An-225 (84 m)."""
 
 DEEPEST_M = 0.5
-"""Of an antenna below an IMU on wheels: one in a box on the roof, an antenna on the bonnet, which
-is half a metre lower on a car."""
+"""Height of an antenna below the IMU (m) that a road vehicle may have.
+
+An IMU in a box on the roof and an antenna on the bonnet are half a metre apart on a car."""
 _ANTENNAS = (GnssAiding, RawAiding, RdssAiding)
 
 GIVES: dict[str, tuple[str, ...]] = {

@@ -17,7 +17,7 @@ class Served(Section):
     """Common options of TCP servers."""
 
     host: str = "127.0.0.1"
-    """Address to listen at; `0.0.0.0` lets the whole network in, unasked for a name."""
+    """Address to listen at; `0.0.0.0` serves the whole network, without a password."""
     rate_hz: Rate = 1.0
     """Epochs a second, as receivers send them."""
 

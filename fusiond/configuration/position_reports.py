@@ -15,7 +15,7 @@ class PositionReports(Section):
     """Reports of the solution to another card; see `docs/rdss-messages.md`."""
 
     card: Annotated[int, Field(ge=1, le=9_999_999)] | None = None
-    """The card that gets them; without it there are none."""
+    """Card that the reports go to; without one none are sent."""
     source: str | None = None
     """The terminal that sends them, where there are several."""
     interval_s: PositiveFloat | None = None

@@ -21,7 +21,7 @@ class Recording(Section):
     split_mb: Annotated[float, Field(ge=1.0)] = 256.0
     """A file larger than this is closed and the next begun; 10^6 bytes."""
     split_min: PositiveFloat = 60.0
-    """So is one older than this."""
+    """Files older than this are deleted, too."""
     keep_mb: PositiveFloat = 8192.0
     """Of this vehicle's logs in the directory the newest this many MB are kept."""
     min_free_mb: NonNegativeFloat = 100.0

@@ -66,7 +66,7 @@ class SpareImu(Section):
     mounting_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of its nominal sensor frame against the body."""
     mounting_sd_deg: PositiveFloat = 1.0
-    """One sigma of what each of those angles is wrong by against the first unit's."""
+    """One sigma of each of those angles, relative to the first unit."""
 
     @property
     def mounted(self) -> dict[str, Any]:

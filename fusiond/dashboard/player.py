@@ -16,7 +16,7 @@ TOPICS = (
 )
 SECOND = 1_000_000_000
 AT_ONCE = 64
-"""Messages handed over before the browsers get their turn, where the log is played fast."""
+"""Messages in a row before the browsers get their turn, in a fast replay."""
 
 
 class Player:

@@ -105,7 +105,7 @@ class Vehicle:
         return {"messages": messages, "rows": {kind: rows for kind, rows in newer.items() if rows}}
 
     def limit_s(self, topic: str) -> float | None:
-        """Age from which what `topic` said is old, in s; None for what does not age."""
+        """Age (s) from which a message of `topic` is stale; None for one that never is."""
         least = LIMITS_S.get(topic)
         if least is None:
             return None
@@ -141,7 +141,7 @@ class Vehicle:
         self._rows[kind].add(self.count, row)
 
     def _earlier_events(self, events: object, kept: bool) -> None:
-        """The events before anybody listened here, which the broker had kept."""
+        """Earlier events, which the broker has retained."""
         if kept and isinstance(events, list) and not self._rows["event"]:
             for one in events:
                 if isinstance(one, Mapping):

@@ -35,7 +35,7 @@ HEADERS = (
     (b"x-content-type-options", b"nosniff"),
     (b"cache-control", b"no-cache"),
 )
-"""Of every answer."""
+"""Headers of every response."""
 
 
 def application(

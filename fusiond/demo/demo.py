@@ -251,7 +251,7 @@ class Score:
         self._rows: list[tuple[float, ...]] = []
 
     def add(self, s: Solution, covariance: Array) -> None:
-        """A solution, and P (n, n) with position n, e at 6 and 7."""
+        """Add a solution with P (n, n), whose position north, east is at 6 and 7."""
         if s.mode not in (Mode.NAVIGATING, Mode.COASTING) or s.t_ns // _SCORE_NS == self._last:
             return
         self._last = s.t_ns // _SCORE_NS
@@ -303,13 +303,13 @@ def ned_error(position: Array, truth: Array) -> Array:
 
 
 def wrapped(angle: Array) -> Array:
-    """Into [-pi, pi)."""
+    """Angles wrapped into [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @contextlib.contextmanager
 def _log_kept_out(headless: bool) -> Iterator[None]:
-    """Events are in the view; only errors go to the terminal, and none while it shows the view."""
+    """Keep the log off the terminal, which shows events itself; errors only if headless."""
     log = logging.getLogger("fusiond")
     handler = logging.StreamHandler(sys.stderr) if headless else logging.NullHandler()
     handler.setLevel(logging.ERROR)

@@ -19,7 +19,7 @@ from rich.text import Text
 REFRESH_S = 0.25
 LINE_EVERY_S = 5.0
 WIDE = 112
-"""Columns from which the two tables stand side by side."""
+"""Least width of a terminal, in columns, for two tables side by side."""
 RATE_WINDOW_S = 5.0
 _EVENTS = 40
 _LEAST_EVENTS = 3
@@ -69,7 +69,7 @@ class Live:
         self.errors: list[float] = []
         """True errors: m north, east, down; m/s; degrees roll, pitch, yaw."""
         self.outage: tuple[str, float] | None = None
-        """The device whose plug is pulled, and until when (monotonic, s)."""
+        """Unplugged device and the instant (monotonic, s) of its return."""
         self.aligning = ""
         """Display while there is no solution yet."""
         self.received = 0

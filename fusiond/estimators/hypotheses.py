@@ -96,7 +96,7 @@ class Hypotheses:
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].view(np.float32).reshape(self.n, -1)
-        """V (n, columns)."""
+        """Sensitivities V (n, columns)."""
         first = int(bank[PHI])
         self.transition = bank[first : first + self.width**2].reshape(self.width, -1)
         """Matrix (w, w) that V waits to be multiplied by; one where it waits for nothing."""

@@ -123,7 +123,7 @@ class Rows:
 
     @property
     def azimuth_rad(self) -> Array:
-        """(n,), from north to east, 0 .. 2 pi."""
+        """Azimuth (n,), from north to east, 0 .. 2 pi."""
         found: Array = np.arctan2(self.values[rk.EAST], self.values[rk.NORTH]) % (2.0 * np.pi)
         return found
 

@@ -94,7 +94,7 @@ class Diagnosis:
         self._agreement: Mapping[str, Agreement] = {}
         """By device that is out; replaced, never changed."""
         self._lasting: Mapping[str, Lasting] = {}
-        """By series, why it left service last; replaced, never changed."""
+        """Last reason of exclusion by series; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
         """Identified faults since the start, the last of each kind and device."""
 
@@ -104,7 +104,7 @@ class Diagnosis:
         return Memory(self._series.copy(), self.findings, self._agreement, self._lasting)
 
     def restore(self, memory: Memory) -> None:
-        """Back to a snapshot."""
+        """Restore a snapshot."""
         self._series, self.findings = memory.series.copy(), memory.findings
         self._shared, self._agreement = set(self._series), memory.agreement
         self._lasting = memory.lasting
@@ -225,7 +225,7 @@ class Diagnosis:
     def _looked_at(
         self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
-        """One that is out was compared with what is published."""
+        """Judge an excluded source by its innovation against the published solution."""
         correction, t_ns, bank = None, measurement.t_ns, estimator.hypotheses
         passes = outcome.nis <= gate_threshold(measurement.gate, max(outcome.degrees, 1))
         if outcome.lasting:

@@ -91,7 +91,7 @@ class Series:
     out_ns: int = 0
     """Instant (ns) of its last exclusion."""
     proven_ns: int = 0
-    """Until when (ns) it is on probation: for as long as it was out."""
+    """End of probation (ns), which is as long as the exclusion was."""
     over: float = 0.0
     """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: object = None

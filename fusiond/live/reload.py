@@ -30,7 +30,7 @@ class Difference:
     outputs: frozenset[str]
     """Those that are made anew, are new or are no more."""
     gates: Mapping[str, float]
-    """By section of `aiding`."""
+    """New gate probability, by section of `aiding`."""
 
 
 def difference(running: Config, read: Config) -> Difference:

@@ -197,7 +197,7 @@ class Model:
 
     @cached_property
     def sensor_errors(self) -> bool:
-        """True if it has states for what each gyro and each accelerometer errs by."""
+        """True if the model has states for the errors of every gyro and accelerometer."""
         return all(self.parameters(axis) for axis in range(RATE_ERROR, FORCE_ERROR + 3))
 
     def parameters(self, column: int) -> list[int]:

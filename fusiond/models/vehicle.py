@@ -52,7 +52,7 @@ def drift(name: str, sd_m_s: float, lasts_s: float) -> Block:
 
 
 def wheel_scale(name: str, sd: float) -> Block:
-    """By what share a wheel's speed is too high: a tyre's radius, worn or under pressure."""
+    """Relative error of a wheel's speed: a tyre's radius, worn or under pressure."""
     return _constant(name, "1", ("scale",), sd)
 
 
@@ -92,8 +92,7 @@ def barometer_offset(name: str, sd_m: float, walk_m_sqrt_s: float) -> Block:
 
 
 def barometer_scale(name: str, sd: float) -> Block:
-    """By what share a barometer's metres are too many: how much colder than the standard the air
-    is."""
+    """Relative error of a barometer's heights: air colder or warmer than the standard."""
     return _constant(name, "1", ("scale",), sd)
 
 

@@ -155,7 +155,7 @@ class KernelCache(NullCache):
 
 
 def _file_name(name: str, signature: str, *processor: str) -> str:
-    """Native code differs by signature, system, processor and its features."""
+    """File name of native code: by signature, system, processor and its features."""
     made_for = repr((signature, processor)).encode()
     return f"{name}-{hashlib.sha256(made_for).hexdigest()[:16]}.kernel"
 
@@ -181,9 +181,10 @@ def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | Non
 
 @cache
 def _name_runtime() -> None:
-    """Tell the linker where the functions are that kernels make arrays with. What else numba's
-    runtime consists of lies in each kernel that needs it; numba compiles it for the first that is
-    compiled, which takes as long as linking twenty."""
+    """Name the functions that kernels make arrays with to the linker.
+
+    The rest of numba's runtime is part of each kernel that needs it; numba compiles it for the
+    first one, which takes as long as linking twenty."""
     for name, address in c_helpers.items():
         _add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 
 def model_of(config: Config, *extra: Block) -> Model:
-    """The error-state model of a configuration, with the blocks that its measurements need; without
-    those that nobody asked for, where there is no room for them.
+    """Error-state model of a configuration, with the blocks that its measurements need.
+
+    Optional blocks are left out where there is no room for them.
 
     Raises `ConfigError` where those are more states than the kernels hold.
     """

@@ -181,7 +181,7 @@ class RateUnits:
         return found
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
-        """The samples from row `new` on have come."""
+        """Take the samples from row `new` on."""
         count = imu.end - new
         if not count:
             return

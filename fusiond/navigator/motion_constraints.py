@@ -85,7 +85,7 @@ class ConstraintMaker:
         ]
 
     def _no_sliding(self, imu: ImuBuffer, new: int) -> list[AidingMeasurement]:
-        """One at the first sample of each interval."""
+        """Non-holonomic constraints, one at the first sample of each interval."""
         o = self._options.non_holonomic
         width, rows, row = round(o.interval_s * 1e9), [], new
         while (row := next_cell(imu.times, row, imu.end, width, self._last_cell)) >= 0:

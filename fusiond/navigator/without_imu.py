@@ -73,7 +73,7 @@ class _Received:
 
     @property
     def position(self) -> PositionCandidate | None:
-        """Position by it alone; None where it says none."""
+        """Position by this measurement alone; None if it has none."""
         if not self._asked:
             self._asked = True
             for candidate in self.measurement.candidates():

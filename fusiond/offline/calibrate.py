@@ -245,7 +245,7 @@ class _Drive:
         return speed, np.gradient(np.unwrap(rows[:, 3]), t), np.gradient(speed, t), rows
 
     def shown_s(self) -> dict[str, float]:
-        """Duration (s) of the motion that shows a parameter."""
+        """Duration (s) of the motion that makes a parameter observable."""
         speed, turn, change, _ = self._table()
         driving = speed > DRIVING_M_S
         step_s = STEP_NS * 1e-9

@@ -251,7 +251,7 @@ def _mf4(
 
 
 def _report_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
-    """In which zone the log's date was taken, or that it has none."""
+    """Report the time zone of the log's date, or that it has none."""
     if log.suffix in _ZONES and not start:
         told("recorder_zone", _UNDATED)
     elif log.suffix in _ZONES:

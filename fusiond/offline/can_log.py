@@ -331,7 +331,7 @@ class _Replay:
                 self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s, utc_ns))
 
     def _imu_table(self) -> ImuTable:
-        """Of the first source that has sent any, as the daemon does."""
+        """IMU samples of the first source that sent any, as the daemon uses them."""
         spare = self._config.imu.spare
         spare_name = None if spare is None else spare.source
         first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)

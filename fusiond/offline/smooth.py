@@ -124,7 +124,7 @@ class SmoothedRows:
                 last.previous, self._kept = None, last
 
     def _finish(self, newest: Node) -> None:
-        """A start has ended: smooth it and write its rows."""
+        """Smooth the navigation since one start and write its rows."""
         nodes, _ = nodes_of(newest, self._kept, NEVER)
         # A filter whose numbers failed is given up at once: what it left last is no part of it.
         unsound = np.flatnonzero(~np.isfinite(nodes.bodies).all(axis=1))

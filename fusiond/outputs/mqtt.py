@@ -323,7 +323,7 @@ class MqttPublisher:
     # ------------------------------------------------------------------ commands
 
     async def _listen(self, client: aiomqtt.Client) -> None:
-        """Keep subscribed to what others publish to us, but for a while after a flood."""
+        """Keep subscriptions; after a flood pause them for a while."""
         addresses = [*self._listeners]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")

@@ -38,7 +38,7 @@ REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""Idle time after which a client gives way to a new one; so does who takes nothing of an answer."""
+"""Idle time after which a client is closed for a new one; one that reads nothing counts as idle."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
 SHORT_LOGGED_S = 60.0
@@ -295,7 +295,7 @@ class TcpServer:
         self._short_logged_ns: int | None = None
 
     async def run(self) -> None:
-        """Listen until cancelled; a port that is taken is tried again."""
+        """Listen until cancelled; retry while the port is taken."""
         listener = await self.port.open(self._listening)
         for sock in listener.sockets:
             self._watch(sock)

@@ -217,7 +217,7 @@ class Recorder:
             self._look_at(message, t_ns)
 
     async def run(self) -> None:
-        """Until cancelled; then everything is on the disk when this returns."""
+        """Record until cancelled; everything is on disk when this returns."""
         try:
             await asyncio.Event().wait()
         finally:

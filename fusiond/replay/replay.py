@@ -155,7 +155,7 @@ class Replay:
         return after_ns
 
     def _on_the_way(self, start: dict[str, Any]) -> tuple[RestoredState, int]:
-        """The first state that the log holds, and its instant."""
+        """First state in the log, and its instant."""
         for message in self._log.messages(STATE):
             try:
                 kept = KEPT_STATE.validate_json(message.data)

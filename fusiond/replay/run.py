@@ -31,7 +31,7 @@ from fusiond.replay.replay_config import config_of
 
 SOLUTION, EVENTS = "solution.csv", "events.csv"
 ROWS = 4096
-"""Solutions that wait to be written together."""
+"""Most solutions that wait to be written together."""
 FAREWELL_S = 1.0
 """Given to the last messages of a published replay."""
 
@@ -48,7 +48,7 @@ class Wish:
 
 
 def replay(paths: Sequence[Path], wish: Wish) -> dict[str, Any]:
-    """Run; the summary. `times_real_time` is by CPU time.
+    """Replay a recording; the summary. `times_real_time` is by CPU time.
 
     `identical` is None where there is nothing to compare with. Raises `LogError`, `ConfigError`,
     OSError.
@@ -143,7 +143,7 @@ class _Run:
             listener(message)
 
     def scheduler(self) -> SchedulerStatus:
-        """The daemon's scheduler then."""
+        """State of the recorded daemon's scheduler."""
         return SchedulerStatus(
             ticks=self.replay.comparison.ticks,
             overruns=self._overruns,

@@ -160,7 +160,7 @@ class _Units:
 
 
 def _instant_ns(stamp: Stamp, t_seen_ns: int) -> int:
-    """The stamp on its own time axis: only differences are looked at."""
+    """Stamp on its own time axis, of which only differences count."""
     match stamp:
         case DeviceStamp():
             return stamp.ticks_ns

@@ -119,8 +119,8 @@ class ImuLook:
 
 @dataclass(slots=True)
 class Fault:
-    """One that the daemon has identified: when it began and was last told, the size that was told
-    last, on the axis where it is largest."""
+    """Fault that the daemon identified: its begin, its last report, and its last size on the
+    largest axis."""
 
     source: str
     kind: str

@@ -70,8 +70,8 @@ def _aiding(section: object) -> dict[str, Any]:
 
 
 def _options(section: object) -> dict[str, Any]:
-    """Defaults of a driver's options; which driver it is, and what must be given, is always
-    told."""
+    """Defaults of a driver's options; the driver's name and its required options are always
+    shown."""
     driver = section.get("driver") if isinstance(section, dict) else None
     point = driver_entry_points().get(str(driver))
     if point is None:

@@ -74,7 +74,7 @@ def _plot(
 
 
 def errors(run: Run, truth: TrajectoryTable) -> Section:
-    """Against a truth whose times are on the solution's axis already."""
+    """Errors against a truth on the solution's time axis."""
     title = "Errors against the truth"
     try:
         found = errors_of(run.solution, truth)

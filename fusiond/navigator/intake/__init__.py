@@ -96,7 +96,7 @@ class Intake:
         return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
 
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Let receivers that have not been heard begin with that."""
+        """Start receivers without a fix so far from these sums."""
         self._sections.fixes_shown = fixes_shown
 
     def extra_blocks(self) -> list[Block]:

@@ -300,7 +300,7 @@ def rdss_step(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def rdss_nan(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The latitude of RDSS fixes is not a number."""
+    """RDSS fixes whose latitude is not a number."""
     return _changed(r, begin_s, length_s, DelayedFix, lambda fix, _: replace(fix, lat_rad=math.nan))
 
 
