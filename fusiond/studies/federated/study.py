@@ -206,14 +206,14 @@ Table = tuple[str, list[str], list[list[str]]]
 def tables(result: dict[str, Any]) -> list[Table]:
     """Title, header and rows of each part, for `fusiond study`."""
     return [
-        *_experiments(result["experiments"]),
-        *(_live(name, live) for name, live in result["without_imu"].items()),
-        *(_honesty(name, honest) for name, honest in result["honesty"].items()),
-        *(_fault(name, fault) for name, fault in result["faults"].items()),
+        *_experiment_tables(result["experiments"]),
+        *(_live_table(name, live) for name, live in result["without_imu"].items()),
+        *(_honesty_table(name, honest) for name, honest in result["honesty"].items()),
+        *(_fault_table(name, fault) for name, fault in result["faults"].items()),
     ]
 
 
-def _experiments(e: dict[str, Any]) -> list[Table]:
+def _experiment_tables(e: dict[str, Any]) -> list[Table]:
     one, two = e["1_random_truth"], e["2_constant_truth"]
     return [
         (
@@ -250,7 +250,7 @@ def _experiments(e: dict[str, Any]) -> list[Table]:
     ]
 
 
-def _live(name: str, live: dict[str, Any]) -> Table:
+def _live_table(name: str, live: dict[str, Any]) -> Table:
     low, high = live["nees_interval"]
     rows = [[f"{s} fixes", f"{rms:.2f}", "", ""] for s, rms in live["fixes_rms_m"].items()]
     for label, f in live["estimates"].items():
@@ -261,7 +261,7 @@ def _live(name: str, live: dict[str, Any]) -> Table:
     return f"{title} [{low:.2f}, {high:.2f}]", header, rows
 
 
-def _honesty(name: str, honest: dict[str, Any]) -> Table:
+def _honesty_table(name: str, honest: dict[str, Any]) -> Table:
     low, high = honest["nees_interval"]
     title = f"no fault, {name} sources; NEES of {honest['nees_dof']} within [{low:.2f}, {high:.2f}]"
     rows = [
@@ -271,7 +271,7 @@ def _honesty(name: str, honest: dict[str, Any]) -> Table:
     return title, ["", "horizontal RMS m", "NEES", "false alarms"], rows
 
 
-def _fault(name: str, fault: dict[str, Any]) -> Table:
+def _fault_table(name: str, fault: dict[str, Any]) -> Table:
     rows = [
         [
             mode,
