@@ -152,7 +152,7 @@ def outcomes_of(intake: Intake, m: Measurement, instants: list[int]) -> Counter[
 
 def test_a_kilohertz_of_fixes_is_left_out_and_named() -> None:
     told: list[tuple[str, str]] = []
-    intake = Intake({}, tell=lambda code, text: told.append((code, text)))
+    intake = Intake({}, report=lambda code, text: told.append((code, text)))
     assert outcomes_of(intake, FIX, rate_of(50.0, 4.0)) == {"aids": 200}
     mixed = sorted(rate_of(1000.0, 0.5, 5.0) + rate_of(5.0, 0.5, 5.0))
     burst = outcomes_of(intake, FIX, mixed)
