@@ -18,7 +18,7 @@ from fusiond.outputs.mqtt_version import MqttVersion
 from fusiond.outputs.topics import EVENT
 from tests.broker import Broker, listening
 from tests.outputs.old_broker import HANGS_UP, REFUSES, SILENT, old_broker
-from tests.outputs.publisher import BASE, event, heard, options, running
+from tests.outputs.publisher import BASE, Running, event, heard, options, running
 from tests.patience import PATIENCE_S, until
 
 
@@ -53,6 +53,18 @@ async def test_a_broker_of_3_1_1_is_spoken_to_in_its_version(
             await it.until(lambda r: r.codes()[1:] == ["mqtt_lost", "mqtt_connected"])
             assert old.versions == [5, 4, 4]
             assert it.publisher.counters["mqtt_reconnects"] == 1
+
+
+async def test_a_broker_that_is_known_to_be_of_3_1_1_is_not_asked_for_5(tmp_path: Path) -> None:
+    with Broker(tmp_path) as broker:
+        async with old_broker(broker, SILENT) as old:
+            it = Running(_options(old.port))
+            it.publisher.begin_with_3_1_1()
+            task = asyncio.create_task(it.publisher.run())
+            await it.until(lambda r: r.codes() == ["mqtt_connected"])
+            task.cancel()
+            await asyncio.wait({task}, timeout=PATIENCE_S)
+            assert old.versions == [4]
 
 
 async def test_the_broker_of_the_demo_is_spoken_to_in_its_version() -> None:
