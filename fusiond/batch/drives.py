@@ -61,9 +61,9 @@ def _config(path: Path) -> Config:
 
 def _recording(config_path: Path, files: list[Path]) -> Row:
     # The daemon's parts come only where there is a recording.
-    from fusiond.replay.run import Wish, replay  # noqa: PLC0415
+    from fusiond.replay.run import ReplayOptions, replay  # noqa: PLC0415
 
-    summary = replay(files, Wish(config=config_path))
+    summary = replay(files, ReplayOptions(config=config_path))
     problems = [*summary.pop("problems"), *summary.pop("driver_faults")]
     figures = {k: v for k, v in summary.items() if k not in _NOT_OF_THE_DRIVE}
     row = flat({"modes": figures.pop("modes"), **figures})

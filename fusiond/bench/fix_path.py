@@ -20,7 +20,7 @@ OURS, NOT_OURS = "fusiond.", ("fusiond.bench.", "fusiond.simulation.")
 """The receiver is simulated."""
 
 
-class Way(NamedTuple):
+class FixPath(NamedTuple):
     """Calls of each function, by module and qualified name."""
 
     calls: dict[tuple[str, str], int]
@@ -36,7 +36,7 @@ class Way(NamedTuple):
         return len({module for module, _ in self.calls})
 
 
-def ordinary_fix() -> Way:
+def ordinary_fix() -> FixPath:
     """Fix with the median number of functions, of `FIXES` fixes under way."""
     drive = Drive(1)
     drive.go_on(AT_S)
@@ -44,7 +44,7 @@ def ordinary_fix() -> Way:
     return sorted(found, key=lambda way: way.functions)[FIXES // 2]
 
 
-def _way(drive: Drive) -> Way:
+def _way(drive: Drive) -> FixPath:
     calls: Counter[tuple[str, str]] = Counter()
     ours: dict[CodeType, tuple[str, str] | None] = {}
 
@@ -68,4 +68,4 @@ def _way(drive: Drive) -> Way:
         drive.take_fix()
     finally:
         sys.setprofile(before)
-    return Way(dict(calls))
+    return FixPath(dict(calls))

@@ -29,10 +29,10 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
+from fusiond.demo.outage_report import outage_report
 from fusiond.demo.page import DemoPage
-from fusiond.demo.papers import paper_play, town
-from fusiond.demo.play import Play, Pulled
-from fusiond.demo.story import story
+from fusiond.demo.papers import paper_setup, town
+from fusiond.demo.setup import DemoSetup, Unplugged
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -79,14 +79,14 @@ def demo(
         DemoPage(broker.port) if dashboard else contextlib.nullcontext() as page,
         _log_kept_out(headless),
     ):
-        play = demo_play() if paper is None else paper_play(paper)
+        play = demo_setup() if paper is None else paper_setup(paper)
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
         live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
         return asyncio.run(_Run(play, live, view, Path(folder), record).drive())
 
 
-def demo_play() -> Play:
+def demo_setup() -> DemoSetup:
     """The shipped car in town streets, its receiver unplugged for a while of every minute."""
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
     config = load_config(CONFIG).model_copy(
@@ -94,8 +94,8 @@ def demo_play() -> Play:
     )
     scenario = replace(SCENARIOS["drive"].fitted(config), path=town)
     rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S, convoy=True)
-    pulled = Pulled("gnss", OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S)
-    return Play(config, replace(scenario, rdss=rdss), ("imu", "gnss", "rdss"), pulled)
+    pulled = Unplugged("gnss", OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S)
+    return DemoSetup(config, replace(scenario, rdss=rdss), ("imu", "gnss", "rdss"), pulled)
 
 
 class View(Protocol):
@@ -107,7 +107,7 @@ class View(Protocol):
 
 class _Run:
     def __init__(
-        self, play: Play, live: Live, view: View, folder: Path, record: Path | None
+        self, play: DemoSetup, live: Live, view: View, folder: Path, record: Path | None
     ) -> None:
         self._play = play
         self._duration_s = duration_s = live.duration_s
@@ -157,7 +157,7 @@ class _Run:
             await asyncio.gather(*others, ended, return_exceptions=True)
             await asyncio.wait([daemon])
         daemon.result()
-        self._print_story()
+        self._print_outages()
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
@@ -234,12 +234,12 @@ class _Run:
             "rejected_by_source": {name: source.rejected for name, source in health.items()},
         }
 
-    def _print_story(self) -> None:
+    def _print_outages(self) -> None:
         """Report an event on standard error: the last line of the output is the summary."""
         t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
         start_s = self._vehicle.start_ns * 1e-9
         outages = [(begin - start_s, end - start_s) for begin, end in self._without_gnss]
-        for sentence in story(t_s, error_m, sigma_m, outages):
+        for sentence in outage_report(t_s, error_m, sigma_m, outages):
             print(sentence, file=sys.stderr)
 
 

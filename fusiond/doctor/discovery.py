@@ -133,7 +133,7 @@ def _kind(item: Sentence | Frame) -> str:
     return "raw" if number in _MSM else "rtcm"
 
 
-async def on_port(
+async def device_on_port(
     port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S
 ) -> Device | SilentPort:
     """Device on a serial port, or a note that none is recognised.
@@ -205,7 +205,9 @@ async def _terminal(port: str) -> Device | None:
     return Device("rdss", {"port": port}, f"{port}: an RDSS terminal answers")
 
 
-async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) -> list[Device]:
+async def device_on_bus(
+    interface: Interface, channel: str, listen_s: float = BUS_S
+) -> list[Device]:
     """The devices on a CAN bus whose DBC file is shipped: IMU and receiver that fit best."""
     decoders: list[tuple[int, CanDecoder[Any]]] = []
     for number, known in enumerate(KNOWN_DEVICES):

@@ -44,7 +44,7 @@ from fusiond.recording.records import (
     reading,
     tick_payload,
 )
-from fusiond.recording.retry import Again
+from fusiond.recording.retry import Retry
 
 MESSAGE_BYTES = 64 * 1024
 """Inputs that come without a tick (it is late, or none is left) make a message of their own."""
@@ -82,7 +82,7 @@ class Recorder:
         """`waiting`: the last seconds are kept in memory until an event comes."""
         self._writer: LogWriter | None = None
         self._closing: list[LogWriter] = []
-        self._again = Again()
+        self._again = Retry()
         self._ring: deque[Item] = deque()
         self._until_ns: int | None = None
         self._started: Record | None = None

@@ -37,7 +37,7 @@ FAREWELL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class ReplayOptions:
     """Options of a replay: another configuration, single settings, files, the speed at which it is
     published (None: not at all, as fast as it goes)."""
 
@@ -47,7 +47,7 @@ class Wish:
     speed: float | None = None
 
 
-def replay(paths: Sequence[Path], wish: Wish) -> dict[str, Any]:
+def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
     """Replay a recording; the summary. `times_real_time` is by CPU time.
 
     `identical` is None where there is nothing to compare with. Raises `LogError`, `ConfigError`,

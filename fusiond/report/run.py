@@ -99,7 +99,7 @@ class Sky:
 
 
 @dataclass(frozen=True, slots=True)
-class ImuLook:
+class ImuStatistics:
     """Statistics of inertial samples before the filter, in the stretches looked at.
 
     Intervals (ms) between samples by their own stamps and by their arrival; the amplitude spectrum
@@ -151,7 +151,7 @@ class LogParts:
     tick_delay_ms: tuple[Floats, Floats] | None = None
     usage: tuple[Floats, Floats, Floats] | None = None
     """Times, CPU in percent of a core, resident memory in MB."""
-    imu: ImuLook | None = None
+    imu: ImuStatistics | None = None
     sources: Sequence[str] = ()
 
 

@@ -17,7 +17,7 @@ from fusiond.report.run import Difference
 _AIDING: TypeAdapter[AnyAiding] = TypeAdapter(AnyAiding)
 
 
-def differing(config: bytes | None) -> list[Difference] | None:
+def changed_settings(config: bytes | None) -> list[Difference] | None:
     """The values that are not the default, dotted, in the file's order; None where the log holds no
     configuration. An inertial unit's defaults are those of its `sensor_class`."""
     try:

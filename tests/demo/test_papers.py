@@ -17,8 +17,8 @@ import pytest
 
 from fusiond.configuration.load import load_config
 from fusiond.demo.demo import ned_error
-from fusiond.demo.papers import PAPERS, paper_play, settings
-from fusiond.demo.play import Pulled
+from fusiond.demo.papers import PAPERS, paper_setup, settings
+from fusiond.demo.setup import Unplugged
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth
@@ -40,7 +40,7 @@ class Run:
     """A paper's daemon and vehicle in this process, and what the daemon says."""
 
     def __init__(self, number: str, folder: Path) -> None:
-        play = paper_play(number)
+        play = paper_setup(number)
         # A host that stands still for a second is not what is looked at.
         slow = play.config.imu.model_copy(update={"rate_hz": 50.0, "gap_s": 2.0})
         config = play.config.model_copy(update={"imu": slow})
@@ -142,13 +142,13 @@ def test_a_papers_configuration_is_the_shipped_one_with_its_lines() -> None:
         path = REPOSITORY / "config" / paper.config
         assert made["imu"] == tomllib.loads(path.read_text(encoding="utf-8"))["imu"], number
         assert paper.lines["estimator"].items() <= made["estimator"].items()
-        assert load_config(path).imu.rate_hz == paper_play(number).scenario.imu.rate_hz
+        assert load_config(path).imu.rate_hz == paper_setup(number).scenario.imu.rate_hz
 
 
 def test_plugs_are_pulled_once_or_over_and_over() -> None:
-    assert list(Pulled("imu", 0.0, 25.0).times(60.0)) == [(0.0, 25.0)]
-    assert list(Pulled("gnss", 18.0, 12.0, 60.0).times(100.0)) == [(18.0, 30.0), (78.0, 90.0)]
-    assert list(Pulled("gnss", 18.0, 12.0).times(10.0)) == []
+    assert list(Unplugged("imu", 0.0, 25.0).times(60.0)) == [(0.0, 25.0)]
+    assert list(Unplugged("gnss", 18.0, 12.0, 60.0).times(100.0)) == [(18.0, 30.0), (78.0, 90.0)]
+    assert list(Unplugged("gnss", 18.0, 12.0).times(10.0)) == []
 
 
 def test_the_command_runs_a_paper_and_names_those_that_there_are() -> None:

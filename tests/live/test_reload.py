@@ -17,7 +17,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.daemon import run_daemon
 from fusiond.live.reload import difference
 from fusiond.navigation.solution import Mode
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.broker import free_port
 from tests.live.daemon_bench import NO_MQTT, PARKED, Bench, running
 from tests.patience import PATIENCE_S, until
@@ -104,7 +104,7 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
         assert bench.events("reloaded")[-1].endswith("changed: nothing")
     assert Mode.ALIGNING not in {s.mode for s in bench.seen[navigated:]}
     (log,) = (tmp_path / "logs").iterdir()
-    again = replay([log], Wish())
+    again = replay([log], ReplayOptions())
     assert again["identical"] is True, again["first_difference"]
 
 

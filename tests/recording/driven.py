@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.configuration.schema import Config
-from fusiond.demo.demo import demo_play
+from fusiond.demo.demo import demo_setup
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.clock.host_time import MS, Host
 from tests.recording.rig import Rig
@@ -22,7 +22,7 @@ class Drive(Rig):
     def __init__(
         self, folder: Path, duration_s: float, config: Config | None = None, **options: Any
     ) -> None:
-        play = demo_play()
+        play = demo_setup()
         config = config or play.served(1, folder)
         scenario = play.scenario.fitted(config)
         self.vehicle = SimulatedVehicle(scenario, seed=3, duration_s=duration_s)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def story(
+def outage_report(
     t_s: Array, error_m: Array, sigma_m: Array, outages: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
     """One sentence for each outage that the solution bridged.
