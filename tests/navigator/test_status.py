@@ -5,15 +5,14 @@ from __future__ import annotations
 from drivers.measurements import PositionFix
 from fusiond.navigation.solution import Mode
 from tests import runs
-from tests.navigator.vehicle import CONFIG, START_NS, drive, started
+from tests.navigator.vehicle import START_NS, drive, started
 
-WITHOUT_S = 24.0, 32.0
+WITHOUT_S = 20.0, 34.0
 """No fix in this part of the drive, which lasts for longer than `coast_after_s`."""
 
 
 def test_the_fixes_that_end_a_coasting_are_the_reason_from_then_on() -> None:
-    settings = CONFIG | {"estimator": {"buffer_s": 12.0, "coast_after_s": 3.0}}
-    navigator, row = started(settings)
+    navigator, row = started()
     d, said = drive(), []
     waiting = [m for m in d.measurements if isinstance(m, PositionFix)]
     for first in range(row, len(d.times), 10):
