@@ -35,7 +35,7 @@ from fusiond.outputs.topics import NAV, TOPICS
 from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 
-PIECES = {"sent": "_send_one", "heard": "_hear_one", "turn": "_turn", "look": "_look"}
+PIECES = {"sent": "_send_one", "heard": "_receive_one", "turn": "_turn", "look": "_look"}
 _OF_QUEUES = ("sent", "heard")
 
 
@@ -68,7 +68,7 @@ async def _feed(outputs: Sequence[Output]) -> None:
         for topic in TOPICS:
             if topic.name in EXAMPLES and (topic is NAV or number % 10 == 0):
                 for output in outputs:
-                    output.take(topic, EXAMPLES[topic.name])
+                    output.publish(topic, EXAMPLES[topic.name])
         number += 1
         await asyncio.sleep(0.1)
 

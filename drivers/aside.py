@@ -38,8 +38,8 @@ async def aside(call: Callable[[], T], discard: Callable[[T], None]) -> T:
         try:
             loop.call_soon_threadsafe(settle, found, failed)
         except RuntimeError:  # the loop is closed: this came too late for anybody
-            for late in found:
-                discard(late)
+            for orphan in found:
+                discard(orphan)
 
     threading.Thread(target=work, name="aside", daemon=True).start()
     try:

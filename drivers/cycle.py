@@ -37,13 +37,13 @@ class Cycle:
         """True if an epoch has begun."""
         return bool(self._names)
 
-    def begins_anew(self, key: Hashable, name: Name) -> bool:
+    def restarts(self, key: Hashable, name: Name) -> bool:
         """True if a message belongs to another epoch than the one that is open."""
         if not self._names:
             return False
         return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
 
-    def late(self, key: Hashable, name: Name) -> bool:
+    def delayed(self, key: Hashable, name: Name) -> bool:
         """True if a message is of the epoch that was closed just now: what was learned is too
         short. One that this epoch had is none: the receiver repeats itself."""
         if self._names or not self._at_once or key != self._key or name in self._last:

@@ -33,7 +33,7 @@ class Inputs:
         self._host_now_ns = host_now_ns
         self._handlers: dict[str, Handler] = {}
         self._held_ns: int | None = None
-        self.heard: Callable[[str, int, bytes | str | CanFrame | None], None] | None = None
+        self.on_input: Callable[[str, int, bytes | str | CanFrame | None], None] | None = None
 
     def on(self, kind: str, handler: Handler) -> None:
         """Register the handler of a kind of input."""
@@ -50,8 +50,8 @@ class Inputs:
         if t_ns is None:
             t_ns = self._host_now_ns()
         handler = self._handlers[kind]
-        if self.heard is not None:
-            self.heard(kind, t_ns, payload)
+        if self.on_input is not None:
+            self.on_input(kind, t_ns, payload)
         self._held_ns = t_ns
         try:
             handler(payload, t_ns)
@@ -60,5 +60,5 @@ class Inputs:
 
     def sent(self, data: bytes) -> None:
         """Tell who listens what the driver has sent to its device."""
-        if self.heard is not None:
-            self.heard("sent", self.now_ns(), data)
+        if self.on_input is not None:
+            self.on_input("sent", self.now_ns(), data)

@@ -25,8 +25,10 @@ CONNECT_S = 5.0
 """For name and connection together a few round trips of a mobile network; the first packet is sent
 again after 1 s and 3 s (RFC 6298, section 2)."""
 KEEPALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte, of which a receiver that
-works leaves none; three probes, since mobile links lose one now and then."""
+"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte.
+
+A receiver that works leaves no such pause; three probes, since mobile links lose one now and
+then."""
 UNANSWERED_MS = 11_000
 """The same for bytes of ours that are not acknowledged (RFC 5482)."""
 SENDER_HELD_S = 5.0
@@ -164,7 +166,7 @@ class UdpPort(_SocketPort):
         super().__init__(opened)
         self._counters = counters
         self._sender: tuple[Any, ...] | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
 
     @property
     def writable(self) -> bool:
@@ -175,10 +177,10 @@ class UdpPort(_SocketPort):
         now_s = monotonic()
         # By host alone: some send each datagram from a fresh port.
         foreign = self._sender is not None and self._sender[0] != sender[0]
-        if foreign and now_s - self._heard_s < SENDER_HELD_S:
+        if foreign and now_s - self._received_s < SENDER_HELD_S:
             self._counters["other_sender"] += 1
             raise BlockingIOError
-        self._sender, self._heard_s = sender, now_s
+        self._sender, self._received_s = sender, now_s
         if not data:
             raise BlockingIOError  # a datagram without a byte is no end of anything
         return data

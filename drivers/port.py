@@ -17,8 +17,9 @@ READ_BYTES = 1024
 parsing, so that a device that floods leaves every other task its turn."""
 
 OPEN_ERRORS = (OSError, ValueError, OverflowError, termios.error)
-"""Exceptions of opening a port that is absent, locked, no terminal, or refuses the baud rate
-(SerialException is an OSError), and for a host that cannot be reached."""
+"""Exceptions of opening a port or reaching a host.
+
+A port is absent, locked, no terminal, or refuses the baud rate (SerialException is an OSError)."""
 
 
 class Port(Protocol):

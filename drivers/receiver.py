@@ -87,7 +87,7 @@ class ReceiverDriver:
         self._now_ns = self.inputs.now_ns
         self._line = SerialLine(options.port, options.baud, now_ns, open_port=open_port)
         self._open = False
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         """Cautions that have been an event."""
         self._why_closed = ""
         self.counters: Counter[str] = self._line.counters
@@ -198,8 +198,8 @@ class ReceiverDriver:
                 self._useful_ns = measurement.t_seen_ns
             self._emit(measurement)
         for code, text in self.cautions.items() if found else ():
-            if code not in self._told:
-                self._told.add(code)
+            if code not in self._reported:
+                self._reported.add(code)
                 self._emit(DeviceEvent(self.name, self._now_ns(), code, text))
 
     # ----------------------------------------------------------------- status

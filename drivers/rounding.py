@@ -29,8 +29,10 @@ ZERO_SD = 1.0 / math.sqrt(3.0)
 
 
 class RoundedSpeed(NamedTuple):
-    """Mean and one sigma (m/s) of a speed, and the step (m/s) of readings that share an error of
-    sigma `SHARED_SD` steps, which is a part of that; 0 where they share none."""
+    """Mean, one sigma and step (m/s) of a speed that was rounded.
+
+    Readings share an error of sigma `SHARED_SD` steps, a part of that sigma; the step is 0 where
+    they share none."""
 
     mean_m_s: float
     sd_m_s: float

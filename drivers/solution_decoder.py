@@ -108,9 +108,9 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
     def _belongs(self, key: Hashable, name: Name, found: list[Measurement]) -> bool:
         """True if a message of instant `key` goes into the epoch that is open, or a new one; what
         it closes is `found`."""
-        if self._cycle.begins_anew(key, name):
+        if self._cycle.restarts(key, name):
             self._close(found, learn=True)
-        return not self._cycle.late(key, name)
+        return not self._cycle.delayed(key, name)
 
     def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
         epoch, self._epoch = self._epoch, None

@@ -34,7 +34,7 @@ def main(names: list[str]) -> None:
     for name in names or list(RUNS):
         study = import_module(STUDIES[name])
         path = FIGURES / f"{name}.png"
-        study.plot(study.run(RUNS[name]), path)
+        study.plot(study.run_study(RUNS[name]), path)
         lightened(path)
         print(path)
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from drivers.bestpos.framing import Log, LogSplitter
 from drivers.measurements import Measurement
 from drivers.plausible import LEAP_SECONDS, within
-from drivers.raw.weeks import utc_as_told
+from drivers.raw.weeks import utc_as_reported
 from drivers.solution import Solution
 from drivers.solution_decoder import SolutionDecoder
 
@@ -139,7 +139,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
         best = next((s for s in there if s.refusal is None), there[0])
         best.t_seen_ns = epoch.t_seen_ns
         if epoch.week:
-            best.utc_ns = utc_as_told(epoch.week, epoch.tow_s, epoch.leap_seconds)
+            best.utc_ns = utc_as_reported(epoch.week, epoch.tow_s, epoch.leap_seconds)
         best.utc_known = epoch.believed
         moving = [epoch.velocities[name] for name in VELOCITIES if name in epoch.velocities]
         if moving:
@@ -215,7 +215,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
         at_ns = None
         if log.week is not None:
             leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
-            at_ns = utc_as_told(log.week, log.tow_s, leap)
+            at_ns = utc_as_reported(log.week, log.tow_s, leap)
         yaw_rad, sd_rad = math.radians(heading), math.radians(sd)
         found += self._judge.heading(self._t_seen_ns, at_ns, yaw_rad, sd_rad)
 

@@ -100,8 +100,8 @@ class LogSplitter(Splitter[Log]):
             return self._refuse("log_cut", end - at)
         if len(buffer) < end + _BODY:
             return None
-        raw, told = bytes(buffer[at + 1 : end]), bytes(buffer[end + 1 : end + _BODY])
-        if b"%08X" % log_crc(raw) != told.upper():
+        raw, stated = bytes(buffer[at + 1 : end]), bytes(buffer[end + 1 : end + _BODY])
+        if b"%08X" % log_crc(raw) != stated.upper():
             return self._refuse("crc_bad", end - at + 1)
         log = _parsed(raw.decode("ascii"))
         if log is None:

@@ -23,7 +23,7 @@ TURN = 2.0 * math.pi
 NAN = math.nan
 
 
-class CanAidOptions(CanOptions):
+class CanMeasurementOptions(CanOptions):
     """Common part of the two."""
 
     valid: str | Signals = ()
@@ -32,7 +32,7 @@ class CanAidOptions(CanOptions):
     """Without a measurement for so long the device is `silent`."""
 
 
-class CanAttitudeOptions(CanAidOptions):
+class CanAttitudeOptions(CanMeasurementOptions):
     """Signals of roll, pitch and yaw (NED to body, 3-2-1), and one sigma of each.
 
     "" for an angle that the device does not measure, or whose sigma it does not say.
@@ -42,7 +42,7 @@ class CanAttitudeOptions(CanAidOptions):
     sd_rpy: tuple[str, str, str] = ("", "", "")
 
 
-class CanBearingOptions(CanAidOptions):
+class CanBearingOptions(CanMeasurementOptions):
     """Signals of the direction to a point, and which number names the point.
 
     Azimuth runs from the sensor's x (nominally forward) to its y (right), elevation is positive

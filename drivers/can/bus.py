@@ -119,16 +119,16 @@ class CanBus:
         exception of a callback is a defect of the caller: it closes the bus and leaves here.
         """
         self._on_frame, self._on_controller = on_frame, on_controller
-        told = ""
+        reported = ""
         while True:
             try:
                 bus = self._open()
             except (OSError, can.CanError, ValueError) as error:
                 self.counters["bus_open_failed"] += 1
                 why = self._explain(error)
-                if why != told:
+                if why != reported:
                     on_link(False, why)
-                    told = why
+                    reported = why
                 await asyncio.sleep(self._backoff.next())
                 continue
             self.counters["bus_opened"] += 1
@@ -137,13 +137,13 @@ class CanBus:
             self._bus = bus
             try:
                 on_link(True, "")
-                told = await self._serve(bus)
+                reported = await self._serve(bus)
             finally:
                 self._bus = None
                 with contextlib.suppress(OSError, can.CanError):
                     bus.shutdown()
                 self.counters["bus_closed"] += 1
-            on_link(False, told)
+            on_link(False, reported)
             await asyncio.sleep(self._backoff.next())
 
     def send(self, frame: CanFrame) -> bool:
@@ -204,7 +204,7 @@ class CanBus:
         except NotImplementedError:
             fd = -1
         if fd < 0:
-            return await _ThreadReader(self, bus, gone).run()
+            return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
         read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
         loop.add_reader(fd, self._readable, fd, read, gone)
@@ -336,7 +336,7 @@ class _ThreadReader:
         self._scheduled = False
         self._stop = threading.Event()
 
-    async def run(self) -> str:
+    async def wait_until_gone(self) -> str:
         name = f"can-{self._owner.channel}"
         threading.Thread(target=self._pump, name=name, daemon=True).start()
         try:

@@ -197,13 +197,13 @@ def load_dbc(name: str) -> Database:
     """
     path = find_dbc(name)
     try:
-        return _loaded(path, path.stat().st_mtime_ns)
+        return _parsed(path, path.stat().st_mtime_ns)
     except OSError as error:
         raise PermanentDriverError(f"dbc: {path}: {error}") from error
 
 
 @lru_cache(maxsize=16)
-def _loaded(path: Path, changed_ns: int) -> Database:
+def _parsed(path: Path, changed_ns: int) -> Database:
     """The file as it was then: sources of one bus share one."""
     content = path.read_bytes()
     # As cantools takes it; a BOM says that it is not so.

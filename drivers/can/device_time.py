@@ -60,10 +60,10 @@ class DeviceTime:
         self._settle = SETTLE_S * per_tick
         self._ticks: int | None = None
         self._arrivals_ns: Arrivals = (0, 0)
-        self._late = 0.0
+        self._delay = 0.0
         self._doubt: _Doubt | None = None
         self._lag: tuple[float, float] | None = None
-        """The lateness above RESTART_S that is watched, and for how long (ticks)."""
+        """Delay above RESTART_S that is watched, and its duration (ticks)."""
 
     def unwrap(self, raw: int, arrivals_ns: Arrivals) -> int | None:
         """Ticks in ns since the clock's own zero; None for a time that did not advance, or that
@@ -74,20 +74,20 @@ class DeviceTime:
         """
         if self._ticks is None:
             return self._begin(raw, arrivals_ns)
-        advance, late, elapsed = self._explain(raw, arrivals_ns)
+        advance, delay, elapsed = self._explain(raw, arrivals_ns)
         if advance <= 0:
             return self._confirm(raw, arrivals_ns)
         self._doubt = None
-        if self._stays_late(late, elapsed):
+        if self._stays_delayed(delay, elapsed):
             self.restarts += 1
             return self._begin(raw, arrivals_ns)
         self._ticks, self._arrivals_ns = self._ticks + advance, arrivals_ns
-        self._late = max(0.0, late)
+        self._delay = max(0.0, delay)
         return self._ns()
 
     def _begin(self, raw: int, arrivals_ns: Arrivals) -> int:
         self._ticks, self._arrivals_ns = raw, arrivals_ns
-        self._late, self._lag, self._doubt = 0.0, None, None
+        self._delay, self._lag, self._doubt = 0.0, None, None
         return self._ns()
 
     def _explain(self, raw: int, arrivals_ns: Arrivals) -> tuple[int, float, float]:
@@ -99,11 +99,11 @@ class DeviceTime:
         for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
             elapsed = (now - before) / self._tick
             drift = DEVICE_DRIFT * abs(elapsed)
-            due = self._late + elapsed
+            due = self._delay + elapsed
             advance = step + modulus * int((due + slack + drift - step) // modulus)
-            late = max(due - advance - drift, -slack)
-            if found is None or abs(late) < abs(found[1]):
-                found = advance, late, elapsed
+            delay = max(due - advance - drift, -slack)
+            if found is None or abs(delay) < abs(found[1]):
+                found = advance, delay, elapsed
         assert found is not None
         return found
 
@@ -131,17 +131,17 @@ class DeviceTime:
         self._doubt = _Doubt(raw, raw, arrivals_ns)
         return None
 
-    def _stays_late(self, late: float, elapsed: float) -> bool:
-        if late <= self._restart or self._slack < self._restart:
+    def _stays_delayed(self, delay: float, elapsed: float) -> bool:
+        if delay <= self._restart or self._slack < self._restart:
             self._lag = None
             return False
-        first, passed = self._lag or (late, 0.0)
+        first, passed = self._lag or (delay, 0.0)
         passed += max(0.0, elapsed) if self._lag else 0.0
         self._lag = first, passed
         if passed <= self._settle:
             return False
-        self._lag = late, 0.0
-        return late > first - BACKLOG_PACE * passed
+        self._lag = delay, 0.0
+        return delay > first - BACKLOG_PACE * passed
 
     def _ns(self) -> int:
         assert self._ticks is not None

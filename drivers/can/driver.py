@@ -132,7 +132,7 @@ class CanDriver(Generic[O]):
         self._was_down = False
         self._restarts = 0
         self._sample_ns = 0
-        self._told_ns: dict[str, int] = {}
+        self._reported_ns: dict[str, int] = {}
 
     async def run(self) -> None:
         """Serve the device until cancelled."""
@@ -183,8 +183,8 @@ class CanDriver(Generic[O]):
         text = text.format(channel=self.options.channel)
         if state == "bus_off":
             self.status.state, self.status.detail = "silent", text
-        if t_ns - self._told_ns.get(code, t_ns - EVENT_SPACING_NS) >= EVENT_SPACING_NS:
-            self._told_ns[code] = t_ns
+        if t_ns - self._reported_ns.get(code, t_ns - EVENT_SPACING_NS) >= EVENT_SPACING_NS:
+            self._reported_ns[code] = t_ns
             self._event(code, f"{self.options.channel}: {text}")
 
     async def _watch(self) -> None:

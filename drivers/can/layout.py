@@ -90,9 +90,9 @@ class Layout:
         """Reader of the wanted signals at once; None where they are not whole bytes of one byte
         order, one after the other."""
         places = [self._place(bits) for bits in self._wanted]
-        apart = all(before[1] <= after[0] for before, after in pairwise(places))
+        disjoint = all(before[1] <= after[0] for before, after in pairwise(places))
         whole = all(b.shift % 8 == 0 and b.mask.bit_length() in _CODES for b in self._wanted)
-        if not places or not apart or not whole or (self._little and self._big):
+        if not places or not disjoint or not whole or (self._little and self._big):
             return None
         codes, at = [">" if self._big else "<"], 0
         for bits, (begin, end) in zip(self._wanted, places, strict=True):

@@ -31,7 +31,7 @@ from drivers.rounding import Rounding, rounded_speed
 
 REQUESTS: dict[int, tuple[int, bool]] = {11: (0x7DF, False), 29: (0x18DB_33F1, True)}
 """Identifier of a request to every unit, and whether it has 29 bits."""
-ANSWERS: dict[int, CanFilter] = {
+REPLY_FILTERS: dict[int, CanFilter] = {
     11: {"can_id": 0x7E8, "can_mask": 0x7F8, "extended": False},
     29: {"can_id": 0x18DA_F100, "can_mask": 0x1FFF_FF00, "extended": True},
 }
@@ -88,7 +88,7 @@ class ObdSpeedDecoder:
         self.name = name
         self.counters: Counter[str] = Counter() if counters is None else counters
         self._options = options
-        self._filter = ANSWERS[options.identifiers]
+        self._filter = REPLY_FILTERS[options.identifiers]
         self._unit = options.unit
         self._seen = False
 

@@ -29,7 +29,7 @@ from drivers.nmea.reasons import (
     FULLER,
     OWN_SENTENCES,
     POSITIONS,
-    Heard,
+    Received,
     cautions,
     no_fix,
     note,
@@ -72,10 +72,10 @@ class NmeaDecoder:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self.gga = b""
         """The last GGA with a position, without its line end; empty before one."""
-        self.heard = Heard()
+        self.received = Received()
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
-        self._judge = EpochJudge(source, self._decoding, self.counters, self.heard)
+        self._judge = EpochJudge(source, self._decoding, self.counters, self.received)
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
         self._cycle = Cycle()
@@ -96,7 +96,7 @@ class NmeaDecoder:
     @property
     def cautions(self) -> dict[str, str]:
         """By counter: what makes the fixes poorer than they could be, and what was done."""
-        return cautions(self.counters, self.heard, self._decoding.earliest_date)
+        return cautions(self.counters, self.received, self._decoding.earliest_date)
 
     @property
     def cause(self) -> str:
@@ -104,7 +104,7 @@ class NmeaDecoder:
         verifies."""
         if not self.counters["sentences"]:
             return nothing_verified(self.counters, self._splitter.unread)
-        return no_fix(self.counters, self.heard, self.refusal)
+        return no_fix(self.counters, self.received, self.refusal)
 
     @property
     def epoch_open(self) -> bool:
@@ -152,23 +152,23 @@ class NmeaDecoder:
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
             own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
-            note(self.heard.unused, sentence.address if own else sentence.formatter)
+            note(self.received.unused, sentence.address if own else sentence.formatter)
             if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ
-                note(self.heard.talkers, sentence.address[:2])
+                note(self.received.talkers, sentence.address[:2])
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
             if sentence.formatter in POSITIONS:
-                note(self.heard.talkers, sentence.talker)
+                note(self.received.talkers, sentence.talker)
             else:
-                note(self.heard.unused, sentence.formatter)
+                note(self.received.unused, sentence.formatter)
             return
         try:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
             self.counters["bad_field"] += 1
             return
-        note(self.heard.used, sentence.formatter)
+        note(self.received.used, sentence.formatter)
         if sentence.formatter == "GGA" and sentence.fields[5:6] not in ((), ("",), ("0",)):
             self.gga = sentence.raw
 
@@ -178,12 +178,12 @@ class NmeaDecoder:
             self.counters["repeated_sentence"] += 1
             return
         epoch = self._epoch
-        if formatter == "GLL" and time_ns is not None and self._told_already(time_ns, sentence):
+        if formatter == "GLL" and time_ns is not None and self._given_already(time_ns, sentence):
             self.counters["unused_sentence"] += 1
             return
         if epoch is not None and time_ns is not None and self._belongs_before(epoch, t_seen_ns):
             epoch = self._epoch = None
-            self._late()
+            self._delayed()
         if epoch is not None:
             again = formatter in epoch.cycle and formatter != "GSA"
             if (
@@ -196,7 +196,7 @@ class NmeaDecoder:
                 self.counters["repeated_sentence"] += 1
                 return
         elif time_ns is None and self._closed_by == "last" and formatter not in self._cycle.last:
-            self._late()
+            self._delayed()
             return
         epoch = self._epoch or Epoch()
         epoch.take(sentence, t_seen_ns)
@@ -210,7 +210,7 @@ class NmeaDecoder:
                 and formatter not in self._cycle.last
                 and self._of_epoch(closed, time_ns, sentence)
             ):
-                self._late()
+                self._delayed()
         elif time_ns is not None and time_step_ns(sentence) < epoch.time_step_ns:
             epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
         if formatter == self._decoding.last_sentence or (
@@ -241,7 +241,7 @@ class NmeaDecoder:
         step_ns = time_step_ns(sentence)
         return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
-    def _told_already(self, time_ns: int, sentence: Sentence) -> bool:
+    def _given_already(self, time_ns: int, sentence: Sentence) -> bool:
         """True if the place at this instant came by a sentence that says more: many a burst ends
         with GLL, behind all GSV, and the epoch would wait for it."""
         epoch = self._epoch if self._epoch is not None else self._closed
@@ -257,7 +257,7 @@ class NmeaDecoder:
             return False
         return epoch.t_seen_ns - closed.t_seen_ns < t_seen_ns - epoch.t_seen_ns
 
-    def _late(self) -> None:
+    def _delayed(self) -> None:
         """More of an epoch that was closed: where it was closed is learned anew."""
         self.counters["late_sentence"] += 1
         self._judge.in_two_parts()

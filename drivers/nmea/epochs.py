@@ -93,7 +93,7 @@ class Epoch:
     addresses: set[str] = field(default_factory=set)
     """The same with their talkers."""
     raws: set[bytes] = field(default_factory=set)
-    """The sentences themselves, which may be said twice."""
+    """Sentences of the epoch, which may come twice."""
     day: date | None = None
     no_date: str = ""
     """A date that is printed and is none."""

@@ -263,8 +263,8 @@ class _WholeSentences:
             if _verifies(match.group()):
                 self._found.append(match.span())
         # A sentence may have begun, of which the rest is to come.
-        begun = buffer.rfind(b"$", max(after, len(buffer) - MAX_SENTENCE))
-        self._searched = len(buffer) if begun < 0 else begun
+        begin_at = buffer.rfind(b"$", max(after, len(buffer) - MAX_SENTENCE))
+        self._searched = len(buffer) if begin_at < 0 else begin_at
 
     def drop(self, count: int) -> None:
         """The first `count` bytes leave the buffer."""

@@ -24,7 +24,7 @@ from drivers.measurements import (
 )
 from drivers.nmea.epochs import INTEGRATED, Epoch
 from drivers.nmea.geoid import Geoid
-from drivers.nmea.reasons import Heard, note
+from drivers.nmea.reasons import Received, note
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
 
@@ -38,14 +38,14 @@ class EpochJudge:
     """Judges epochs in their order. Its counters are those of `NmeaDecoder`."""
 
     def __init__(
-        self, source: str, decoding: SolutionDecoding, counters: Counter[str], heard: Heard
+        self, source: str, decoding: SolutionDecoding, counters: Counter[str], received: Received
     ) -> None:
         self.counters = counters
         self.refusal = ""
         """Reason why the last epoch was refused, by counter name; empty when it was not."""
         self._source = source
         self._decoding = decoding
-        self._heard = heard
+        self._received = received
         self._calendar = Calendar(decoding.earliest_date, counters)
         self._order = EpochOrder(counters)
         self._trust = TimeTrust()
@@ -62,10 +62,10 @@ class EpochJudge:
         self.counters["epochs"] += 1
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
-            note(self._heard.statuses, epoch.unknown_status)
+            note(self._received.statuses, epoch.unknown_status)
         if epoch.no_date:
             self.counters["bad_date"] += 1
-            self._heard.no_date = epoch.no_date
+            self._received.no_date = epoch.no_date
         if epoch.quality is None and epoch.plain_valid is not None:
             self._without_gga += 1
             if self._without_gga >= PLAIN_AFTER:
@@ -126,16 +126,16 @@ class EpochJudge:
         if epoch.time_of_day_ns is None:
             return None
         if epoch.day is not None and not self._calendar.plausible(epoch.day):
-            self._heard.implausible_date = epoch.day
+            self._received.implausible_date = epoch.day
             epoch.day = None
         if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
-        told = epoch.plain_valid if epoch.quality is None else epoch.rmc_valid
-        believed = valid and bool(epoch.quality) if told is None else told
+        valid_stated = epoch.plain_valid if epoch.quality is None else epoch.rmc_valid
+        believed = valid and bool(epoch.quality) if valid_stated is None else valid_stated
         if believed:
             self._calendar.dated(epoch.day, epoch.time_of_day_ns, epoch.t_seen_ns)
-        elif told is None and epoch.quality is None and self._heard.used["RMC"]:
+        elif valid_stated is None and epoch.quality is None and self._received.used["RMC"]:
             return epoch.day  # a ZDA of another instant than RMC: some are seconds ahead of it
         utc_ns = posix_ns(epoch.day, epoch.time_of_day_ns)
         trusted = self._trust.report(utc_ns, epoch.t_day_seen_ns, valid=believed)

@@ -51,7 +51,7 @@ OWN_SENTENCES = {
 """Owners of proprietary sentences, by their beginning, in which receivers tell place or
 attitude."""
 MOST_NAMES = 8
-"""Talkers and formatters that are remembered; the first ones are enough to name."""
+"""Most talkers and formatters to remember; the first are enough to name."""
 ROLLOVER = timedelta(weeks=1024)
 ROLLOVER_SPAN = timedelta(days=3653)
 """A date that is right but for the rollover is of the ten years from this software's on."""
@@ -66,7 +66,7 @@ CHECKSUMS = (
 
 
 @dataclass(slots=True)
-class Heard:
+class Received:
     """Received items that a decoder does not use, beside its counters."""
 
     talkers: Counter[str] = field(default_factory=Counter)
@@ -124,21 +124,21 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
     return named(unread)
 
 
-def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
+def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
     """Reason why sentences arrive and no fix comes of them. `refusal`: why the last epoch was
     refused."""
     if refusal:
         return REFUSALS.get(refusal, refusal)
-    if heard.talkers and not POSITIONS & set(heard.used):
-        talker = heard.talkers.most_common(1)[0][0]
+    if received.talkers and not POSITIONS & set(received.used):
+        talker = received.talkers.most_common(1)[0][0]
         what = TALKERS_NOT_READ.get(talker)
         kind = f" ({what})" if what else ""
         return (
             f"positions of talker {talker}{kind} arrive, which are not read: set the receiver to "
             "talker GP or GN"
         )
-    own = next((a for a in heard.unused for o in OWN_SENTENCES if a.startswith(o)), "")
-    if own and not POSITIONS & set(heard.used):
+    own = next((a for a in received.unused for o in OWN_SENTENCES if a.startswith(o)), "")
+    if own and not POSITIONS & set(received.used):
         whose = next(who for o, who in OWN_SENTENCES.items() if own.startswith(o))
         return (
             f"sentences of a maker's own arrive (${own}: {whose}), which are not read: switch on "
@@ -146,38 +146,38 @@ def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
         )
     if counters["checksum_missing"] >= MANY:
         return CHECKSUMS
-    if counters["untimed_epoch"] and POSITIONS & set(heard.used):
+    if counters["untimed_epoch"] and POSITIONS & set(received.used):
         return "positions arrive without a time of day, and are not used: give the antenna more sky"
-    if counters["bad_field"] and not POSITIONS & set(heard.used):
+    if counters["bad_field"] and not POSITIONS & set(received.used):
         return "the positions that arrive have fields that cannot be true (bad_field)"
-    heading = _heading(heard)
-    if heading and not POSITIONS & set(heard.used):
+    heading = _heading(received)
+    if heading and not POSITIONS & set(received.used):
         return (
             f"headings of a compass arrive ({heading}), and no position: a source with "
             'driver = "compass" reads them'
         )
-    names = [*heard.used, *heard.unused]
+    names = [*received.used, *received.unused]
     which = f" ({', '.join(names[:MOST_NAMES])})" if names else ""
     if not counters["epochs"]:
         return f"sentences arrive{which}, but none that counts: switch on GGA and RMC"
     return f"epochs arrive{which}, but none has a position: switch on GGA"
 
 
-def _heading(heard: Heard) -> str:
+def _heading(received: Received) -> str:
     """A sentence of a compass that has been left out; "" where none has."""
-    return next((name for name in OF_A_COMPASS if name in heard.unused), "")
+    return next((name for name in OF_A_COMPASS if name in received.unused), "")
 
 
-def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, str]:
+def cautions(counters: Counter[str], received: Received, earliest: date) -> dict[str, str]:
     """By counter: what makes the fixes poorer than the receiver could, and what was done."""
     found = {}
-    day = heard.implausible_date
+    day = received.implausible_date
     if day is not None:
         found["implausible_date"] = implausible_date(day, earliest)
     if counters["bad_date"] >= MANY:
         found["bad_date"] = (
-            f"RMC has {heard.no_date[:8]!r} for a date, which is none: its times of day are used, "
-            "and the date is another source's"
+            f"RMC has {received.no_date[:8]!r} for a date, which is none: its times of day are "
+            "used, and the date is another source's"
         )
     if counters["checksum_missing"] >= MANY and counters["sentences"]:
         found["checksum_missing"] = CHECKSUMS
@@ -206,7 +206,7 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
             "only GLL has a position: it is used without height and with the sigma of a poor sky; "
             "switch on GGA, RMC and GST"
         )
-    heading = _heading(heard)
+    heading = _heading(received)
     if heading and counters["fixes"]:
         found["compass_left_out"] = (
             f"headings of a compass arrive ({heading}), which a receiver's source does not use: a "
@@ -219,7 +219,7 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
             "sentences (GP, GN)"
         )
     if counters["unknown_status"]:
-        status = heard.statuses.most_common(1)[0][0]
+        status = received.statuses.most_common(1)[0][0]
         found["unknown_status"] = (
             f"RMC has the status {status!r}, which NMEA does not know: its velocity is not used"
         )

@@ -171,7 +171,7 @@ class NtripClient:
         """One connection, to its end, which is an exception."""
         host, port = self._options.address
         reach = partial(_reach, host, port, self._options.tls)
-        connected, context = await aside(reach, lambda late: late[0].close())
+        connected, context = await aside(reach, lambda orphan: orphan[0].close())
         name = host if context is not None else None
         reader, writer = await asyncio.open_connection(
             sock=connected, ssl=context, server_hostname=name

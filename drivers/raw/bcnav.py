@@ -116,7 +116,7 @@ class Bcnav1Decoder:
         self._two: Bits | None = None
         self._healthy: bool | None = None
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a subframe: an ephemeris as soon as both 2 and 3 have been heard, and the
         ionosphere of 3. RefusedError by name."""
         number = SUBFRAMES.get(len(subframe.words))
@@ -164,7 +164,7 @@ class Bcnav2Decoder:
     def __init__(self) -> None:
         self._parts: dict[int, Bits] = {}
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a message. RefusedError by name, `ephemeris_mixed` among them."""
         if len(subframe.words) < 9:
             raise RefusedError("subframe_short")

@@ -25,7 +25,7 @@ SIGNALS = (("1C",), ("2S", "2L", "2X"), ("5I",), ("5Q",))
 class CnavDecoder:
     """One GPS satellite's messages."""
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a message. RefusedError by name."""
         if len(subframe.words) < WORDS:
             raise RefusedError("subframe_short")

@@ -53,7 +53,7 @@ class D1Decoder:
     def __init__(self) -> None:
         self._parts = Parts()
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = information(subframe.words, WORDS)
         number = subframe_number(bits)

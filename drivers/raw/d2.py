@@ -60,7 +60,7 @@ class D2Decoder:
     def __init__(self) -> None:
         self._parts = Parts()
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = information(subframe.words, PAGE_WORDS)
         if subframe_number(bits) != 1:

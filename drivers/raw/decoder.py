@@ -58,7 +58,7 @@ from drivers.raw.weeks import FIRST_RAWX_WEEK, LAST_WEEK, WeekReference, leap_se
 class MessageDecoder(Protocol):
     """Of one satellite, one message."""
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded: ...
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded: ...
 
 
 _DECODERS: dict[str, Callable[[], MessageDecoder]] = {
@@ -109,7 +109,7 @@ class RawDecoder:
         self._t_seen_ns = t_seen_ns
         for item in self._splitter.feed(data):
             if isinstance(item, Frame):
-                found += self.take(item, t_seen_ns)
+                found += self.decode(item, t_seen_ns)
         return found
 
     def flush(self) -> list[RawEvent]:
@@ -117,7 +117,7 @@ class RawDecoder:
         found: list[RawEvent] = []
         for item in self._splitter.finish():
             if isinstance(item, Frame):
-                found += self.take(item, self._t_seen_ns)
+                found += self.decode(item, self._t_seen_ns)
         return found + self.flush_epoch()
 
     @property
@@ -135,13 +135,13 @@ class RawDecoder:
 
     def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
         """Result of a verified frame of RTCM 3 that did not come from the receiver."""
-        return [] if self._rtcm is None else self._rtcm.take(frame, t_seen_ns)
+        return [] if self._rtcm is None else self._rtcm.decode(frame, t_seen_ns)
 
-    def take(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
+    def decode(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
         """Result of a frame that `StreamSplitter` verified."""
         if frame.kind == "rtcm":
             if self._rtcm is not None:
-                return self._rtcm.take(frame.raw, t_seen_ns)
+                return self._rtcm.decode(frame.raw, t_seen_ns)
             self.counters["rtcm_not_used"] += 1
             return []
         kind, payload = frame.raw[2:4], frame.raw[6:-2]
@@ -207,7 +207,7 @@ class RawDecoder:
             self._source, t_seen_ns, system, sfrbx.prn, sfrbx.signal_id, sfrbx.words
         )
         try:
-            decoded = decoder.take(subframe, self._weeks)
+            decoded = decoder.decode(subframe, self._weeks)
         except RefusedError as refused:
             self.counters[str(refused)] += 1
             return []

@@ -27,8 +27,9 @@ NMEA_TIME_NS = 5_000_000_000
 """Another message tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. That of
 RXM-RAWX is up to some milliseconds off, as the receiver's clock is."""
 UBX_FIX_NS = 5_000_000_000
-"""Fixes of UBX-NAV, which have a velocity down and sigmas of their own, stand for the same ones by
-NMEA until none has come for this long."""
+"""Fixes of NMEA are left out until none of UBX-NAV has come for this long.
+
+Those of UBX-NAV are the same fixes with a velocity down and sigmas of their own."""
 SAME_FIX_NS = 20_000_000
 """NMEA prints hundredths of a second, of what UBX gives in nanoseconds; fixes come 50 ms apart at
 the least."""
@@ -79,7 +80,7 @@ class GnssDecoder:
             else None
         )
         self._trust = TimeTrust()
-        self._nmea_told_ns: int | None = None
+        self._nmea_utc_ns: int | None = None
         """UTC of RMC or ZDA when last told, else of the first epoch of RXM-RAWX."""
         self._delays: set[int] = set()
         """BeiDou satellites whose B-CNAV has come."""
@@ -104,8 +105,8 @@ class GnssDecoder:
         nothing tells."""
         if not any(self.counters[name] for name in ALIVE_BY):
             return nothing_verified(self.counters, self._splitter.unread)
-        heard = self._nmea.heard
-        return self._nmea.cause if heard.talkers and not heard.used else ""
+        received = self._nmea.received
+        return self._nmea.cause if received.talkers and not received.used else ""
 
     @property
     def gga(self) -> bytes:
@@ -154,14 +155,14 @@ class GnssDecoder:
         if isinstance(item, Sentence):
             self._take_nmea(self._nmea.take(item, self._t_seen_ns), found)
         elif item.kind == "ubx" and item.raw[2] == CLASS_NAV:
-            self._take_ubx(self._ubx.take(item.raw, self._t_seen_ns), found)
+            self._take_ubx(self._ubx.decode(item.raw, self._t_seen_ns), found)
         elif self._raw is not None:
-            self._take_raw(self._raw.take(item, self._t_seen_ns), found)
+            self._take_raw(self._raw.decode(item, self._t_seen_ns), found)
 
     def _take_nmea(self, measurements: list[Measurement], found: list[Found]) -> None:
         for measurement in measurements:
             if isinstance(measurement, TimeReport):
-                self._nmea_told_ns = measurement.utc_ns
+                self._nmea_utc_ns = measurement.utc_ns
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
             if isinstance(measurement, PositionFix) and not self._own_fix(measurement):
@@ -183,7 +184,7 @@ class GnssDecoder:
             if isinstance(measurement, TimeReport):
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
-                if not self._told_by_nmea(measurement.utc_ns):
+                if not self._known_from_nmea(measurement.utc_ns):
                     found.append(measurement)
                 continue
             if isinstance(measurement, PositionFix):
@@ -222,17 +223,17 @@ class GnssDecoder:
         if not isinstance(epoch.stamp, UtcStamp):
             return
         utc_ns = epoch.stamp.utc_ns
-        if self._told_by_nmea(utc_ns):
+        if self._known_from_nmea(utc_ns):
             return
         trusted = self._trust.report(utc_ns, epoch.t_seen_ns, valid=True)
         if trusted is not None:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
 
-    def _told_by_nmea(self, utc_ns: int) -> bool:
+    def _known_from_nmea(self, utc_ns: int) -> bool:
         """True if RMC or ZDA have told the time lately, or may yet."""
-        if self._nmea_told_ns is None:
-            self._nmea_told_ns = utc_ns
-        return abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS
+        if self._nmea_utc_ns is None:
+            self._nmea_utc_ns = utc_ns
+        return abs(utc_ns - self._nmea_utc_ns) < NMEA_TIME_NS
 
 
 class GnssDriver(ReceiverDriver):

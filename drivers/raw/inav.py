@@ -82,7 +82,7 @@ class InavDecoder:
     def __init__(self) -> None:
         self._parts = Parts()
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a page of I/NAV. RefusedError by name, `ephemeris_mixed` among them."""
         bits = data_word(subframe.words)
         kind = bits.unsigned(0, 6)

@@ -101,7 +101,7 @@ class LnavDecoder:
     def __init__(self) -> None:
         self._parts: dict[int, Bits] = {}
 
-    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
+    def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = subframe_bits(subframe.words)
         number = bits.unsigned(43, 3)

@@ -145,7 +145,7 @@ class RtcmDecoder:
         """True if `flush` would end an epoch."""
         return self._epoch is not None
 
-    def take(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
+    def decode(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
         """Result of a frame."""
         bits = Bits.of_bytes(frame[3:-3])
         number = bits.unsigned(0, 12) if bits.length >= 12 else 0

@@ -57,7 +57,7 @@ def utc_ns(week: int, tow_s: float, leap_seconds: int) -> int:
     return (GPS_EPOCH_S + week * WEEK_S - leap_seconds) * 1_000_000_000 + round(tow_s * 1e9)
 
 
-def utc_as_told(week: int, tow_s: float, leap: int | None) -> int:
+def utc_as_reported(week: int, tow_s: float, leap: int | None) -> int:
     """The same by the leap seconds that the receiver told; by the table where it told none."""
     return utc_ns(week, tow_s, leap_seconds(week, tow_s) if leap is None else leap)
 

@@ -82,7 +82,7 @@ class RdssOptions(DriverOptions):
     transmit: bool = True
     """False: the terminal is read, and never asked for a fix, with which it would transmit."""
     message_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of the transmissions that the card allows, what messages have while fixes wait too."""
+    """Share of the card's transmissions for messages while fixes wait, too."""
     message_expiry_s: PositiveFloat = 3600.0
     """A message that could not be sent or confirmed for so long is given up."""
     message_carriage: Carriage = "binary"
@@ -216,10 +216,10 @@ class RdssDriver:
         return self._terminal.beams
 
     def _posted(self, t_ns: int) -> None:
-        self.tell_stages(t_ns)
+        self.report_stages(t_ns)
         self._wake.set()
 
-    def tell_stages(self, t_ns: int) -> None:
+    def report_stages(self, t_ns: int) -> None:
         """Hand over where messages are that have come further."""
         for change in self.outbox.take_changes():
             m = change.message
@@ -353,7 +353,7 @@ class RdssDriver:
                     self._emit(action.mail)
                 case Notice():
                     self._notify(t_ns, action.code, action.text)
-        self.tell_stages(t_ns)
+        self.report_stages(t_ns)
 
     def _listen(self) -> None:
         """Start afresh for every family that may speak: what came before means nothing now."""

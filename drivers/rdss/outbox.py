@@ -151,7 +151,7 @@ class Outbox:
         self.waiting = list(messages)
         self.number = number
         for message in self.waiting:
-            self._tell(message, message.stage, "kept over a restart")
+            self._report(message, message.stage, "kept over a restart")
 
     def _worded(self, text: str, receipt: bool) -> tuple[Wording, Receipted | None]:
         if not receipt:
@@ -176,7 +176,7 @@ class Outbox:
     def _queue(self, message: Outgoing) -> None:
         self.waiting.append(message)
         self.counters["messages_queued"] += 1
-        self._tell(message, "queued", "")
+        self._report(message, "queued", "")
 
     # ------------------------------------------------------------------ sending
 
@@ -226,7 +226,7 @@ class Outbox:
         message.stage = "sent"
         wait_ns = max(GIVE_UP_NS, RECEIPT_SPACINGS * self.spacing_ns) * message.attempts
         message.not_before_ns = t_ns + wait_ns
-        self._tell(message, "sent", "awaiting its receipt")
+        self._report(message, "sent", "awaiting its receipt")
 
     def refused(self, outcome: Outcome, t_ns: int) -> None:
         """The terminal refuses what is in flight."""
@@ -243,7 +243,7 @@ class Outbox:
             if message.refusals >= MOST_REFUSALS:
                 self._end(message, "failed", f"refused {message.refusals} times: {outcome}")
                 return
-        self._tell(message, "queued", f"refused: {outcome}")
+        self._report(message, "queued", f"refused: {outcome}")
 
     def unanswered(self) -> None:
         """No feedback came for what is in flight: it may have left, and goes again."""
@@ -255,7 +255,7 @@ class Outbox:
         if message.attempts >= MOST_ATTEMPTS:
             self._end(message, "unconfirmed", f"written {message.attempts} times, no feedback")
         else:
-            self._tell(message, "queued", "no feedback: it may have left")
+            self._report(message, "queued", "no feedback: it may have left")
 
     def receipt(self, sender: int, receipted: Receipted) -> None:
         """A receipt has come from this card."""
@@ -279,7 +279,7 @@ class Outbox:
                     self._end(message, "unconfirmed", text)
                 else:
                     message.stage = "queued"
-                    self._tell(message, "queued", "no receipt: it goes again")
+                    self._report(message, "queued", "no receipt: it goes again")
 
     # ------------------------------------------------------------------ inside
 
@@ -293,9 +293,9 @@ class Outbox:
         if self.doubtful is message:
             self.doubtful = None
         self.counters[f"message_{stage}"] += 1
-        self._tell(message, stage, why)
+        self._report(message, stage, why)
 
-    def _tell(self, message: Outgoing, stage: Stage, why: str) -> None:
+    def _report(self, message: Outgoing, stage: Stage, why: str) -> None:
         message.why = why
         self.changes.append(Change(message, stage, why))
 

@@ -71,8 +71,10 @@ class TransmitPermit:
         return feedback.inhibited is False
 
     def lifted_by_self_test(self, inbound_state: int | None) -> bool:
-        """Does ZJXX say so? The bits of its inbound state differ by vendor, but back to the value
-        it had while requests were accepted, after another one, means the same everywhere."""
+        """True if ZJXX says so.
+
+        The bits of its inbound state differ by vendor. Back to the value it had while requests were
+        accepted, after another one, means the same everywhere."""
         self._inbound = inbound_state
         if self.granted or self._inbound_free is None:
             return False

@@ -68,7 +68,7 @@ class Replies:
         if session.state is State.PROBING and not isinstance(message, Identity):
             session.counters["before_identity"] += 1
             return actions
-        session.heard_ns = t_ns
+        session.received_ns = t_ns
         match message:
             case Identity():
                 self._on_identity(message, t_ns, family, actions)
@@ -192,11 +192,11 @@ class Replies:
         if not (awaited and feedback.command is None) and feedback.command not in MESSAGE_COMMANDS:
             return False
         if not awaited:
-            late = session.outbox.doubtful is not None and outcome is Outcome.OK
-            if late:
+            was_doubtful = session.outbox.doubtful is not None and outcome is Outcome.OK
+            if was_doubtful:
                 session.counters["late_feedback"] += 1
                 session.outbox.accepted(t_ns)
-            return late
+            return was_doubtful
         session.enter(State.READY, None)
         if outcome is Outcome.OK:
             self._refused.clear()

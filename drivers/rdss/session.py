@@ -37,7 +37,7 @@ class Session:
         self.counters = counters
         self.state = State.CLOSED
         self.deadline_ns: int | None = None
-        self.heard_ns = 0
+        self.received_ns = 0
         self.family: Family | None = None
         self.identity: Identity | None = None
         self.probe = Probe(options.bauds, options.families)

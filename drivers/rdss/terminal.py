@@ -179,7 +179,7 @@ class Terminal:
                     due = min(due, max(session.pace.free_ns, session.outbox.next_ns))
             due = max(due, self._deadlines.quiet_until_ns)
         if due is not None and session.answered:
-            due = min(due, session.heard_ns + int(self._options.timeout_s * SECOND))
+            due = min(due, session.received_ns + int(self._options.timeout_s * SECOND))
         return due
 
     @property
@@ -241,4 +241,4 @@ class Terminal:
 
     def _gone_quiet(self, t_ns: int) -> bool:
         quiet_ns = int(self._options.timeout_s * SECOND)
-        return self._session.answered and t_ns - self._session.heard_ns >= quiet_ns
+        return self._session.answered and t_ns - self._session.received_ns >= quiet_ns

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from drivers.measurements import Measurement, Vector3
 from drivers.plausible import LEAP_SECONDS, within
-from drivers.raw.weeks import LAST_WEEK, WEEK_S, utc_as_told
+from drivers.raw.weeks import LAST_WEEK, WEEK_S, utc_as_reported
 from drivers.sbf.framing import Block, BlockSplitter
 from drivers.solution import Solution
 from drivers.solution_decoder import SolutionDecoder
@@ -92,7 +92,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
 
     def _end(self, found: list[Measurement], *, learn: bool) -> None:
         super()._end(found, learn=learn)
-        self._tell_heading(None, found)
+        self._report_heading(None, found)
 
     # ----------------------------------------------------------------- blocks to epochs
 
@@ -119,7 +119,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
             _, _, error, variance = _ATTITUDE_COVARIANCE.unpack_from(block.body)
             if self._heading is not None and self._heading[0] == when:
                 good = error & 3 == 0 and 0.0 < variance < math.inf
-                self._tell_heading(math.radians(math.sqrt(variance)) if good else None, found)
+                self._report_heading(math.radians(math.sqrt(variance)) if good else None, found)
 
     def _group(self, block: Block, when: tuple[int, int], found: list[Measurement]) -> bool:
         """True if a block is taken into an epoch."""
@@ -165,7 +165,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
         tow_ms, week = when
         if tow_ms >= WEEK_S * 1000 or not 0 < week <= LAST_WEEK:
             return None
-        return utc_as_told(week, tow_ms * 1e-3, self._leap_seconds)
+        return utc_as_reported(week, tow_ms * 1e-3, self._leap_seconds)
 
     # ----------------------------------------------------------------- fields
 
@@ -208,7 +208,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
 
     def _attitude(self, body: bytes, when: tuple[int, int], found: list[Measurement]) -> None:
         """Kept until its covariance has come, or the next one."""
-        self._tell_heading(None, found)
+        self._report_heading(None, found)
         _, _, _, error, mode, heading_deg = _ATTITUDE.unpack_from(body)
         if error & 3 or not mode or not NO_NUMBER < heading_deg < math.inf:
             self.counters["heading_not_valid"] += 1
@@ -217,7 +217,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
         else:
             self._heading = when, math.radians(heading_deg), self._t_seen_ns
 
-    def _tell_heading(self, sd_rad: float | None, found: list[Measurement]) -> None:
+    def _report_heading(self, sd_rad: float | None, found: list[Measurement]) -> None:
         heading, self._heading = self._heading, None
         if heading is None:
             return

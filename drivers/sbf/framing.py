@@ -78,5 +78,5 @@ def _length(buffer: bytearray, at: int) -> int | None:
 
 
 def _verifies(buffer: bytearray, at: int, end: int) -> bool:
-    told = int.from_bytes(buffer[at + 2 : at + 4], "little")
-    return binascii.crc_hqx(memoryview(buffer)[at + 4 : end].tobytes(), 0) == told
+    stated = int.from_bytes(buffer[at + 2 : at + 4], "little")
+    return binascii.crc_hqx(memoryview(buffer)[at + 4 : end].tobytes(), 0) == stated

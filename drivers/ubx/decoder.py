@@ -31,7 +31,7 @@ RTK = {1: 5, 2: 4}
 
 
 class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
-    """See `SolutionDecoder`. Who splits the stream himself hands over frames (`take`).
+    """See `SolutionDecoder`. Who splits the stream himself hands over frames (`decode`).
 
     Every NAV frame ends in one counter: `nav_messages`, `nav_unreadable`, `late_message` (its epoch
     was closed), `relposned`, or `ubx_not_used`, which takes all other classes too. Of baselines
@@ -45,7 +45,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
     def _make_splitter(self) -> StreamSplitter:
         return StreamSplitter(self.counters)
 
-    def take(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
+    def decode(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
         """Result of a UBX frame that `StreamSplitter` verified."""
         self._t_seen_ns = t_seen_ns
         found: list[Measurement] = []

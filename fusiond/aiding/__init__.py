@@ -1,1 +1,1 @@
-"""Aids: one module a kind of measurement, each with its innovation, Jacobian and noise."""
+"""Measurements: one module a kind of measurement, each with its innovation, Jacobian and noise."""

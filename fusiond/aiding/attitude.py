@@ -14,10 +14,10 @@ d = m - m^ what is left of it,
     z = rotation vector of C^ exp[m^ x] C_y^T = -phi - C d + v
 
 m is a block of the model where there is one, else nothing. Attitude and misalignment add in z:
-other aids must tell them apart (position and velocity over accelerations, a bearing). A star
-tracker really measures against the stars; its attitude against north-east-down, which papers 001
-and others take ("SST attitude minus INS"), needs time and position. What a position error dr does
-to it, dr / R, is 0.03 arcsec a metre and is left out.
+other measurements must tell them apart (position and velocity over accelerations, a bearing). A
+star tracker really measures against the stars; its attitude against north-east-down, which papers
+001 and others take ("SST attitude minus INS"), needs time and position. What a position error dr
+does to it, dr / R, is 0.03 arcsec a metre and is left out.
 
 A timing error of sigma s_t turns the body by w s_t, w the rate against north-east-down, which adds
 the squares of its roll, pitch and yaw to the variances. Heading alone:
@@ -36,7 +36,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import (
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     State,
@@ -44,8 +44,8 @@ from fusiond.aiding.base import (
     misaligned_axes,
 )
 from fusiond.aiding.candidates import HeadingCandidate
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.over_ground import CourseMeasurement
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,
@@ -61,7 +61,7 @@ STAR_BLOCK = "star_misalignment"
 
 
 @immutable()
-class AttitudeAid(Aid):
+class AttitudeMeasurement(AidingMeasurement):
     """Roll, pitch, yaw (rad, NED to body) with `sd`; NaN is not measured.
 
     `block` names the model's block of the sensor's misalignment; a model without it has none.
@@ -72,7 +72,7 @@ class AttitudeAid(Aid):
     sd_time_s: float = 0.0
     block: str = ""
 
-    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
+    def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
         if not way.known or self.block or math.isnan(self.rpy[2]):
             return None
         own = self.source, self.t_ns, self.gate, self.rpy[2], self.sd[2], way.slips_m_s
@@ -110,7 +110,7 @@ class AttitudeAid(Aid):
 
 
 @immutable()
-class HeadingAid(Aid):
+class HeadingMeasurement(AidingMeasurement):
     """True heading (rad) of the body's forward axis with `sd_rad`."""
 
     period: ClassVar[float] = 2.0 * math.pi
@@ -118,7 +118,7 @@ class HeadingAid(Aid):
     yaw_rad: float
     sd_rad: float
 
-    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
+    def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
         own = self.source, self.t_ns, self.gate, self.yaw_rad, self.sd_rad, way.slips_m_s
         return CourseMeasurement(*own, robust=self.robust) if way.known else None
 

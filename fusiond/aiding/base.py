@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.candidates import Candidate
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -30,13 +30,14 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
-"""Choice of when the error estimate is fed back into the navigation state: right after the aid; not
-before an aid says so; or now, all that was held."""
+"""Choice of when the error estimate is fed back into the navigation state: right after the
+measurement; not before a measurement says so; or now, all that was held."""
 NOTHING_LEFT = np.zeros(10)
 POSITION, VELOCITY, NO_SLIP, SPEED = range(1, 5)
 """Kinds of packed rows, of which positions and velocities always apply."""
 LENT_ROWS = 3
-"""Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
+"""Measurements of so many rows at most write their innovations to what a filter lends them: nearly
+all."""
 
 
 @compiled("f8(f8[::1])")
@@ -54,15 +55,15 @@ class Innovation(NamedTuple):
 
     @staticmethod
     def unwritten(rows: int, size: int) -> Innovation:
-        """Of so many rows and states, for an aid to write it."""
+        """Of so many rows and states, for a measurement to write it."""
         return Innovation(np.empty(rows), np.empty((rows, size)), np.empty(rows))
 
 
 class State(NamedTuple):
     """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
     (35,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
-    point, the truth). `lent` is what a filter lends aids to write their innovations to, by the
-    number of rows: it holds until the next innovation is asked for."""
+    point, the truth). `lent` is what a filter lends measurements to write their innovations to, by
+    the number of rows: it holds until the next innovation is asked for."""
 
     nav: Array
     xi: Array
@@ -105,7 +106,7 @@ class Renewal(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Kind of an aid's row, number of rows of its innovation, body of its row
+    """Kind of a measurement's row, number of rows of its innovation, body of its row
     (fusiond.aiding.packed)."""
 
     kind: int
@@ -114,17 +115,18 @@ class Packed(NamedTuple):
 
 
 class NotApplicable(NamedTuple):
-    """The aid does not hold in this state; `outcome` names why."""
+    """The measurement does not hold in this state; `outcome` names why."""
 
     outcome: str
 
 
 @immutable()
-class Aid:
+class AidingMeasurement:
     """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
-    `gate` is the probability with which a consistent innovation passes. What an aid is, it says
-    itself: timeline, navigator, verdicts and alignment ask it and know no kind of aid by name.
+    `gate` is the probability with which a consistent innovation passes. What a measurement is, it
+    says itself: timeline, navigator, verdicts and alignment ask it and know no kind of measurement
+    by name.
     """
 
     screened: ClassVar[bool] = False
@@ -149,7 +151,7 @@ class Aid:
     """Its `feedback` is not always at once."""
     placed: ClassVar[bool] = False
     """Its corrections depend on the place: it is folded in as it is `at` the filter's."""
-    late: ClassVar[bool] = False
+    delayed: ClassVar[bool] = False
     """It comes seldom and long after its instant, as what must be asked for does."""
 
     source: str
@@ -166,7 +168,7 @@ class Aid:
 
     @property
     def rests_s(self) -> float:
-        """For how long (s) a vehicle of which it holds is taken to rest."""
+        """Duration (s) of rest that this measurement proves."""
         return 0.0
 
     @property
@@ -200,16 +202,17 @@ class Aid:
         it is made here alone."""
         return None
 
-    def at(self, nav: Array) -> Aid:
-        """The aid as it is for a vehicle in the navigation state (10,), which is the filter's at
-        the aid's instant: itself, unless its corrections depend on the place."""
+    def at(self, nav: Array) -> AidingMeasurement:
+        """The measurement as it is for a vehicle in the navigation state (10,), which is the
+        filter's at the measurement's instant: itself, unless its corrections depend on the
+        place."""
         return self
 
-    def unturned(self, way: WayFaced) -> Aid | None:
-        """The aid for a vehicle whose attitude nobody knows, the state being that of one that faces
-        north and is level: of a lever arm only its upward part is known, and the rest is noise; of
-        the `way` that it faces, what headings say. None where the measurement says nothing without
-        an attitude."""
+    def without_attitude(self, way: HeadingHistory) -> AidingMeasurement | None:
+        """The measurement for a vehicle whose attitude nobody knows, the state being that of one
+        that faces north and is level: of a lever arm only its upward part is known, and the rest is
+        noise; of the `way` that it faces, what headings say. None where the measurement says
+        nothing without an attitude."""
         return None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -225,8 +228,8 @@ class Aid:
         return ()
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
-        """Of a screened aid, the series of innovations that a verdict judges: of each by name this
-        epoch's row (m,). Other aids are one series, under their source's name.
+        """Of a screened measurement, the series of innovations that a verdict judges: of each by
+        name this epoch's row (m,). Other measurements are one series, under their source's name.
 
         `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows were used.
         """

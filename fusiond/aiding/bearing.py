@@ -35,7 +35,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import (
-    Aid,
+    AidingMeasurement,
     Array,
     Innovation,
     NotApplicable,
@@ -56,12 +56,12 @@ STEEPEST_ELEVATION_RAD = math.radians(80.0)
 
 def line_of_sight(place: Vector3, point: Vector3) -> Array:
     """From a place to a point, both lat, lon (rad), height (m): (3,) m, NED at the place."""
-    apart = np.subtract(to_ecef(*point), to_ecef(*place))
-    return np.asarray(ned_axes(place[0], place[1]).T @ apart, dtype=np.float64)
+    separation = np.subtract(to_ecef(*point), to_ecef(*place))
+    return np.asarray(ned_axes(place[0], place[1]).T @ separation, dtype=np.float64)
 
 
 @immutable()
-class BearingAid(Aid):
+class BearingMeasurement(AidingMeasurement):
     """Azimuth and elevation (rad) with `sd` of `point` (lat, lon in rad, height in m).
 
     `block` names the model's block of the sensor's misalignment; a model without it has none.

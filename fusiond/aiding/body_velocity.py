@@ -40,7 +40,7 @@ from drivers.immutable import immutable
 from fusiond.aiding.base import (
     NO_SLIP,
     SPEED,
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     Packed,
@@ -48,9 +48,9 @@ from fusiond.aiding.base import (
     Vector3,
 )
 from fusiond.aiding.candidates import STEADY, SpeedCandidate
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeed
 from fusiond.aiding.preintegration import add_of_force, turning
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -157,11 +157,11 @@ def _rows(
             kind = column_of[j] - RATE_ERROR
             if 0 <= kind < 3:
                 h[i, j] = t0 * arm[kind] + t1 * arm[3 + kind] + t2 * arm[6 + kind]
-        late = _estimate(xi, slot[LATENCY]) if axis == FORWARD else 0.0
+        delay_s = _estimate(xi, slot[LATENCY]) if axis == FORWARD else 0.0
         if slot[PITCH] >= 0:
             # Row of [u x], of the velocity that long before, and columns of the left Jacobian of
             # exp[m x] to second order.
-            u0, u1, u2 = u[0] - late * a0, u[1] - late * a1, u[2] - late * a2
+            u0, u1, u2 = u[0] - delay_s * a0, u[1] - delay_s * a1, u[2] - delay_s * a2
             x = 0.0 if axis == 0 else (u2 if axis == 1 else -u1)
             y = -u2 if axis == 0 else (0.0 if axis == 1 else u0)
             w = u1 if axis == 0 else (-u0 if axis == 1 else 0.0)
@@ -174,10 +174,10 @@ def _rows(
             z[i] -= xi[slot[DRIFT]]
             h[i, slot[DRIFT]] = 1.0
         if axis == FORWARD:
-            z[i] -= late * a0
-            h[i, 0] += late * b * g
-            h[i, 1] -= late * a * g
-            add_of_force(step, column_of, c, -late * t0, -late * t1, -late * t2, h[i])
+            z[i] -= delay_s * a0
+            h[i, 0] += delay_s * b * g
+            h[i, 1] -= delay_s * a * g
+            add_of_force(step, column_of, c, -delay_s * t0, -delay_s * t1, -delay_s * t2, h[i])
             if slot[LATENCY] >= 0:
                 h[i, slot[LATENCY]] = a0
             gain = 1.0 + _estimate(xi, slot[SCALE])
@@ -287,7 +287,7 @@ def no_slip_rows(
 
 
 @immutable()
-class NonHolonomicAid(Aid):
+class NonHolonomicConstraint(AidingMeasurement):
     """No sideways (sigma `sd_m_s`) or vertical velocity (`sd_down_m_s`) at `lever`, above
     `min_speed_m_s`."""
 
@@ -317,7 +317,7 @@ class NonHolonomicAid(Aid):
 
 
 @immutable()
-class WheelSpeedAid(Aid):
+class WheelSpeedMeasurement(AidingMeasurement):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
     `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says
     of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not. `drifts`: sigma (m/s)
@@ -342,7 +342,7 @@ class WheelSpeedAid(Aid):
     shared_step_m_s: float = 0.0
     drifts: tuple[float, float] = STEADY
 
-    def unturned(self, way: WayFaced) -> GroundSpeed:
+    def without_attitude(self, way: HeadingHistory) -> GroundSpeed:
         return GroundSpeed(
             *(self.source, self.t_ns, self.gate, self.speed_m_s, self.sd_m_s, self.signed),
             *(self.drift, self.scale, self.latency, self.rounding, self.shared_step_m_s, way),

@@ -2,8 +2,9 @@
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
-of errors that all measurements of the device share, as of its aids; `bias_share` is what part of a
-state of `bias` there is in each axis, `wander_m` how many metres of `wander` north and east.
+of errors that all measurements of the device share; `bias_share` is what
+part of a state of `bias` there is in each axis, `markov_m` how many metres of `markov` north and
+east.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class PositionCandidate(NamedTuple):
     time: str = ""
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
-    wander: str = ""
-    wander_m: float = 0.0
+    markov: str = ""
+    markov_m: float = 0.0
 
 
 class VelocityCandidate(NamedTuple):

@@ -21,11 +21,11 @@ import math
 import numpy as np
 
 from drivers.immutable import immutable
-from fusiond.aiding.attitude import HeadingAid
+from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.candidates import HeadingCandidate
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.over_ground import CourseMeasurement
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
 
@@ -45,7 +45,7 @@ def disturbance(name: str, sd_rad: float, lasts_s: float) -> Block:
 
 
 @immutable()
-class CompassAid(HeadingAid):
+class CompassMeasurement(HeadingMeasurement):
     """A compass's heading with the declination added (rad), `sd_rad` of its white noise;
     `deviation` and `disturbance` name the model's blocks of the rest, of which one sigma in all is
     `lasting_sd_rad`."""
@@ -54,13 +54,13 @@ class CompassAid(HeadingAid):
     disturbance: str
     lasting_sd_rad: float
 
-    def unturned(self, way: WayFaced) -> CourseMeasurement | None:
+    def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
         own = self.source, self.t_ns, self.gate, self.yaw_rad, self.sd_rad, way.slips_m_s
         blocks, by = (self.deviation, self.disturbance), lasting(self.yaw_rad)
         return CourseMeasurement(*own, blocks, by, robust=self.robust) if way.known else None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        found = HeadingAid.innovation(self, state)  # super() knows no dataclass with slots
+        found = HeadingMeasurement.innovation(self, state)  # super() knows no dataclass with slots
         if isinstance(found, NotApplicable):
             return found
         yaw = rpy_from_dcm(state.dcm)[2]

@@ -309,7 +309,7 @@ class FixErrors:
         self._known: deque[tuple[int, Shares]] = deque([(_BEFORE_ALL_NS, self._now())])
 
     def take(self, fix: Fix) -> None:
-        """A fix of the receiver, with its velocity."""
+        """Take a fix of the receiver, with its velocity."""
         insort(self._waiting, fix)
 
     def shares(self, t_ns: int) -> Shares:

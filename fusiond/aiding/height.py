@@ -20,15 +20,15 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import HeightCandidate
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN
 
 
 @immutable()
-class HeightAid(Aid):
+class HeightMeasurement(AidingMeasurement):
     """Ellipsoidal height (m) with `sd_m`. What successive ones share is not estimated: it is of the
     same origin as the error of the blocks `of`, those of the position that came with it."""
 
@@ -40,7 +40,7 @@ class HeightAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return self.of
 
-    def unturned(self, way: WayFaced) -> HeightAid:
+    def without_attitude(self, way: HeadingHistory) -> HeightMeasurement:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -57,7 +57,7 @@ class HeightAid(Aid):
 
 
 @immutable()
-class BarometerAid(Aid):
+class BarometerMeasurement(AidingMeasurement):
     """Height of the standard atmosphere (m) with `sd_m`; `offset`, `scale` and `airflow` name the
     blocks of its errors, which the model has. It is no height to start with: the weather may be
     anything."""
@@ -68,7 +68,7 @@ class BarometerAid(Aid):
     scale: str
     airflow: str
 
-    def unturned(self, way: WayFaced) -> BarometerAid:
+    def without_attitude(self, way: HeadingHistory) -> BarometerMeasurement:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

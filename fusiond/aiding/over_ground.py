@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.navigation.strapdown import VD, VE, VN
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def _variance(p: Array | None, axis: Array) -> float:
 
 
 @immutable()
-class CourseMeasurement(Aid):
+class CourseMeasurement(AidingMeasurement):
     """No velocity across a heading `yaw_rad` with `sd_rad`, but for a slip of sigma `slips_m_s`.
 
     `blocks` name the model's blocks of what the heading is off by, in the order of `shares` (k,):
@@ -80,9 +80,9 @@ class CourseMeasurement(Aid):
 
 
 @immutable()
-class GroundSpeed(Aid):
-    """A wheel's speed (m/s) with `sd_m_s`; all else as `WheelSpeedAid` has it, and the `way` that
-    the vehicle faces."""
+class GroundSpeed(AidingMeasurement):
+    """A wheel's speed (m/s) with `sd_m_s`; all else as `WheelSpeedMeasurement` has it, and the
+    `way` that the vehicle faces."""
 
     rolls: ClassVar[bool] = True
     shown: ClassVar[attrgetter[Any] | None] = attrgetter("speed_m_s")
@@ -95,7 +95,7 @@ class GroundSpeed(Aid):
     latency: str
     rounding: str
     shared_step_m_s: float
-    way: WayFaced
+    way: HeadingHistory
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model, y = state.model, self.speed_m_s

@@ -1,12 +1,12 @@
-"""Aids as rows of numbers, of which one compiled kernel makes innovations.
+"""Measurements as rows of numbers, of which one compiled kernel makes innovations.
 
 A timeline that runs again has hundreds of them, and a call of Python for each would cost more than
 all that a filter does with it. Position, velocity, no slip and a wheel's speed have such a row;
 others make their innovations themselves.
 
-A row is `HEADER`, which the timeline fills, and a body of the aid's own: what its kernel takes, in
-that order, each list of slots with its length before it. Integers are those of 64 bits in the same
-places.
+A row is `HEADER`, which the timeline fills, and a body of the measurement's own: what its kernel
+takes, in that order, each list of slots with its length before it. Integers are those of 64 bits in
+the same places.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
 from fusiond.aiding.base import (
     POSITION,
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     Packed,
@@ -58,8 +58,8 @@ from fusiond.aiding.base import (
     level_arm_m,
 )
 from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.preintegration import add_of_force
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
@@ -82,10 +82,10 @@ _UNKNOWN = np.zeros((0, 0))
 _BODY = Struct("<14d14q")
 
 
-def wander_of(axis: int, wander_m: float, sd: Vector3) -> float:
+def markov_sd_of(axis: int, markov_m: float, sd: Vector3) -> float:
     """Metres of an error that lasts for seconds along an axis: down as many more as the fix's own
     sigmas (m) say that its errors are larger there."""
-    return wander_m if axis < 2 else 2.0 * wander_m * sd[2] / (sd[0] + sd[1])
+    return markov_m if axis < 2 else 2.0 * markov_m * sd[2] / (sd[0] + sd[1])
 
 
 @compiled("void(UniTuple(f8, 9), i8[::1], f8[:, :], f8[::1])", forceinline=True, allocates=True)
@@ -118,7 +118,7 @@ def position_rows(
     bias: Indices,
     time: Indices,
     rest: Indices,
-    wander: Indices,
+    markov: Indices,
     lat: float,
     lon: float,
     height: float,
@@ -132,15 +132,17 @@ def position_rows(
     s0: float,
     s1: float,
     s2: float,
-    wander_m: float,
+    markov_m: float,
     p: Array,
     z: Array,
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,), H (m, n) and r (m,) for the first m of north, east, down, with what offset in
-    time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias` (up to 3,),
-    `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 3,): slots in `xi`."""
+    """Write the rows of a position: z (m,), H (m, n) and r (m,).
+
+    Of north, east, down the first m. P (n, n) says what the offset in time and the lever arm leave
+    out; (0, 0) where none is known. Slots in `xi`: `bias` (up to 3,), `time` (0 or 1,), `rest`
+    (0 or 3,), `markov` (0 or 3,)."""
     m, n = h.shape
     h[:] = 0.0
     share = (s0, s1, s2)
@@ -170,31 +172,31 @@ def position_rows(
         if i < bias.size:
             z[i] += share[i] * xi[bias[i]]
             h[i, bias[i]] = -share[i]
-        if i < wander.size:
+        if i < markov.size:
             # Down it is as much larger as the fix says that its errors are.
-            w = wander_m if i < 2 else 2.0 * wander_m * sd2 / (sd0 + sd1)
-            z[i] += w * xi[wander[i]]
-            h[i, wander[i]] = -w
-        elif wander_m > 0.0:  # the model has no state for it
-            w = wander_m if i < 2 else 2.0 * wander_m * sd2 / (sd0 + sd1)
+            w = markov_m if i < 2 else 2.0 * markov_m * sd2 / (sd0 + sd1)
+            z[i] += w * xi[markov[i]]
+            h[i, markov[i]] = -w
+        elif markov_m > 0.0:  # the model has no state for it
+            w = markov_m if i < 2 else 2.0 * markov_m * sd2 / (sd0 + sd1)
             r[i] += w * w
     for slot in time:
-        late_s = xi[slot]
+        delay_s = xi[slot]
         v, of_v, columns = np.empty(m), np.zeros((m, n)), np.empty(n, dtype=np.int64)
         antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, STEP_SMOOTH_RATE_B, v, of_v)
         f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
         a = (f0, f1, f2 + gravity(nav[LAT], nav[HEIGHT]))
         turned = ((0.0, -f2, f1), (f2, 0.0, -f0), (-f1, f0, 0.0))
         for i in range(m):
-            z[i] += (v[i] + 0.5 * a[i] * late_s) * late_s
+            z[i] += (v[i] + 0.5 * a[i] * delay_s) * delay_s
             for j in range(n):
-                h[i, j] += late_s * of_v[i, j]
+                h[i, j] += delay_s * of_v[i, j]
             for j in range(3):
-                h[i, j] += 0.5 * late_s * late_s * turned[i][j]
-            half = 0.5 * late_s * late_s
+                h[i, j] += 0.5 * delay_s * delay_s * turned[i][j]
+            half = 0.5 * delay_s * delay_s
             x0, x1, x2 = half * c[3 * i], half * c[3 * i + 1], half * c[3 * i + 2]
             add_of_force(step, column_of, c, x0, x1, x2, h[i])
-            h[i, slot] = -(v[i] + a[i] * late_s)
+            h[i, slot] = -(v[i] + a[i] * delay_s)
             if p.size:
                 variance, across, count = 0.0, 0.0, 0
                 for j in range(n):
@@ -216,13 +218,13 @@ def position_rows(
 
 
 @immutable()
-class PositionAid(Aid):
+class PositionMeasurement(AidingMeasurement):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
     `bias`: the blocks whose states north, east, down are the error that the fixes share, and
     `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
-    that of what is left of the lever arm; `wander` that of the error that lasts for seconds, of
-    `wander_m`.
+    that of what is left of the lever arm; `markov` that of the error that lasts for seconds, of
+    `markov_m`.
     """
 
     locates: ClassVar[bool] = True
@@ -238,14 +240,14 @@ class PositionAid(Aid):
     time: str = ""
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
-    wander: str = ""
-    wander_m: float = 0.0
+    markov: str = ""
+    markov_m: float = 0.0
 
     @property
     def shares(self) -> tuple[str, ...]:
         return self.bias
 
-    def unturned(self, way: WayFaced) -> PositionAid:
+    def without_attitude(self, way: HeadingHistory) -> PositionMeasurement:
         (north, east, down), arm = self.sd, level_arm_m(self.lever)
         sd = math.hypot(north, arm), math.hypot(east, arm), down
         return replace(self, sd=sd, lever=(0.0, 0.0, self.lever[2]), rest="")
@@ -255,23 +257,23 @@ class PositionAid(Aid):
         height, at = self.height_m, model.indices
         m = 2 if height is None or model.hold_height else 3
         rows = lent.get(m) or Innovation.unwritten(m, model.size)
-        slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.wander]
+        slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.markov]
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
-        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
+        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.markov_m
         position_rows(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
         return rows
 
     def packed(self, model: Model) -> Packed | None:
-        height, names = self.height_m, (self.bias, self.time, self.rest, self.wander)
+        height, names = self.height_m, (self.bias, self.time, self.rest, self.markov)
         slots = model.listed.get(names) or model.list_slots(names, (3, 1, 3, 3))
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
         body = _BODY.pack(
-            *(*fix, *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m),
+            *(*fix, *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.markov_m),
             *slots,
         )
         return Packed(POSITION, 2 if height is None or model.hold_height else 3, body)
 
     def candidates(self) -> tuple[PositionCandidate, ...]:
         measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever
-        shared = self.bias, self.time, self.rest, self.bias_share, self.wander, self.wander_m
+        shared = self.bias, self.time, self.rest, self.bias_share, self.markov, self.markov_m
         return (PositionCandidate(*measured, *shared),)

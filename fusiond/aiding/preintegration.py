@@ -4,8 +4,8 @@ r"""Preintegrated IMU data of a measurement: an acceleration, with the force's o
     a = C f + g,   d a = [f x] phi + C e,   e = db + ds f       (computed minus true, body axes)
 
 An offset in time multiplies a. Tilt and force bias are known by their sum long before they are each
-(fusiond.estimators.tilt_axes): an aid that has the first term alone would tell them apart, a little
-with each measurement, whatever the truth.
+(fusiond.estimators.tilt_axes): a measurement that has the first term alone would tell them apart, a
+little with each measurement, whatever the truth.
 
 A rate multiplies what is not known of a lever arm. In the slope by that its noise n passes for a
 turn: each velocity of variance r brings the information E[n^2] / r, whatever the vehicle does, and

@@ -71,7 +71,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import (
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     Renewal,
@@ -79,6 +79,7 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.range_rows import (
     BASIC,
     LEFT,
@@ -98,7 +99,6 @@ from fusiond.aiding.range_rows import (
     range_rows,
 )
 from fusiond.aiding.velocity import CORNER_RAD_S
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 
 Array = NDArray[np.float64]
@@ -115,9 +115,9 @@ NO_CLOCK = -1
 
 
 def epoch_values(position: ArrayLike, velocity: ArrayLike, *rows: ArrayLike) -> Array:
-    """The values of an epoch of n satellites as the aid takes them (17, n): positions, velocities
-    (n, 3), and as `rows` (n,) ranges, rates, and their variances; no shared errors, no carriers.
-    ValueError for other shapes."""
+    """The values of an epoch of n satellites as the measurement takes them (17, n): positions,
+    velocities (n, 3), and as `rows` (n,) ranges, rates, and their variances; no shared errors, no
+    carriers. ValueError for other shapes."""
     parts = [np.asarray(part, float).T for part in (position, velocity, *rows)]
     if any(part.shape[-1:] != parts[-1].shape for part in parts):
         raise ValueError(f"shapes differ: {[part.T.shape for part in parts]}")
@@ -131,7 +131,7 @@ def nothing_left() -> Array:
 
 
 @immutable(eq=False)
-class PseudorangeAid(Aid):
+class PseudorangeMeasurement(AidingMeasurement):
     """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
 
     `values` (17, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
@@ -243,10 +243,10 @@ class PseudorangeAid(Aid):
             if span or math.isfinite(value)
         ]
 
-    def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> PseudorangeAid:
+    def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> PseudorangeMeasurement:
         """The epoch with the satellites marked in `keep` (n,) alone."""
         mask = np.asarray(keep, dtype=bool)
-        return PseudorangeAid(
+        return PseudorangeMeasurement(
             self.source,
             self.t_ns,
             self.gate,
@@ -261,7 +261,7 @@ class PseudorangeAid(Aid):
             self.kept,
         )
 
-    def unturned(self, way: WayFaced) -> PseudorangeAid:
+    def without_attitude(self, way: HeadingHistory) -> PseudorangeMeasurement:
         """Rates are the Dopplers': what a carrier says is the mean since the epoch before, and
         nothing tells how the velocity has changed meanwhile."""
         values, arm = self.values.copy(), level_arm_m(self.lever)

@@ -256,8 +256,9 @@ WRONG = {
 
 @compiled("UniTuple(i8, 4)(f8[:, ::1], i8[::1], f8[::1])")
 def measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, int]:
-    """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
-    ranges and rates those are, how many clocks they have, and what is wrong with them."""
+    """Write the variances r (2 n,) of the finite ranges, then of the finite rates.
+
+    Returns the numbers of ranges and rates, the number of clocks, and what is wrong with them."""
     n = clock.shape[0]
     row = finite = timed = clocks = 0
     wrong = SOUND
@@ -291,9 +292,11 @@ def by_clock(
     sums: Array,
     first: Indices,
 ) -> int:
-    """Write to `sums` (k, 2), for each clock that has both, the sum of what is `whitened` and
-    `kept` (m,) of its ranges and that of its rates, each over the root of its number; to `first`
-    (k,) the clocks' first satellites, by which they are ordered. How many clocks that are."""
+    """Sum the innovations of each receiver clock; the number of clocks.
+
+    `sums` (k, 2) takes, for each clock that has both, the sums of its ranges and of its rates that
+    are `kept` (m,) of `whitened` (m,), each over the root of its number; `first` (k,) the clocks'
+    first satellites, by which they are ordered."""
     found = 0
     for i in range(clock.shape[0]):
         new = clock[i] >= 0

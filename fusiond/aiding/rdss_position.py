@@ -13,7 +13,7 @@ How a fix that is late is used is its strategy:
 `rewind`                 at its own instant; everything after it runs again.
 `optimal_prediction`     at its own instant, but not fed back there: the error estimate x(k|k) and P
                          are predicted to the instant of arrival, and x(k+1|k) is fed back
-                         (paper 000, section 1.1). `FeedBackAid` marks that instant.
+                         (paper 000, section 1.1). `HeldFeedback` marks that instant.
 `position_compensation`  at its arrival, moved forward by the computed velocity times the delay;
                          what that leaves is the coloured noise b (paper 000, reference 2).
 `none`                   at its arrival, as if it were true then.
@@ -32,7 +32,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import (
-    Aid,
+    AidingMeasurement,
     Feedback,
     Innovation,
     NotApplicable,
@@ -41,7 +41,7 @@ from fusiond.aiding.base import (
     level_arm_m,
 )
 from fusiond.aiding.candidates import PositionCandidate
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
@@ -50,16 +50,16 @@ BIAS_BLOCK = "rdss_bias"
 
 
 @immutable()
-class RdssPositionAid(Aid):
+class RdssPositionMeasurement(AidingMeasurement):
     """Fix (rad, rad) with `covariance` (nn, ne, ee) in m^2.
 
     `moved_s`: the computed velocity times this is added to the fix (position compensation).
-    `holds`: the estimate is not fed back until a `FeedBackAid` comes (optimal prediction).
+    `holds`: the estimate is not fed back until a `HeldFeedback` comes (optimal prediction).
     """
 
     locates: ClassVar[bool] = True
     shown: ClassVar[attrgetter[Any] | None] = attrgetter("lat_rad", "lon_rad")
-    late: ClassVar[bool] = True
+    delayed: ClassVar[bool] = True
     waits: ClassVar[bool] = True
 
     lat_rad: float
@@ -78,7 +78,7 @@ class RdssPositionAid(Aid):
     def feedback(self) -> Feedback:
         return "hold" if self.holds else "at_once"
 
-    def unturned(self, way: WayFaced) -> RdssPositionAid:
+    def without_attitude(self, way: HeadingHistory) -> RdssPositionMeasurement:
         (nn, ne, ee), arm = self.covariance, level_arm_m(self.lever)
         wider = nn + arm * arm, ne, ee + arm * arm
         return replace(self, covariance=wider, lever=(0.0, 0.0, self.lever[2]))
@@ -111,14 +111,14 @@ class RdssPositionAid(Aid):
         return Innovation(z, h, np.ones(2))
 
     def candidates(self) -> tuple[PositionCandidate, ...]:
-        """The fix without its height, which is an aid of its own where it is believed."""
+        """The fix without its height, which is a measurement of its own where it is believed."""
         sd_n, sd_e = math.sqrt(self.covariance[0]), math.sqrt(self.covariance[2])
         place = self.lat_rad, self.lon_rad, None
         return (PositionCandidate(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
 
 
 @immutable()
-class FeedBackAid(Aid):
+class HeldFeedback(AidingMeasurement):
     """The instant at which an estimate that was held is fed back."""
 
     waits: ClassVar[bool] = True
@@ -127,7 +127,7 @@ class FeedBackAid(Aid):
     def feedback(self) -> Feedback:
         return "release"
 
-    def unturned(self, way: WayFaced) -> FeedBackAid:
+    def without_attitude(self, way: HeadingHistory) -> HeldFeedback:
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

@@ -9,9 +9,9 @@ T, averages by what fits into the span of x T: it is sure with
 
     s = max(sqrt(sd^2 / n + a sd_d^2), s_0),   a = max(2 (x - 1 + exp(-x)) / x^2, 1 / n)
 
-Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids;
-Gelb, Applied Optimal Estimation, chapter 3, for the process; a is its mean's variance by double
-integration of exp(-|t - s| / T).
+Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity
+measurements; Gelb, Applied Optimal Estimation, chapter 3, for the process; a is its mean's variance
+by double integration of exp(-|t - s| / T).
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import STEADY, SpeedCandidate, VelocityCandidate
 
 # What remains of an averaged velocity (m/s): multipath moves a receiver's Doppler by a centimetre
 # or two a second, for seconds alike.
 LEAST_SD_M_S = 0.02
-# A test of rest refuses a vehicle at rest once in a thousand windows: it loses one aid of many.
-# Quantiles of chi-square of one and two degrees of freedom.
+# A test of rest refuses a vehicle at rest once in a thousand windows: it loses one measurement of
+# many. Quantiles of chi-square of one and two degrees of freedom.
 CONTRADICTION = (10.83, 13.82)
 # Kept longer than any history: a rewind asks again.
 KEEP_NS = 700_000_000_000
@@ -39,7 +39,7 @@ MOST_WAITING = 4096
 MOST_SUMS = 8
 # Spans of which it is kept what they say, two a window: those of two minutes. A rewind asks for
 # those within the history again.
-MOST_TOLD = 256
+MOST_SPANS = 256
 # A ride is smooth if this many windows of this time were quiet at a speed that is no rest: chance
 # makes one or two where driving shakes the vehicle.
 SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
@@ -102,25 +102,25 @@ class RestEvidence:
     """Speeds that were measured, and the quiet windows that were none of rest."""
 
     def __init__(self) -> None:
-        self.waiting: deque[Aid] = deque(maxlen=MOST_WAITING)
+        self.waiting: deque[AidingMeasurement] = deque(maxlen=MOST_WAITING)
         """Measurements that have come and are taken in when somebody asks."""
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
-        self._told: dict[tuple[int, int], Measured] = {}
+        self._by_span: dict[tuple[int, int], Measured] = {}
         """Results of `measured` by span, asked for at every tick and again by each rewind: of those
         that no speed has come into since."""
-        self._told_ns = 0
+        self._by_span_until_ns = 0
         """The latest end of them."""
         self._sums: dict[tuple[str, int], _Sum] = {}
         """By source and begin of a span: a standstill is asked about at each speed of minutes."""
 
-    def hear(self, aids: Sequence[Aid]) -> None:
+    def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
         alone is an effort, and it has the rates of all satellites."""
-        for aid in aids:
-            if aid.screened or aid.locates:
+        for measurement in measurements:
+            if measurement.screened or measurement.locates:
                 continue
-            for candidate in aid.candidates():
+            for candidate in measurement.candidates():
                 match candidate:
                     case VelocityCandidate():
                         speed = _Speed(
@@ -131,10 +131,10 @@ class RestEvidence:
                         speed = _Speed(candidate.t_ns, (candidate.speed_m_s,), *own)
                     case _:
                         continue
-                if speed.t_ns <= self._told_ns:
-                    self._told.clear()
-                    self._told_ns = 0
-                speeds = self._speeds[aid.source]
+                if speed.t_ns <= self._by_span_until_ns:
+                    self._by_span.clear()
+                    self._by_span_until_ns = 0
+                speeds = self._speeds[measurement.source]
                 if speeds and speed < speeds[-1]:
                     self._sums.clear()
                     insort(speeds, speed)
@@ -142,7 +142,7 @@ class RestEvidence:
                     speeds.append(speed)
                 if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
                     self._sums.clear()
-                    self._told.clear()
+                    self._by_span.clear()
                     del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def catch_up(self) -> None:
@@ -150,18 +150,18 @@ class RestEvidence:
         if self.waiting:
             waiting = tuple(self.waiting)
             self.waiting.clear()
-            self.hear(waiting)
+            self.receive(waiting)
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
         """Speeds measured from `begin_ns` to `end_ns`, both included."""
         self.catch_up()
         span = begin_ns, end_ns
-        found = self._told.get(span)
+        found = self._by_span.get(span)
         if found is None:
-            if len(self._told) >= MOST_TOLD:
-                self._told.clear()
-            found = self._told[span] = self._measured(begin_ns, end_ns)
-            self._told_ns = max(self._told_ns, end_ns)
+            if len(self._by_span) >= MOST_SPANS:
+                self._by_span.clear()
+            found = self._by_span[span] = self._measured(begin_ns, end_ns)
+            self._by_span_until_ns = max(self._by_span_until_ns, end_ns)
         return found
 
     def _measured(self, begin_ns: int, end_ns: int) -> Measured:
@@ -192,8 +192,10 @@ class RestEvidence:
         return found
 
     def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
-        """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to
-        `end_ns`, both included, and the sigma of one of its measurements."""
+        """Mean velocity north, east (m/s) of one source, and the sigma of one of its measurements.
+
+        From `begin_ns` to `end_ns`, both included; the source is the one with the most
+        measurements."""
         self.catch_up()
         found: list[_Speed] = []
         for speeds in self._speeds.values():

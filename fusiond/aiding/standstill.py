@@ -21,7 +21,7 @@ from asking the gyros. v_max is the largest speed of a vehicle that creeps, s_v 
 zero velocity, s_r of the rate of a vehicle at rest, all configured; s_n the gyro's noise in a
 window, k the number of windows in a row (one, and up to ten). The bias's P is at the start that of
 the data sheet: a turn within it cannot be told from a bias. The last test asks for evidence as good
-as what the aid will claim, once quiet windows at speed have shown that quiet is none.
+as what the measurement will claim, once quiet windows at speed have shown that quiet is none.
 
 What has stood the tests may creep still, at a speed of sigma s_v, and around a bend: it turns about
 its down axis with the sigma s_v / R at the most, R the least radius of a car. A creep is not even:
@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import (
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     State,
@@ -131,7 +131,7 @@ class Rest:
         self.rest_evidence.quiet_at_speed(w.end_ns, state.speed - 3.0 * sd > self.max_speed_m_s)
         if state.speed > self.max_speed_m_s:
             return "moving"
-        # A tenth of the sigma that the aid claims, beside P: a filter that is surer is not.
+        # A tenth of the sigma that the measurement claims, beside P: a filter that is surer is not.
         least = (0.1 * self.velocity_sd_m_s) ** 2
         square = _normalised(v.tolist(), p_v.tolist(), least)
         measured = self._measured(w.run)
@@ -185,7 +185,7 @@ class Rest:
 
 
 @immutable()
-class ZeroVelocityAid(Aid):
+class ZeroVelocityUpdate(AidingMeasurement):
     """Zero velocity with `sd_m_s`."""
 
     constraint: ClassVar[bool] = True
@@ -210,7 +210,7 @@ class ZeroVelocityAid(Aid):
 
 
 @immutable()
-class ZeroRateAid(Aid):
+class ZeroAngularRateUpdate(AidingMeasurement):
     """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may
     turn."""
 

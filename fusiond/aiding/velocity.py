@@ -35,7 +35,7 @@ from drivers.immutable import immutable
 from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import (
     VELOCITY,
-    Aid,
+    AidingMeasurement,
     Innovation,
     NotApplicable,
     Packed,
@@ -44,8 +44,8 @@ from fusiond.aiding.base import (
     level_arm_m,
 )
 from fusiond.aiding.candidates import VelocityCandidate
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.preintegration import add_of_force
-from fusiond.aiding.way_faced import WayFaced
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -104,20 +104,20 @@ def velocity_rows(
     f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
     down = f2 + gravity(nav[LAT], nav[HEIGHT])
     for slot in time:
-        late_s = xi[slot]
-        z[0], z[1] = z[0] + f0 * late_s, z[1] + f1 * late_s
+        delay_s = xi[slot]
+        z[0], z[1] = z[0] + f0 * delay_s, z[1] + f1 * delay_s
         h[0, slot], h[1, slot] = -f0, -f1
-        h[0, 1] -= late_s * f2
-        h[0, 2] += late_s * f1
-        h[1, 0] += late_s * f2
-        h[1, 2] -= late_s * f0
+        h[0, 1] -= delay_s * f2
+        h[0, 2] += delay_s * f1
+        h[1, 0] += delay_s * f2
+        h[1, 2] -= delay_s * f0
         if z.shape[0] > 2:
-            z[2] += down * late_s
+            z[2] += down * delay_s
             h[2, slot] = -down
-            h[2, 0] -= late_s * f1
-            h[2, 1] += late_s * f0
+            h[2, 0] -= delay_s * f1
+            h[2, 1] += delay_s * f0
         for i in range(z.shape[0]):
-            x, y, d = late_s * c[3 * i], late_s * c[3 * i + 1], late_s * c[3 * i + 2]
+            x, y, d = delay_s * c[3 * i], delay_s * c[3 * i + 1], delay_s * c[3 * i + 2]
             add_of_force(step, column_of, c, x, y, d, h[i])
     z[0], z[1] = z[0] - v0, z[1] - v1
     r[0], r[1] = sd0 * sd0, sd1 * sd1
@@ -135,9 +135,10 @@ def velocity_rows(
 
 
 @immutable()
-class VelocityAid(Aid):
+class VelocityMeasurement(AidingMeasurement):
     """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three. `time` and
-    `rest` as of `PositionAid`; `fix_time` is the `time` of the position with the same stamp."""
+    `rest` as of `PositionMeasurement`; `fix_time` is the `time` of the position with the same
+    stamp."""
 
     moves: ClassVar[bool] = True
     shown: ClassVar[attrgetter[Any] | None] = attrgetter("v_ned")
@@ -154,7 +155,7 @@ class VelocityAid(Aid):
     def device(self) -> str:
         return self.source.removesuffix(SUFFIX)
 
-    def unturned(self, way: WayFaced) -> VelocityAid:
+    def without_attitude(self, way: HeadingHistory) -> VelocityMeasurement:
         aside = CORNER_RAD_S * level_arm_m(self.lever)
         north, east, *down = self.sd
         sd = math.hypot(north, aside), math.hypot(east, aside), *down

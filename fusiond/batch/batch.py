@@ -1,4 +1,4 @@
-"""`fusiond batch`: a row a log, whatever becomes of it.
+"""`fusiond batch`: one row for each log, also for one that fails.
 
 A row is named by its log, the digest of the configuration and the version of fusiond: a batch with
 another configuration adds rows to the same file, and one that has its rows already does nothing.
@@ -29,7 +29,7 @@ def run_batch(
     runner: Runner,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
-    """Rows that were `there`, and of the new ones how many ended in which way.
+    """Number of rows that were there, and of new rows by how they ended.
 
     Raises `ConfigError`, `MissingPackageError`, `TableError` for an `out` that is no file of rows,
     OSError; of what happens to a log nothing.

@@ -19,11 +19,11 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.parquet_rows import Row, flat
 from fusiond.files.tables import read_solution, read_truth
-from fusiond.offline.aid_files import READERS
 from fusiond.offline.compare import NothingToCompareError, compare
+from fusiond.offline.measurement_files import READERS
 from fusiond.offline.process import process
 
-AID_FILES = {
+MEASUREMENT_FILES = {
     **{f"{kind}.csv": kind for kind in READERS if kind not in ("nmea", "raw")},
     "gnss.nmea": "nmea",
     "gnss.ubx": "raw",
@@ -38,7 +38,7 @@ _NOT_OF_THE_DRIVE = frozenset(
 
 
 def drive_row(config_path: Path, log: Path) -> Row:
-    """The figures of one log, flat: a name of parts is joined by dots.
+    """Figures of one log, flat; parts of a name are joined by dots.
 
     `not_navigated` says why there is no solution. Raises what the readers raise.
     """
@@ -61,9 +61,9 @@ def _config(path: Path) -> Config:
 
 def _recording(config_path: Path, files: list[Path]) -> Row:
     # The daemon's parts come only where there is a recording.
-    from fusiond.replay.run import Wish, replay  # noqa: PLC0415
+    from fusiond.replay.run import ReplayOptions, replay  # noqa: PLC0415
 
-    summary = replay(files, Wish(config=config_path))
+    summary = replay(files, ReplayOptions(config=config_path))
     problems = [*summary.pop("problems"), *summary.pop("driver_faults")]
     figures = {k: v for k, v in summary.items() if k not in _NOT_OF_THE_DRIVE}
     row = flat({"modes": figures.pop("modes"), **figures})
@@ -72,7 +72,9 @@ def _recording(config_path: Path, files: list[Path]) -> Row:
 
 def _tables(config: Config, folder: Path) -> Row:
     measurements = [
-        (kind, folder / name) for name, kind in AID_FILES.items() if (folder / name).exists()
+        (kind, folder / name)
+        for name, kind in MEASUREMENT_FILES.items()
+        if (folder / name).exists()
     ]
     if not (folder / TRUTH).exists():
         return _processed(process(config, folder / IMU, measurements))
@@ -91,7 +93,7 @@ def _tables(config: Config, folder: Path) -> Row:
 
 
 def _processed(result: dict[str, Any]) -> Row:
-    """Of what `process` found."""
+    """Figures of a run of `process`."""
     rows = result["solution_rows"]
     files = result["files"]
     return flat(

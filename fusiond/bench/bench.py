@@ -10,6 +10,31 @@ up to m n k = 262 144; here 9261).
 
 The IMU runs at 200 Hz, but for `process` and the step of an estimator (100 Hz); the model is
 `ins21`.
+
+`numpy_product_us`: the product. As ratios to it: `block_step_ratio`, strapdown and covariance
+over one of 4000 samples propagated in one call; `single_step_ratio`, a call from Python for
+one sample; `rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run
+again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
+`process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
+velocity in order of validity, files read and the solution written at every row;
+`raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
+`late_tick_ratio`, the tick in which a fix comes that is 10 s late
+(`fusiond.bench.delayed_fix`).
+
+Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
+
+As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
+multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
+`federated_step_ratio`, a second of a federated filter with three local filters (IMU at 100 Hz,
+one position of each of three sources, fault detection on, mode `no_reset`).
+`unscented_step_ratio` and `unscented_propagation_step_ratio`, of the unscented filter as it is
+by default and with sigma points in the propagation too.
+
+Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
+(`fusiond.studies.reduced_order.cost`).
+
+Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
+to published sigma, and the modules that they are in (`fusiond.bench.fix_path`).
 """
 
 from __future__ import annotations
@@ -28,8 +53,8 @@ from typing import Any
 import numpy as np
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.bench.delayed_fix import delayed_fix
 from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.raw_epoch import raw_epoch
@@ -71,33 +96,7 @@ LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
 
 
 def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[str, Any]:
-    """The figures, with the versions and the processor that they hold for.
-
-    `numpy_product_us`: the product. As ratios to it: `block_step_ratio`, strapdown and covariance
-    over one of 4000 samples propagated in one call; `single_step_ratio`, a call from Python for
-    one sample; `rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run
-    again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
-    `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
-    velocity in order of validity, files read and the solution written at every row;
-    `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
-    `late_tick_ratio`, the tick in which a fix comes that is 10 s late
-    (`fusiond.bench.delayed_fix`).
-
-    Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
-
-    As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
-    multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
-    `federated_step_ratio`, a second of a federated filter with three local filters (IMU at 100 Hz,
-    one position of each of three sources, fault detection on, mode `no_reset`).
-    `unscented_step_ratio` and `unscented_propagation_step_ratio`, of the unscented filter as it is
-    by default and with sigma points in the propagation too.
-
-    Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
-    (`fusiond.studies.reduced_order.cost`).
-
-    Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
-    to published sigma, and the modules that they are in (`fusiond.bench.fix_path`).
-    """
+    """The figures, with the versions and the processor that they hold for."""
     product = _product()
     figures: dict[str, Any] = {}
     products: list[float] = []
@@ -212,9 +211,9 @@ def _single(_: int) -> Callable[[], int]:
     return work
 
 
-def _fix(source: str, t_ns: int) -> PositionAid:
+def _fix(source: str, t_ns: int) -> PositionMeasurement:
     lever, lat = (0.3, 0.0, -1.0), LAT + 1e-20 * t_ns  # a receiver that hangs takes another way
-    return PositionAid(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
+    return PositionMeasurement(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
 
 
 def _rewind(number: int) -> Callable[[], int]:
@@ -225,12 +224,12 @@ def _rewind(number: int) -> Callable[[], int]:
     timeline.start()
     for t_ns in range(FIX_NS, steps * STEP_NS + 1, FIX_NS):
         timeline.insert(_fix("gnss", t_ns))
-    timeline.run()
+    timeline.advance()
     delayed = _fix("rdss", buffer.latest_ns - DELAY_NS)
 
     def work() -> int:
         timeline.insert(delayed)
-        timeline.run()
+        timeline.advance()
         assert timeline.counters.rewinds == 1
         return 1
 
@@ -244,7 +243,7 @@ def _one_source() -> list[Linearised]:
     for second in range(1, STEP_SECONDS + 1):
         t_ns = second * 1_000_000_000
         measurements.append(_fix("gnss", t_ns))
-        measurements.append(VelocityAid("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
+        measurements.append(VelocityMeasurement("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
     return measurements
 
 
@@ -262,7 +261,7 @@ def _step_ratio(
 ) -> float:
     """Processor time of an estimator's second over the centralised filter's, taken in turns.
 
-    100 IMU samples and the aids, in order of validity; median over the repetitions.
+    100 IMU samples and the measurements, in order of validity; median over the repetitions.
     """
     model, centralised, buffer = _filter(STEP_SECONDS * STEP_RATE_HZ, STEP_RATE_HZ)
     nav, xi, p = centralised.nav.copy(), centralised.xi.copy(), centralised.covariance.copy()

@@ -2,7 +2,7 @@
 
 IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at
 100 Hz. The tick in which the late fix comes takes it in, runs the last 10 s again with 2000 samples
-and 300 aids, and reads the solution. It has 10 ms for that and all else.
+and 300 measurements, and reads the solution. It has 10 ms for that and all else.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SAMPLES, TICK_SAMPLES = round(RATE_HZ / FIXES_HZ), round(RATE_HZ / 100.0)
 
 
 class Drive:
-    """A navigator that is driven on, aid by aid, and told of late fixes."""
+    """A navigator that is run from measurement to measurement, with delayed fixes inserted."""
 
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
@@ -64,7 +64,7 @@ class Drive:
         return work
 
     def go_on(self, until_s: float) -> None:
-        """Drive on to that instant, at which an epoch comes next."""
+        """Advance to that instant, at which an epoch comes next."""
         until = round(until_s * RATE_HZ)
         while self._row < until:
             self.fix()
@@ -85,7 +85,7 @@ class Drive:
         self.navigator.add_imu(self._times[rows], self._samples[rows])
 
     def take_fix(self) -> None:
-        """The fix of that epoch comes, the filter runs, the solution is read."""
+        """Insert the fix of that epoch, run the filter, read the solution."""
         self.fix()
         self._row += TICK_SAMPLES
         self.navigator.advance()

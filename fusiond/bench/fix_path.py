@@ -20,14 +20,14 @@ OURS, NOT_OURS = "fusiond.", ("fusiond.bench.", "fusiond.simulation.")
 """The receiver is simulated."""
 
 
-class Way(NamedTuple):
+class FixPath(NamedTuple):
     """Calls of each function, by module and qualified name."""
 
     calls: dict[tuple[str, str], int]
 
     @property
     def functions(self) -> int:
-        """Number of different ones."""
+        """Number of different functions."""
         return len(self.calls)
 
     @property
@@ -36,15 +36,15 @@ class Way(NamedTuple):
         return len({module for module, _ in self.calls})
 
 
-def ordinary_fix() -> Way:
-    """Of `FIXES` fixes of a drive that navigates the one with the median of functions."""
+def ordinary_fix() -> FixPath:
+    """Fix with the median number of functions, of `FIXES` fixes under way."""
     drive = Drive(1)
     drive.go_on(AT_S)
     found = [_way(drive) for _ in range(FIXES)]
     return sorted(found, key=lambda way: way.functions)[FIXES // 2]
 
 
-def _way(drive: Drive) -> Way:
+def _way(drive: Drive) -> FixPath:
     calls: Counter[tuple[str, str]] = Counter()
     ours: dict[CodeType, tuple[str, str] | None] = {}
 
@@ -68,4 +68,4 @@ def _way(drive: Drive) -> Way:
         drive.take_fix()
     finally:
         sys.setprofile(before)
-    return Way(dict(calls))
+    return FixPath(dict(calls))

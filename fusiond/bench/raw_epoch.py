@@ -54,19 +54,19 @@ def raw_epoch(_: int) -> Callable[[], int]:
 
     instants = count(1)
     estimator.step[STEP_SECONDS] = 1.0
-    first = raw.aid(before, 0)
+    first = raw.measurement(before, 0)
     first.at(nav).innovation(estimator.state)
     estimator.step[STEP_SECONDS] += epoch.tow_s - before.tow_s
 
     def work() -> int:
         for _ in range(EPOCHS):
             raw.recent[:] = [first]
-            aid = raw.aid(epoch, next(instants))
-            outcome = estimator.update(aid.at(nav))
+            measurement = raw.measurement(epoch, next(instants))
+            outcome = estimator.update(measurement.at(nav))
             assert outcome.name == "fused"
             assert len(outcome.rows) == 2 * SATELLITES
-            aid.judged(outcome.rows, outcome.whitened)
-            aid.series(outcome.whitened, np.array(outcome.rows) == KEPT)
+            measurement.judged(outcome.rows, outcome.whitened)
+            measurement.series(outcome.whitened, np.array(outcome.rows) == KEPT)
         return EPOCHS
 
     work()

@@ -54,7 +54,7 @@ _KERNEL_MAX_AGE_NS = SECOND_NS
 _UTC_MAX_AGE_NS = 10 * SECOND_NS
 """The timeline's least history: a UTC stamp older than that by another's UTC says that one of the
 two is wrong."""
-_UTC_MAX_LATE_NS = 60 * SECOND_NS
+_UTC_MAX_DELAY_NS = 60 * SECOND_NS
 """Longer than a tty's queue holds: a stamp older by its own source's UTC belongs to another UTC."""
 _UTC_FUTURE_NS = 100 * MILLISECOND_NS
 _SYSTEM_LATENCY_NS = SECOND_NS
@@ -65,7 +65,7 @@ _SAME_UTC_NS = 3 * SECOND_NS
 _RESUMED_NS = 60 * SECOND_NS
 """Older knowledge is learnt anew: drift of 100 ppm has made 6 ms of it, twice what it is worth."""
 _BETTER_NS = 5 * MILLISECOND_NS
-_TOLD_NS = 500 * MILLISECOND_NS
+_REPORTED_STEP_NS = 500 * MILLISECOND_NS
 """A change of UTC this large is an event when another source becomes the reference."""
 
 _SETS_CLOCKS_SD_S = 2e-2
@@ -213,7 +213,7 @@ class Clock:
         if t_ns > t_seen_ns + _UTC_FUTURE_NS:
             self.counters["utc_stamp_future"] += 1
             return self._by_arrival(t_seen_ns, stamped.sd_s)
-        if t_ns < t_seen_ns - _UTC_MAX_LATE_NS:
+        if t_ns < t_seen_ns - _UTC_MAX_DELAY_NS:
             self.counters["utc_stamp_old"] += 1
             return self._by_arrival(t_seen_ns, own.sd_s)
         return Instant(min(t_ns, t_seen_ns), stamped.sd_s, "utc")
@@ -277,8 +277,8 @@ class Clock:
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
         envelope = self._envelope(self._utc, report.source)
         if envelope.plausible and not plausible:
-            told = f"{report.source} tells the year {dates.year(utc_ns)}: not believed"
-            self._event("utc_implausible", told)
+            refusal = f"{report.source} tells the year {dates.year(utc_ns)}: not believed"
+            self._event("utc_implausible", refusal)
         jumped_ns = -envelope.update(utc_ns, report.t_seen_ns, plausible=plausible)
         if jumped_ns and report.source == self._reference:
             self._jumped(jumped_ns, f"{report.source} has said so for minutes")
@@ -335,7 +335,7 @@ class Clock:
         gain = incumbent.believed_offset_ns - envelope.believed_offset_ns
         if silent or _BETTER_NS < gain < _SAME_UTC_NS:
             self.counters["utc_source_changed"] += 1
-            if abs(gain) > _TOLD_NS and self._options.utc == "gnss":
+            if abs(gain) > _REPORTED_STEP_NS and self._options.utc == "gnss":
                 self._jumped(gain, f"{source} tells it in place of {self._reference}")
             self._reference = source
 

@@ -24,7 +24,7 @@ def plausible(utc_ns: int) -> bool:
 
 
 def year(utc_ns: int) -> int:
-    """The Gregorian year of a date, of any at all."""
+    """Gregorian year of any date."""
     return int(np.datetime64(utc_ns // SECOND_NS, "s").astype("datetime64[Y]").astype(int)) + 1970
 
 

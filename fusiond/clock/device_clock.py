@@ -20,7 +20,7 @@ _SLEW_DIVISOR = 100
 """An upward correction stretches the spacing of samples by at most 1 %."""
 _JITTER_NS = 50 * MILLISECOND_NS
 """Beyond the jitter of a serial line (1 to 16 ms for USB); 5000 ppm of drift over the window."""
-_LATE_FOR_NS = 120 * SECOND_NS
+_DELAYED_FOR_NS = 120 * SECOND_NS
 """A busy host is late for seconds; what lasts for two minutes is the device's clock."""
 _CONFIRM_SAMPLES = 3
 
@@ -42,7 +42,7 @@ class OffsetFilter:
         self._minima: deque[int] = deque(maxlen=_BUCKETS)
         self._bucket = -1
         self._t_seen_ns = 0
-        self._late_since_ns: int | None = None
+        self._delayed_since_ns: int | None = None
         self.offset_ns: int | None = None
         self.snaps = 0
 
@@ -61,11 +61,11 @@ class OffsetFilter:
         rise = envelope - offset
         passed = max(0, t_seen_ns - self._t_seen_ns)
         if rise <= _JITTER_NS:
-            self._late_since_ns = None
-        elif self._late_since_ns is None:
-            self._late_since_ns = t_seen_ns
-        if self._late_since_ns is not None:
-            if t_seen_ns - self._late_since_ns > _LATE_FOR_NS:
+            self._delayed_since_ns = None
+        elif self._delayed_since_ns is None:
+            self._delayed_since_ns = t_seen_ns
+        if self._delayed_since_ns is not None:
+            if t_seen_ns - self._delayed_since_ns > _DELAYED_FOR_NS:
                 self.snaps += 1
                 offset = envelope
             else:

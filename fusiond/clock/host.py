@@ -73,7 +73,7 @@ class Readings:
 
     def __init__(self, host: HostTime) -> None:
         self._host = host
-        self.heard: Callable[[ReadClock, int, int], None] | None = None
+        self.on_reading: Callable[[ReadClock, int, int], None] | None = None
 
     def realtime(self) -> tuple[int, int]:
         """CLOCK_REALTIME against CLOCK_MONOTONIC, ns."""
@@ -95,8 +95,8 @@ class Readings:
             if best[0] <= _BRACKET_NS:
                 break
         assert best is not None
-        if self.heard is not None:
-            self.heard(clock, best[1], best[2])
+        if self.on_reading is not None:
+            self.on_reading(clock, best[1], best[2])
         return best[1], best[2]
 
 

@@ -35,14 +35,14 @@ ASKED_AGAIN_NS = 20 * SECOND_NS
 """Time for which a bus whose controllers disagree is not asked once more whether its clock was
 set."""
 ORDINARY = 3
-"""A pause of so many of the longest lately is one of a sparse bus."""
+"""Pause, in multiples of the longest lately, that a sparse bus may have."""
 FOLLOWING = 8
 """Frames by which damage is told from a clock that was set: most must agree."""
 _LATELY = 64
 _OWN_PERIOD = 512
 """Frames among which the last two of the same identifier are looked for."""
 REPORTS = 5
-"""Reports of UTC whose median is taken, on either side."""
+"""Reports of UTC before and after a jump whose medians are compared."""
 ENOUGH_REPORTS = 3
 """As many as UTC itself is followed by (`utc_envelope`): two may be one queue's."""
 
@@ -67,7 +67,7 @@ class RecorderClock:
         self.t_ns = 0
         self.stamp_ns = 0
         self.steps: list[Step] = []
-        self._begun = False
+        self._started = False
         self._went_back = False
         """Time itself did, as UTC says: what was recorded before is refused until it is over."""
         self._denied_ns: int | None = None
@@ -85,7 +85,7 @@ class RecorderClock:
         """True if `take` has to look at what follows."""
         change = stamp_ns - self.stamp_ns
         if 0 <= change < LEAP_NS:
-            return not self._begun
+            return not self._started
         own_ns = self._of_channel.get(of[0], stamp_ns)
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
@@ -95,7 +95,7 @@ class RecorderClock:
         return change_ns < -AHEAD_NS or change_ns >= max(LEAP_NS, ORDINARY * spacing_ns)
 
     def next(self, stamp_ns: int, of: Of) -> None:
-        """The stamp of a frame, which is not odd."""
+        """Take the stamp of a frame that fits."""
         if stamp_ns >= self.stamp_ns:
             self._on(stamp_ns, stamp_ns - self.stamp_ns, of)
         self._of_channel[of[0]] = stamp_ns
@@ -106,10 +106,10 @@ class RecorderClock:
         `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
         say nothing. It is asked where a step is possible.
         """
-        if not self._begun:
+        if not self._started:
             if 2 * sum(f < stamp_ns - AHEAD_NS for f in following) > len(following):
                 return "time_ahead"
-            self._begun = True
+            self._started = True
             self.t_ns = self.stamp_ns = stamp_ns
         change = stamp_ns - self.stamp_ns
         if change < 0:
@@ -176,7 +176,7 @@ class RecorderClock:
         return due_ns if 0 <= due_ns < LEAP_NS else spacing
 
     def _alone(self, stamp_ns: int, following: Sequence[int]) -> bool:
-        """Of a stamp that went back: whether most of what follows has not, or does not go on from
+        """True if a stamp that went back stands alone: most that follow go on from those before
         it."""
         on = [f for f in following if stamp_ns - AHEAD_NS <= f < self.stamp_ns]
         return 2 * len(on) <= len(following)

@@ -38,7 +38,7 @@ from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
 _EARLY_NS = 50 * MILLISECOND_NS
 """Beyond the jitter of a serial line (1 to 16 ms for USB) an early report is held back."""
-_LATE_NS = 500 * MILLISECOND_NS
+_DELAY_NS = 500 * MILLISECOND_NS
 """UTC reports are at most 200 ms late on a healthy serial line."""
 _YOUNG_REPORTS = 10
 _YOUNG_EARLY_NS = 60 * SECOND_NS
@@ -86,10 +86,10 @@ class Stamped(NamedTuple):
     sd_s: float
 
 
-def whole_seconds_ns(late_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:
-    """The jump by whole seconds that explains `late_ns` with a delay up to `delay_ns`, else 0."""
-    jump = (late_ns + _WHOLE_LOW_NS) // SECOND_NS * SECOND_NS
-    return jump if late_ns - jump <= delay_ns else 0
+def whole_seconds_ns(excess_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:
+    """The jump by whole seconds that explains `excess_ns` with a delay up to `delay_ns`, else 0."""
+    jump = (excess_ns + _WHOLE_LOW_NS) // SECOND_NS * SECOND_NS
+    return jump if excess_ns - jump <= delay_ns else 0
 
 
 def _after_leap(utc_ns: int) -> bool:
@@ -152,7 +152,7 @@ class UtcEnvelope:
 
     @property
     def open(self) -> bool:
-        """While reports that are held back are sure to say something, and not yet what."""
+        """True while the reports held back show a change that is not identified yet."""
         return bool(self._odd)
 
     @property
@@ -178,12 +178,12 @@ class UtcEnvelope:
 
         A late one keeps its age; if a jump of UTC would explain that, sigma is the jump.
         """
-        late_ns = t_seen_ns - utc_ns - self.offset_ns
+        excess_ns = t_seen_ns - utc_ns - self.offset_ns
         doubt_s = 0.0
-        if late_ns > _LATE_NS and (
+        if excess_ns > _DELAY_NS and (
             self._doubt_ns or self._missed(utc_ns) or self._turns_back(utc_ns, t_seen_ns)
         ):
-            doubt_s = whole_seconds_ns(late_ns) / SECOND_NS
+            doubt_s = whole_seconds_ns(excess_ns) / SECOND_NS
         return Stamped(utc_ns + self.offset_ns, hypot(self.sd_s, doubt_s))
 
     def _missed(self, utc_ns: int) -> bool:
@@ -194,7 +194,7 @@ class UtcEnvelope:
 
     def _turns_back(self, utc_ns: int, t_seen_ns: int) -> bool:
         """True if UTC stands still or goes back with `utc_ns`, and not because it is read twice."""
-        return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _LATE_NS
+        return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _DELAY_NS
 
     def untrusted(self, utc_ns: int, t_seen_ns: int) -> None:
         """A report that the device does not trust: all it can say is that UTC turned back."""
@@ -230,28 +230,30 @@ class UtcEnvelope:
             return 0
         drifted = self._offset_ns + max(0, t_seen_ns - self.t_seen_ns) * self._ppb // SECOND_NS
         self._offset_ns = drifted
-        late = d - drifted
+        excess_ns = d - drifted
         early_from = _YOUNG_EARLY_NS if self._reports < _YOUNG_REPORTS else _EARLY_NS
         backward = self._turned_back or self._turns_back(utc_ns, t_seen_ns)
-        repeated = plausible and whole_seconds_ns(late) == SECOND_NS and _after_leap(utc_ns)
-        if late < -early_from or (late > _LATE_NS and (backward or repeated or self._odd)):
+        repeated = plausible and whole_seconds_ns(excess_ns) == SECOND_NS and _after_leap(utc_ns)
+        if excess_ns < -early_from or (
+            excess_ns > _DELAY_NS and (backward or repeated or self._odd)
+        ):
             self.t_seen_ns = max(t_seen_ns, self.t_seen_ns)
-            self._hold(d, late, utc_ns, t_seen_ns)
+            self._hold(d, excess_ns, utc_ns, t_seen_ns)
             return self._believe()
         self._odd.clear()
-        if late < -_EARLY_NS:
-            self._spread_s = min(_MAX_SPREAD_S, max(self._spread_s, -late / SECOND_NS))
+        if excess_ns < -_EARLY_NS:
+            self._spread_s = min(_MAX_SPREAD_S, max(self._spread_s, -excess_ns / SECOND_NS))
             self._reports = 0
         self._offset_ns = min(d, drifted)
-        if late <= _LATE_NS:
+        if excess_ns <= _DELAY_NS:
             self._unsupported = None
             self._supported_ns = t_seen_ns
         else:
             self._counters["utc_report_late"] += 1
             run, missed = self._unsupported, self._missed(utc_ns)
-            if run is None or not run.take(late):
+            if run is None or not run.take(excess_ns):
                 missed = missed or (run is not None and run.after_gap)
-                run = self._unsupported = _Unsupported(t_seen_ns, late)
+                run = self._unsupported = _Unsupported(t_seen_ns, excess_ns)
             run.after_gap = run.after_gap or missed
         self._accept(utc_ns, d, t_seen_ns)
         return self._outlasted() or self._believe()
@@ -265,7 +267,7 @@ class UtcEnvelope:
         self._reports += 1
         self.t_seen_ns = max(t_seen_ns, self.t_seen_ns)
 
-    def _hold(self, d: int, late: int, utc_ns: int, t_seen_ns: int) -> None:
+    def _hold(self, d: int, excess_ns: int, utc_ns: int, t_seen_ns: int) -> None:
         """Hold a report that no latency explains: a wrong report, or a change of UTC once three
         agree."""
         self._counters["utc_report_odd"] += 1
@@ -294,14 +296,14 @@ class UtcEnvelope:
 
     def _outlasted(self) -> int:
         """Reports late by the same whole seconds for minutes: UTC has jumped back by them."""
-        late = self._unsupported
-        if late is None or self.t_seen_ns - late.since_ns < _BELIEVE_NS:
+        excess_ns = self._unsupported
+        if excess_ns is None or self.t_seen_ns - excess_ns.since_ns < _BELIEVE_NS:
             return 0
         jump = self._doubt_ns
-        if jump == 0 or late.reports < _YOUNG_REPORTS or not self.plausible:
+        if jump == 0 or excess_ns.reports < _YOUNG_REPORTS or not self.plausible:
             return 0
         self._counters["utc_jump"] += 1
-        self._offset_ns = self.offset_ns + late.least_ns
+        self._offset_ns = self.offset_ns + excess_ns.least_ns
         self._unsupported = None
         self._supported_ns = self.t_seen_ns
         return jump
@@ -319,16 +321,16 @@ class UtcEnvelope:
 class _Unsupported:
     """Reports that have been late since the last one that was not."""
 
-    def __init__(self, since_ns: int, late_ns: int) -> None:
+    def __init__(self, since_ns: int, excess_ns: int) -> None:
         self.since_ns = since_ns
-        self.least_ns = late_ns
+        self.least_ns = excess_ns
         self.reports = 1
         self.after_gap = False
 
-    def take(self, late_ns: int) -> bool:
+    def take(self, excess_ns: int) -> bool:
         """Take another one in; False if it does not fit, and a new run begins with it."""
-        if not -_AGREE_NS <= late_ns - self.least_ns <= _SCATTER_NS:
+        if not -_AGREE_NS <= excess_ns - self.least_ns <= _SCATTER_NS:
             return False
-        self.least_ns = min(self.least_ns, late_ns)
+        self.least_ns = min(self.least_ns, excess_ns)
         self.reports += 1
         return True

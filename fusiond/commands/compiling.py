@@ -1,7 +1,7 @@
-"""Notice while kernels compile: once after an installation or an update, a minute and more.
+"""Progress of compiling kernels, once after an installation or an update.
 
 with compiling():
-    from fusiond.live.daemon import run
+    from fusiond.live.daemon import run_daemon
 """
 
 from __future__ import annotations

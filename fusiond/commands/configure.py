@@ -184,7 +184,7 @@ def _look(
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
-    from fusiond.doctor.discovery import Device, SilentPort, on_bus, on_port  # noqa: PLC0415
+    from fusiond.doctor.discovery import Device, SilentPort, device_on_bus, device_on_port  # noqa: PLC0415
 
     channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
 
@@ -194,9 +194,9 @@ def _look(
 
     async def look() -> tuple[list[Device], list[SilentPort]]:
         found = await asyncio.gather(
-            *(on_port(line, ask_terminal=ask_terminal) for line in unique.values())
+            *(device_on_port(line, ask_terminal=ask_terminal) for line in unique.values())
         )
-        on_buses = await asyncio.gather(*(on_bus(*channel) for channel in channels))
+        on_buses = await asyncio.gather(*(device_on_bus(*channel) for channel in channels))
         looked_at = [device for devices in on_buses for device in devices]
         looked_at += [one for one in found if isinstance(one, Device)]
         return looked_at, [one for one in found if isinstance(one, SilentPort)]

@@ -37,7 +37,7 @@ def run(config: ConfigPath, record: RecordPath = None) -> None:
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415
 
     with gathered() as missing:
-        from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+        from fusiond.live.daemon import run_daemon  # noqa: PLC0415
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
         with suppress(ConfigError):  # the daemon's own will say so
@@ -91,7 +91,7 @@ def check(
     """Validate a configuration: 0, or 78 with every mistake.
 
     What is valid and cannot work is told too, marked with !, and leaves the exit code at 0. With
-    --compile also that the model, with all that its aids add, fits the kernels.
+    --compile also that the model, with all that its measurements add, fits the kernels.
     """
     settings = load(config)
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415
@@ -106,13 +106,13 @@ def check(
     for name, source in settings.sources.items():
         section = settings.aiding.get(name)
         typer.echo(
-            f"  {name}: driver {source.driver}" + (f", aids as {section.kind}" if section else "")
+            f"  {name}: driver {source.driver}" + (f", used as {section.kind}" if section else "")
         )
     for name in settings.outputs.served:
         typer.echo(f"  output {name}")
     for name, section in settings.aiding.items():
         if name not in settings.sources:
-            typer.echo(f"  {name}: aids as {section.kind}, no source (for `process`)")
+            typer.echo(f"  {name}: used as {section.kind}, no source (for `process`)")
     for doubt in doubts(settings):
         typer.echo(f"  ! {doubt}")
 

@@ -24,7 +24,7 @@ _ROOT_HOUR = 60.0
 
 
 def model_report(name: str, config: Config | None) -> dict[str, Any]:
-    """The model with a configuration's IMU and aids, or with the defaults; SI units.
+    """The model with a configuration's IMU and measurements, or with the defaults; SI units.
 
     `states`: one record a state: `name`, `unit`, `initial_sigma` (None: set by the alignment),
     `white_noise` (unit/sqrt(s)), and `markov_sigma` with `correlation_s` where it decays.
@@ -52,7 +52,7 @@ def model_report(name: str, config: Config | None) -> dict[str, Any]:
 
 
 def print_model(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print in the units of data sheets to standard output, or to the console given."""
+    """Print a model in the units of data sheets, to standard output or the given console."""
     console = console or Console()
     held = ", height held" if report["hold_height"] else ""
     console.print(f"{report['model']}: {report['size']} states{held}", highlight=False)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -62,7 +64,7 @@ def process(
         list[str] | None,
         typer.Option(
             metavar="START:LENGTH[:SOURCE,...]",
-            help="Withhold aids, all or of these sources, in s of the files; repeatable.",
+            help="Withhold measurements, all or of these sources, in s of the files; repeatable.",
         ),
     ] = None,
     out: Annotated[
@@ -88,35 +90,32 @@ def process(
     if smooth and out is None:
         raise typer.BadParameter("--smooth: name a file to write with --out")
     settings = load(config)
-    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
         raw_receivers(settings.aiding)  # what they compile comes with the rest
     wanted = _systems_argument(systems)
-    try:
-        with config_errors(), data_errors(), progress_bar("processing") as bar:
-            result = run_process(
-                settings,
-                imu,
-                aids,
-                outages,
-                out,
-                wanted,
-                can,
-                smooth=smooth,
-                progress=bar or (lambda done, total: None),
-            )
-    except MissingPackageError as error:
-        typer.echo(f"fusiond: {error}", err=True)
-        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    given = (settings, imu, aids, outages, out, wanted, can)
+    with _missing_packages(), config_errors(), data_errors(), progress_bar("processing") as bar:
+        result = run_process(*given, smooth=smooth, progress=bar or (lambda done, total: None))
     _print_summary(result, err="-" in (json_path, str(out)))
     write_json(result, json_path)
     if not result["solution_rows"]:
         typer.echo(f"fusiond: No solution: {result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
+
+
+@contextmanager
+def _missing_packages() -> Iterator[None]:
+    """Exit with the reason where a package for a file's format is not installed."""
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+
+    try:
+        yield
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
 
 
 def _recording(logs: list[Path]) -> Pass:
@@ -149,7 +148,6 @@ def calibrate(
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
     settings = load(config)
     from fusiond.commands.recordings import log_errors  # noqa: PLC0415
-    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
@@ -158,12 +156,14 @@ def calibrate(
 
         navigate = _recording(logs) if logs else files(imu, aids, can)
         raw_receivers(settings.aiding)  # what they compile comes with the rest
-    try:
-        with config_errors(), data_errors(), log_errors(), progress_bar("calibrating") as bar:
-            found = run_calibrate(settings, navigate, bar or (lambda done, total: None))
-    except MissingPackageError as error:
-        typer.echo(f"fusiond: {error}", err=True)
-        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    with (
+        _missing_packages(),
+        config_errors(),
+        data_errors(),
+        log_errors(),
+        progress_bar("calibrating") as bar,
+    ):
+        found = run_calibrate(settings, navigate, bar or (lambda done, total: None))
     if not found.result["solution_rows"]:
         typer.echo(f"fusiond: No solution: {found.result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
@@ -223,16 +223,10 @@ def simulate(
 
 
 def _live(folder: Path, duration_s: float | None, seed: int) -> None:
-    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-
     with compiling():
         from fusiond.simulation.live import live as run_live  # noqa: PLC0415
-    try:
-        with data_errors():
-            sent = run_live(folder, duration_s, seed, typer.echo)
-    except MissingPackageError as error:
-        typer.echo(f"fusiond: {error}", err=True)
-        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    with _missing_packages(), data_errors():
+        sent = run_live(folder, duration_s, seed, typer.echo)
     typer.echo(", ".join(f"{count} {name}" for name, count in sorted(sent.items())))
 
 

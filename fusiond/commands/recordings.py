@@ -66,11 +66,11 @@ def replay(
 ) -> None:
     """Run a recording through the daemon's own parts; exit 1 where the bits are not the same."""
     with compiling():
-        from fusiond.replay.run import Wish  # noqa: PLC0415
+        from fusiond.replay.run import ReplayOptions  # noqa: PLC0415
         from fusiond.replay.run import replay as run_replay  # noqa: PLC0415
 
     logging.getLogger("fusiond").addHandler(logging.NullHandler())  # events go into --out
-    wish = Wish(config, tuple(settings or ()), out, speed)
+    wish = ReplayOptions(config, tuple(settings or ()), out, speed)
     with log_errors(), config_errors(), spinner("replaying"):
         summary = run_replay(logs, wish)
     _print_replay(summary, err=json_path == "-")

@@ -81,7 +81,7 @@ def study(
         _runs(runs or ABOUT[name].runs, workers, cluster, timeout, kept) as lost,
         progress_bar(name) as progress,
     ):
-        result = module.run(runs, seed, progress=progress)
+        result = module.run_study(runs, seed, progress=progress)
     if lost:
         result["lost_runs"] = [asdict(run) for run in lost]
         for run in lost:
@@ -104,7 +104,7 @@ study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
 
 @contextmanager
 def rows_kept(out: Path | None, name: str, seed: int) -> Iterator[KeptRuns | None]:
-    """The rows of a study in `out`; says in the end how many there are."""
+    """Rows of a study in `out`; prints at the end how many there are."""
     if out is None:
         yield None
         return
@@ -147,7 +147,7 @@ def model(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Such as ins21.")],
     config: Annotated[
         Path | None,
-        typer.Option(metavar="CONFIG", help="Whose IMU and aids; the defaults if none."),
+        typer.Option(metavar="CONFIG", help="Whose IMU and measurements; the defaults if none."),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:

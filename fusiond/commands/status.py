@@ -49,7 +49,8 @@ class VehicleMessages:
 
     @property
     def complete(self) -> bool:
-        """True if there is nothing more to wait for; nothing is before the first tick."""
+        """True if every topic that the daemon sends has come; before the first tick it sends
+        none."""
         compiling = self.topics.get("status", {}).get("ticks") == 0
         asked = ("status",) if compiling else _ASKED
         return self.online == "offline" or (self.live and all(t in self.topics for t in asked))

@@ -45,14 +45,14 @@ class Aiding(Section):
     """Common options of aiding sections: place, how it is gated."""
 
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
-    """Body axes (forward, right, down), from the IMU to the aid's reference point."""
+    """Body axes (forward, right, down), from the IMU to the device's reference point."""
     gate_probability: Probability = 0.9999
-    """A consistent innovation fails the gate with one minus this probability."""
+    """Probability with which a correct measurement passes the gate."""
     sigma_scale: PositiveFloat = 1.0
-    """Multiplies every sigma the device states, where experience says it is too optimistic."""
+    """Factor on every sigma that the device states; above 1 for an optimistic device."""
     robust: bool = False
-    """Measurements far off weigh less instead of being refused, by Student's t: where fixes come
-    among houses. See `docs/estimators.md`."""
+    """True: outliers get less weight (Student's t) instead of being rejected; for fixes among
+    houses. See `docs/estimators.md`."""
 
 
 class GnssAiding(Aiding):
@@ -60,28 +60,26 @@ class GnssAiding(Aiding):
 
     kind: Literal["gnss"] = "gnss"
     use_velocity: bool = True
-    """True if the receiver's velocity is an aid too."""
+    """True if the receiver's velocity is a measurement too."""
     range_error_m: PositiveFloat = 3.0
-    """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
+    """Range error; times DOP it is the sigma of a fix without GST. See `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
     """Value where the receiver states none."""
     min_position_sd_m: PositiveFloat | None = None
-    """No smaller sigma is believed; without it by the fix's quality: 0.3 m by code (0.5 m of
-    height), 0.05 m RTK float, 0.02 m RTK fixed."""
+    """Least sigma of a position. Default by the fix's quality: 0.3 m by code (0.5 m of height),
+    0.05 m RTK float, 0.02 m RTK fixed."""
     min_velocity_sd_m_s: PositiveFloat = 0.02
-    """No smaller sigma is believed."""
+    """Least sigma of a velocity."""
     velocity_delay_s: NonNegativeFloat = 0.0
-    """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
-    one."""
+    """Age of the velocity at the fix's instant; half an epoch if the receiver averages over one."""
     time_offset_sd_s: NonNegativeFloat = 0.1
     """Offset of validity from the stamps, for fixes and velocities: one sigma of offsets that the
     filter estimates. A serial line's latency is known to 0.1 s. 0: none is."""
     time_sd_s: NonNegativeFloat = 0.0
-    """Timing error of a single fix against the IMU; times the speed it adds to sigma."""
+    """Timing error of a single fix against the IMU; multiplied by the speed it adds to sigma."""
     lever_arm_sd_m: NonNegativeFloat | None = None
-    """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; 0:
-    it is as measured. Without it 1 m for the only receiver, if its `lever_arm_m` is not given, else
-    0."""
+    """One sigma of the error of `lever_arm_m` on each axis; the filter estimates that error. 0:
+    exact. Default: 1 m for the only receiver if its `lever_arm_m` is not set, else 0."""
     bias_sd_m: NonNegativeFloat | None = None
     """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east, beside
     what they state; fixes by carrier phase have half of what they state. Unless it is given, what
@@ -106,9 +104,9 @@ class RawAiding(Aiding):
     systems: tuple[Literal["G", "E", "C"], ...] = ("G", "E", "C")
     """GPS, Galileo, BeiDou: which to use. Each has a clock offset of its own."""
     elevation_mask_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 10.0
-    """Lower satellites are left out."""
+    """Lower satellites are not used."""
     cno_mask_db_hz: NonNegativeFloat = 28.0
-    """Weaker signals are left out."""
+    """Weaker signals are not used."""
     best_four: bool = False
     """Use the four satellites of smallest GDOP alone (paper 002), not all in view."""
     bias_sd_m: NonNegativeFloat = 0.5
@@ -143,18 +141,19 @@ class RdssAiding(Aiding):
     satellites_deg: tuple[float, float] = (80.0, 140.0)
     """Longitudes of the two geostationary satellites, east positive."""
     range_sd_m: PositiveFloat = 15.3
-    """Of a slant range after differential correction: 8 m satellite drift and 13 m ranging."""
+    """One sigma of a slant range after differential correction: 8 m satellite drift and 13 m
+    ranging."""
     height_sd_m: PositiveFloat = 10.0
-    """Of the height that the centre solves with; where the request gave the solution's height, its
-    sigma stands in place of this."""
+    """One sigma of the height that the centre solves with. If the request gave the solution's
+    height, that height's sigma is used."""
     fix_height_sd_m: PositiveFloat | None = 30.0
-    """The fix's height aids with this sigma, unless the request gave it (then it says nothing new).
-    Without any height an inertial height runs away."""
+    """One sigma of the fix's height. A height that the request gave is not used: it is the
+    solution's own. Without any height measurement an inertial height diverges."""
     bias_sd_m: NonNegativeFloat = 15.0
-    """Error that successive fixes share (height model, satellite positions), one sigma an axis; 0:
-    none is estimated. See `docs/rdss-strategies.md` for why not 0."""
+    """Error that successive fixes share (height model, satellite positions), one sigma an axis. 0:
+    not estimated; `docs/rdss-strategies.md` says why that is too sure."""
     bias_correlation_s: PositiveFloat = 600.0
-    """Correlation time of that drift."""
+    """Correlation time of that error."""
 
 
 class AttitudeAiding(Aiding):
@@ -162,16 +161,17 @@ class AttitudeAiding(Aiding):
 
 
 class Misaligned(Aiding):
-    """An aid whose sensor is mounted a little askew: three small angles that the filter estimates.
+    """A measurement whose sensor is mounted a little askew: three small angles that the filter
+    estimates.
 
     The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
     device.
     """
 
     misalignment_sd_arcsec: NonNegativeFloat = 200.0
-    """One sigma of each angle before it is estimated; 0: none is estimated."""
+    """One sigma of each angle before it is estimated; 0: not estimated."""
     misalignment_correlation_s: PositiveFloat | None = None
-    """Correlation time, where mount or airframe bend; without it the angles are constant."""
+    """Correlation time of the angles, if mount or airframe bend; default: they are constant."""
 
 
 class StarTrackerAiding(Misaligned):
@@ -179,7 +179,7 @@ class StarTrackerAiding(Misaligned):
 
     kind: Literal["star_tracker"] = "star_tracker"
     sd_arcsec: PositiveFloat = 200.0
-    """One sigma of roll, pitch and yaw each, where the device states none. As in paper 001."""
+    """One sigma of roll, pitch and yaw if the device states none (paper 001)."""
 
 
 class SarAiding(Misaligned):
@@ -187,13 +187,13 @@ class SarAiding(Misaligned):
 
     kind: Literal["sar"] = "sar"
     sd_arcsec: PositiveFloat = 100.0
-    """One sigma of azimuth and of elevation, where the device states none."""
+    """One sigma of azimuth and elevation if the device states none."""
     min_range_m: PositiveFloat = 1000.0
-    """A nearer point is `too_close`: a position off by 16 m bends its angles by half the default
-    sigma."""
+    """A nearer point is rejected as `too_close`: 16 m of position error turn its angles by half the
+    default sigma."""
     targets_deg_m: dict[str, Place] = Field(default_factory=dict)
-    """The known points by the number or name that the device gives: latitude, longitude (deg),
-    ellipsoidal height (m)."""
+    """Known points, by the device's number or name: latitude, longitude (deg), ellipsoidal height
+    (m)."""
 
 
 class HeadingAiding(Aiding):
@@ -208,15 +208,15 @@ class CompassAiding(Aiding):
     sd_deg: PositiveFloat = 1.0
     """Noise of a single reading."""
     declination_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
-    """Magnetic north from true north, east positive; without it the World Magnetic Model says it,
-    where and when the fixes are."""
+    """Declination, east positive. Default: the World Magnetic Model at place and date of the
+    fixes."""
     deviation_sd_deg: PositiveFloat = 5.0
-    """One sigma of the deviation at any heading: what a compass that was compensated once in a
-    steel vehicle is left with. The filter estimates it."""
+    """One sigma of the deviation at any heading, as left in a steel vehicle after compensation. The
+    filter estimates it."""
     disturbance_sd_deg: PositiveFloat = 3.0
-    """One sigma of what lasts for some seconds: bridges, vehicles beside, currents of the own."""
+    """One sigma of errors that last for seconds: bridges, vehicles beside, own currents."""
     disturbance_s: PositiveFloat = 20.0
-    """Correlation time of that."""
+    """Correlation time of those errors."""
 
 
 class HeightAiding(Aiding):
@@ -235,9 +235,9 @@ class BarometerAiding(Aiding):
     weather_sd_m: PositiveFloat = 100.0
     """One sigma of the offset at first: 10 hPa of weather (80 m) and the geoid (30 m)."""
     weather_walk_m_sqrt_s: PositiveFloat = 0.15
-    """Its random walk: 9 m in an hour, the weather's 0.7 hPa and as much by driving through it."""
+    """Random walk of the offset: 9 m in an hour, by the weather and by driving through it."""
     temperature_sd: PositiveFloat = 0.04
-    """By what share its metres are too many: 4 % in air 10 K colder than the standard."""
+    """One sigma of the scale error: 4 % in air 10 K off the standard."""
     airflow_sd: PositiveFloat = 0.1
     """Share of the dynamic pressure missing at the sensor's place: 2 m at 20 m/s."""
 
@@ -253,15 +253,15 @@ class WheelAiding(Aiding):
     latency_s: float = 0.0
     """Latency of a speed."""
     drift_sd_m_s: NonNegativeFloat = 0.1
-    """Of what lasts (slip, a wheel's load, rounding at a steady speed): one sigma of a state; 0:
+    """One sigma of errors that last (slip, wheel load, rounding at a steady speed), a state; 0:
     none."""
     drift_s: PositiveFloat = 1.0
-    """Correlation time of that drift."""
+    """Correlation time of that error."""
     scale_sd: NonNegativeFloat = 0.02
-    """One sigma of what `scale` is wrong by, which the filter estimates: tyres wear by 2 % of their
-    radius. 0: nothing."""
+    """One sigma of the error of `scale`; the filter estimates it. Tyres wear by 2 % of their
+    radius. 0: exact."""
     latency_sd_s: NonNegativeFloat = 0.2
-    """One sigma of what `latency_s` is wrong by, which the filter estimates. 0: nothing."""
+    """One sigma of the error of `latency_s`; the filter estimates it. 0: exact."""
 
 
 AnyAiding = Annotated[

@@ -33,19 +33,19 @@ class Alignment(Section):
     heading_sd_deg: PositiveFloat = 5.0
     """One sigma of it."""
     position_deg_m: Vector | None = None
-    """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
+    """Latitude, longitude, height of the start, if no device gives a position."""
     position_sd_m: PositiveFloat = 100.0
     """One sigma of it."""
     levelling_s: PositiveFloat = 2.0
     """Rest needed to level by gravity."""
     course_speed_m_s: PositiveFloat = 3.0
-    """Speed from which the GNSS course is taken for the heading."""
+    """Least speed at which the GNSS course is taken as the heading."""
     course_sd_deg: PositiveFloat = 5.0
-    """One sigma of that (side slip, mounting)."""
+    """One sigma of that heading (side slip, mounting)."""
     gyrocompass_s: PositiveFloat = 120.0
     """Rest needed to gyrocompass."""
     gyrocompass_max_sd_deg: PositiveFloat = 5.0
-    """Gyrocompassing is used only if bias and noise allow this heading sigma."""
+    """Gyrocompassing is used only if bias and noise allow a smaller heading sigma."""
     saved_max_age_s: PositiveFloat = 86400.0
     """A saved state older than this is not used."""
 

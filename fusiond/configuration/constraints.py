@@ -12,16 +12,16 @@ class ZeroVelocity(Section):
 
     enabled: bool = True
     window_s: PositiveFloat = 1.0
-    """Samples judged together, on a fixed grid of time."""
+    """Length of a window of samples, on a fixed time grid."""
     gyro_sd_deg_s: PositiveFloat = 0.5
-    """Quiet below this standard deviation on every axis; twice what standing with the engine
-    on shows."""
+    """Rest needs a smaller standard deviation on every axis; set twice the value with the engine
+    on."""
     accel_sd_m_s2: PositiveFloat = 0.15
     """The same for specific force."""
     max_rate_deg_s: PositiveFloat = 2.0
-    """Quiet below this mean rate, beyond three sigma of the gyro's bias."""
+    """Rest needs a smaller mean rate, three sigma of the gyro's bias allowed."""
     max_speed_m_s: PositiveFloat = 0.5
-    """A quiet sensor means standstill only below this computed speed."""
+    """Rest needs a smaller computed speed."""
     velocity_sd_m_s: PositiveFloat = 0.05
     """One sigma of the velocity at rest."""
     rate_sd_deg_s: PositiveFloat = 0.1
@@ -35,22 +35,23 @@ class NonHolonomic(Section):
 
     enabled: bool = False
     sd_m_s: PositiveFloat = 0.2
-    """Sideways, of what is new in each interval."""
+    """One sigma of the sideways velocity, independent in each interval."""
     sd_down_m_s: PositiveFloat = 0.5
-    """Downwards: heave and pitch of the suspension, which last for seconds."""
+    """One sigma of the downward velocity: heave and pitch of the suspension, which last for
+    seconds."""
     drift_sd_m_s: NonNegativeFloat = 0.1
-    """Sideways, of what lasts (slip angle, a road's crown): one sigma of a state; 0: none."""
+    """One sigma of a lasting sideways velocity (slip angle, a road's crown), a state; 0: none."""
     drift_s: PositiveFloat = 5.0
-    """Correlation time of that drift."""
+    """Correlation time of that error."""
     mounting_sd_deg: NonNegativeFloat = 5.0
-    """One sigma of pitch and yaw of the IMU against the vehicle beyond `imu.mounting_deg`, which
-    the filter estimates. 0: the mounting is as measured."""
+    """One sigma of the error of `imu.mounting_deg` in pitch and yaw; the filter estimates it. 0:
+    exact."""
     min_speed_m_s: NonNegativeFloat = 2.0
     interval_s: PositiveFloat = 0.1
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """From the IMU to the point that does not slide (the rear axle)."""
     lever_arm_sd_m: NonNegativeFloat = 1.0
-    """One sigma of what its forward part is wrong by, which the filter estimates. 0: nothing."""
+    """One sigma of the error of its forward part; the filter estimates it. 0: exact."""
 
 
 class Constraints(Section):

@@ -29,8 +29,9 @@ LONGEST_M: dict[VehicleClass, float] = {
 96/53/EC), a railway coach (27.5 m, UIC 567), a container ship (400 m), the An-225 (84 m)."""
 
 DEEPEST_M = 0.5
-"""Of an antenna below an IMU on wheels: one in a box on the roof, an antenna on the bonnet, which
-is half a metre lower on a car."""
+"""Height of an antenna below the IMU (m) that a road vehicle may have.
+
+An IMU in a box on the roof and an antenna on the bonnet are half a metre apart on a car."""
 _ANTENNAS = (GnssAiding, RawAiding, RdssAiding)
 
 GIVES: dict[str, tuple[str, ...]] = {
@@ -49,7 +50,8 @@ GIVES: dict[str, tuple[str, ...]] = {
     "sbf": ("gnss", "heading"),
     "ubx": ("gnss", "heading"),
 }
-"""Kinds of aid that come of each shipped driver; of drivers in other packages nothing is known."""
+"""Kinds of measurement that come of each shipped driver; of drivers in other packages nothing is
+known."""
 
 
 def doubts(config: Config) -> list[str]:
@@ -124,7 +126,7 @@ def _aiding(config: Config) -> Iterator[str]:
         if source is None or kinds is None or section.kind in kinds:
             continue
         if not kinds:
-            yield f"aiding.{name}: driver {source.driver} is no aid: leave the section out"
+            yield f"aiding.{name}: driver {source.driver} gives no measurement: leave it out"
             continue
         yield (
             f"aiding.{name}.kind = {section.kind!r}: driver {source.driver} gives "

@@ -55,15 +55,15 @@ class Federated(Section):
     shares: dict[str, PositiveFloat] = Field(default_factory=dict)
     """Relative factors by local filter, brought to a sum of 1; empty: all equal."""
     master_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of the process noise, for the master's own estimate in `rescale`."""
+    """Share of the process noise for the master's own estimate in `rescale`."""
     retained: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of its information, what an updated local filter keeps in `rescale`."""
+    """Share of its information that an updated local filter keeps in `rescale`."""
     fault_detection: bool = True
     """True if a local filter that fails its tests is left out."""
     false_alarm_probability: Probability = 1e-6
-    """Of one innovation or difference test."""
+    """Probability of a false alarm of one innovation or difference test."""
     window: Annotated[int, Field(ge=2, le=100)] = 10
-    """Innovations judged together."""
+    """Number of innovations of a test."""
     readmit_after: PositiveInt = 20
     """Innovations in a row that must fit the master before a source is taken back."""
 
@@ -91,13 +91,13 @@ class Estimator(Section):
     filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
     """Kind of estimator; see `docs/estimators.md`."""
     model: Literal["ins15", "ins21", "ins17", "ins20", "ins23", "planar10", "planar15"] = "ins21"
-    """Error state; see `docs/navigation.md`."""
+    """The error-state model; see `docs/navigation.md`."""
     buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
-    """History that late measurements may rewind into; at least 10 s."""
+    """History for delayed measurements; at least 10 s."""
     checkpoint_s: PositiveFloat = 0.5
-    """Spacing of the points that a rewind starts from."""
+    """Interval of the checkpoints that a rewind starts from."""
     coast_after_s: PositiveFloat = 10.0
-    """Without a fused position for longer the mode is `coasting`."""
+    """Without a fused position for longer than this the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0
     """Horizontal sigma beyond which the mode is `invalid`."""
     federated: Federated = Field(default_factory=Federated.unsaid)

@@ -21,12 +21,12 @@ class Integrity(Section):
     vertical_alert_limit_m: PositiveFloat | None = None
     """The same for the vertical one."""
     integrity_risk_per_hour: Probability = 1e-5
-    """Of an error beyond a protection level at some time of an hour."""
+    """Probability of an error beyond a protection level within an hour."""
     false_alarm_per_hour: Probability = 1e-4
-    """Of a level that grows by chance, because two solutions are further apart than they should."""
+    """Probability within an hour that a level grows by chance."""
     fault_probability_per_hour: dict[str, Probability] = Field(default_factory=dict)
-    """By `[aiding.NAME]`: that the device is at fault at some time of an hour; 1e-3 where it is
-    not named."""
+    """Probability of a fault within an hour, by `[aiding.NAME]`; 1e-3 for one that is not
+    listed."""
 
     def priors(self, devices: tuple[str, ...]) -> tuple[float, ...]:
         """Probability of a fault in an hour of each device."""

@@ -2,7 +2,7 @@ r"""Fit of the model to the inertial sensor's errors.
 
 An accelerometer's bias that a model has no state for is noise to it
 (`fusiond.models.missing_states`), so that it stays honest, at the price of its sigma. The measure
-is a minute without aids, t = 60 s, one sigma of the displacement:
+is a minute without measurements, t = 60 s, one sigma of the displacement:
 
     an accelerometer bias b       b t^2 / 2
     what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
@@ -54,8 +54,9 @@ def model_doubts(config: Config) -> Iterator[str]:
         yield (
             f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
             f"{force / MILLI_G:.3g} mg, one sigma, which is noise to it: sigma grows by "
-            f"{_metres(known_m)} in a minute without aids, where the bias does {_metres(moved_m)}, "
-            f"and the level is off by {math.atan(force / g) / DEG:.2g} deg; {instead}"
+            f"{_metres(known_m)} in a minute without measurements, where the bias does "
+            f"{_metres(moved_m)}, and the level is off by {math.atan(force / g) / DEG:.2g} deg; "
+            f"{instead}"
         )
 
 

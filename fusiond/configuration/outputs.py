@@ -17,7 +17,7 @@ class Served(Section):
     """Common options of TCP servers."""
 
     host: str = "127.0.0.1"
-    """Address to listen at; `0.0.0.0` lets the whole network in, unasked for a name."""
+    """Address to listen at; `0.0.0.0` serves the whole network, without a password."""
     rate_hz: Rate = 1.0
     """Epochs a second, as receivers send them."""
 
@@ -65,17 +65,17 @@ class Foxglove(Served):
     port: Port = 8765
     """As Foxglove proposes it."""
     rate_hz: Rate = 10.0
-    """Of position and attitude."""
+    """Rate of position and attitude."""
     origins: tuple[Annotated[str, Field(pattern=r"^https?://[^/\s]+$")], ...] = ()
-    """Sites whose pages may connect, as a browser names them: `https://app.foxglove.dev`. Pages of
-    the same computer and programs that are no browser always may."""
+    """Web sites whose pages may connect, for example `https://app.foxglove.dev`. Pages of the same
+    computer, and programs other than browsers, always may."""
 
 
 class HomeAssistant(Section):
     """Home Assistant's discovery, through the broker of `[mqtt]`."""
 
     prefix: Annotated[str, Field(pattern=r"^[^#+\s]+$")] = "homeassistant"
-    """The discovery prefix of its MQTT integration."""
+    """Discovery prefix of its MQTT integration."""
 
 
 class OwnTracks(Section):
@@ -98,8 +98,8 @@ class Outputs(Section):
     """Shared options of outputs, and a section each."""
 
     geoid_separation_m: Annotated[float, Field(ge=-120.0, le=100.0)] | None = None
-    """Height of the geoid above the ellipsoid where the vehicle drives, for heights above the sea;
-    by default that of EGM96, to some metres."""
+    """Height of the geoid above the ellipsoid, for heights above the sea; default: EGM96, to some
+    metres."""
     gpsd: Gpsd | None = None
     nmea: NmeaServed | None = None
     prometheus: Prometheus | None = None

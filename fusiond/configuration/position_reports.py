@@ -15,13 +15,14 @@ class PositionReports(Section):
     """Reports of the solution to another card; see `docs/rdss-messages.md`."""
 
     card: Annotated[int, Field(ge=1, le=9_999_999)] | None = None
-    """The card that gets them; without it there are none."""
+    """Card that the reports go to; without one none are sent."""
     source: str | None = None
-    """The terminal that sends them, where there are several."""
+    """Terminal that sends them, if there are several."""
     interval_s: PositiveFloat | None = None
-    """A report every so often, as far as the card's turns allow; the latest counts."""
+    """Interval of the reports, if the card's turns allow it; a newer report replaces a waiting
+    one."""
     events: tuple[EventCode, ...] = ()
-    """Codes of events of devices and navigator with each of which a report goes out."""
+    """Codes of events that send a report at once."""
 
     @model_validator(mode="after")
     def _when(self) -> PositionReports:

@@ -16,20 +16,20 @@ class Recording(Section):
     directory: Path | None = None
     """Directory of the logs; without it only `fusiond run --record DIR` records."""
     when: Literal["always", "event", "command"] = "always"
-    """`always` from the start on; `event`: when one of `events` comes, with the time before it;
-    `command`: when `cmd/start_recording` says so, which works in any case."""
+    """`always`: from the start; `event`: from one of `events` on, with the time before it;
+    `command`: by `cmd/start_recording`, which always works."""
     split_mb: Annotated[float, Field(ge=1.0)] = 256.0
-    """A file larger than this is closed and the next begun; 10^6 bytes."""
+    """Size (10^6 bytes) at which the next file begins."""
     split_min: PositiveFloat = 60.0
-    """So is one older than this."""
+    """Age at which the next file begins."""
     keep_mb: PositiveFloat = 8192.0
-    """Of this vehicle's logs in the directory the newest this many MB are kept."""
+    """Most MB of this vehicle's logs in the directory: the oldest are deleted."""
     min_free_mb: NonNegativeFloat = 100.0
-    """With less than this left on the disk the recording stops."""
+    """Least free space on the disk; with less the recording stops."""
     before_s: Annotated[float, Field(ge=0.0, le=600.0)] = 60.0
-    """With `when = "event"`: how much from before the event is kept; it waits in memory."""
+    """With `when = "event"`: time before the event in the log; it is kept in memory."""
     after_s: Annotated[float, Field(ge=1.0)] = 60.0
-    """And how long recording goes on after the last of them."""
+    """With `when = "event"`: time after the last event in the log."""
     events: tuple[str, ...] = (
         "mode_invalid",
         "diverged",
@@ -37,4 +37,4 @@ class Recording(Section):
         "driver_fault",
         "protection_level",
     )
-    """Codes that start it, or parts of codes."""
+    """Codes of events, or parts of codes, that start a recording."""

@@ -60,13 +60,13 @@ class SpareImu(Section):
     """A second inertial unit of the same kind, which takes over when the first one fails."""
 
     source: str
-    """The source, of those in `[sources]`, that is the spare."""
+    """Name of the spare's `[sources.NAME]`."""
     axes: Axes = ("+x", "+y", "+z")
     """Its sensor axes along body forward, right and down."""
     mounting_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of its nominal sensor frame against the body."""
     mounting_sd_deg: PositiveFloat = 1.0
-    """One sigma of what each of those angles is wrong by against the first unit's."""
+    """One sigma of each of those angles, relative to the first unit."""
 
     @property
     def mounted(self) -> dict[str, Any]:
@@ -82,17 +82,17 @@ class Imu(Section):
     """
 
     sensor_class: SensorClass | None = None
-    """`consumer`, `mems` or `tactical`: noise, biases and scale factors that no other key gives are
-    those of the class; see `docs/vehicle.md`."""
+    """`consumer`, `mems` or `tactical`: gives noise, biases and scale factors for keys that are not
+    set; see `docs/vehicle.md`."""
     axes: Axes = ("+x", "+y", "+z")
     """Sensor axes along body forward, right and down."""
     mounting_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of the nominal sensor frame against the body."""
     time_offset_s: float = 0.0
-    """Added to the sensor's stamps; negative where they are late."""
+    """Added to the sensor's stamps; negative if the stamps are late."""
     rate_hz: PositiveFloat = 100.0
     gyro_range_deg_s: PositiveFloat | None = None
-    """Full scale of the data sheet: a rate that reaches it is refused as `saturated`."""
+    """Full scale of the data sheet: a rate that reaches it is rejected as `saturated`."""
     accel_range_g: PositiveFloat | None = None
     """The same for specific force."""
     gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
@@ -104,7 +104,7 @@ class Imu(Section):
     accel_bias_instability_mg: PositiveFloat = 0.1
     """One sigma of the drifting part of the bias."""
     bias_correlation_s: PositiveFloat = 3600.0
-    """Correlation time of that drift."""
+    """Correlation time of that error."""
     gyro_bias_initial_deg_h: PositiveFloat = 360.0
     """One sigma of the bias at switch-on."""
     accel_bias_initial_mg: PositiveFloat = 10.0
@@ -117,8 +117,8 @@ class Imu(Section):
     """One sigma of each small angle by which an axis is out of square: cross-axis sensitivity, 1 %
     of it is 0.57 deg. It is noise while the vehicle turns."""
     gap_s: PositiveFloat = 0.5
-    """A pause longer than this is a gap: the solution says so. The covariance grows for any that is
-    longer than 3.5 samples."""
+    """A longer pause between samples is a gap, which the mode reports. The covariance grows in any
+    pause longer than 3.5 samples."""
     spare: SpareImu | None = None
     """`[imu.spare]`: a second unit; see `docs/can-imu.md`."""
 
@@ -135,7 +135,7 @@ class ConsistencyTest(Section):
     """The verdict on a source's innovations; see `docs/consistency.md`."""
 
     window: Annotated[int, Field(ge=20, le=10000)] = 100
-    """Epochs judged together. RDSS sources, asked once a minute, use half of it."""
+    """Number of epochs of a test. RDSS sources, with a fix a minute, use half."""
     alpha: Probability = 0.01
     """Share of windows of a matched filter that are found wrong by chance."""
 
@@ -189,7 +189,7 @@ class Mqtt(Section):
     nav_rate_hz: Annotated[float, Field(ge=1.0, le=100.0)] = 10.0
     health_rate_hz: Annotated[float, Field(ge=0.1, le=10.0)] = 1.0
     queue: Annotated[int, Field(ge=1, le=10000)] = 64
-    """Messages that may wait for the broker; beyond it the oldest is dropped and counted."""
+    """Most messages that wait for the broker; then the oldest is dropped and counted."""
     commands: tuple[CommandName, ...] = ()
     """Commands accepted on `cmd/<name>`; none by default."""
 

@@ -53,7 +53,7 @@ class Broker:
         payload = json.dumps({"id": request_id}).encode()
         self._commands.put_nowait((f"{BASE}/{vehicle}/cmd/{name}", payload))
 
-    async def run(self) -> None:
+    async def listen(self) -> None:
         """Listen until cancelled."""
         while True:
             try:

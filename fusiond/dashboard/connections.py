@@ -18,7 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from fusiond.outputs.sockets import LINGER_NOT
 
 MOST_CONNECTIONS = 128
-"""Sixteen viewers, each a browser, which opens six to a host and two more for its WebSockets."""
+"""Most connections: sixteen browsers with six each, and two for their WebSockets."""
 REQUEST_S = 10.0
 """As the daemon's own servers wait (`fusiond.outputs.tcp`)."""
 STUCK_S = 20.0

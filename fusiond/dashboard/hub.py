@@ -61,7 +61,7 @@ class Hub:
         self._topics = topics()
         self._refused_last = ""
         self.send_command: Callable[[str, str, str], None] | None = None
-        """Puts a command (vehicle, name, id) on its way; None where none is possible."""
+        """Send a command (vehicle, name, id); None where commands are not possible."""
 
     def linked(self, state: LinkState, text: str = "") -> None:
         """The link has changed; the same state again keeps its beginning."""
@@ -70,7 +70,7 @@ class Hub:
 
     @property
     def refused(self) -> dict[str, Any]:
-        """Summary of rejected messages: how many of each kind, and why the last was."""
+        """Rejected messages: number of each kind, and the reason of the last."""
         kinds = {kind: n for kind in REFUSALS if (n := self.counters[kind])}
         return {"count": sum(kinds.values()), "kinds": kinds, "last": self._refused_last}
 

@@ -16,7 +16,7 @@ TOPICS = (
 )
 SECOND = 1_000_000_000
 AT_ONCE = 64
-"""Messages handed over before the browsers get their turn, where the log is played fast."""
+"""Messages in a row before the browsers get their turn, in a fast replay."""
 
 
 class Player:
@@ -38,7 +38,7 @@ class Player:
     def _elapsed_s(self) -> float:
         return (time.monotonic() - self._began) * self.speed
 
-    async def run(self, hub: Hub) -> None:
+    async def play(self, hub: Hub) -> None:
         """Play to the end, then stand there until cancelled."""
         first_ns: int | None = None
         hub.linked("up")

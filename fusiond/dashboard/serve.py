@@ -59,7 +59,7 @@ def serve_broker(access: Access, page_address: PageAddress, report: Callable[[st
     broker = Broker(access, hub)
     if page_address.token is not None:
         hub.send_command = broker.send_command
-    _run(hub, broker.run, page_address, report)
+    _run(hub, broker.listen, page_address, report)
 
 
 def serve_log(
@@ -72,7 +72,7 @@ def serve_log(
     hub = Hub(player.now_s, player.origin, speed)
 
     async def play() -> None:
-        await player.run(hub)
+        await player.play(hub)
 
     _run(hub, play, page_address, report)
 

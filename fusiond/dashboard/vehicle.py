@@ -105,7 +105,7 @@ class Vehicle:
         return {"messages": messages, "rows": {kind: rows for kind, rows in newer.items() if rows}}
 
     def limit_s(self, topic: str) -> float | None:
-        """Age from which what `topic` said is old, in s; None for what does not age."""
+        """Age (s) from which a message of `topic` is stale; None for one that never is."""
         least = LIMITS_S.get(topic)
         if least is None:
             return None
@@ -141,7 +141,7 @@ class Vehicle:
         self._rows[kind].add(self.count, row)
 
     def _earlier_events(self, events: object, kept: bool) -> None:
-        """The events before anybody listened here, which the broker had kept."""
+        """Earlier events, which the broker has retained."""
         if kept and isinstance(events, list) and not self._rows["event"]:
             for one in events:
                 if isinstance(one, Mapping):
@@ -190,7 +190,7 @@ class Vehicle:
                 self._innovation(one, t_ms, at_s - (now_ms - t_ms) / 1000.0)
 
     def _innovation(self, said: Said, key: float | None, at_s: float) -> None:
-        """A rewind applies an aid again: the last one counts, in its old place. `key` is the
+        """A rewind applies a measurement again: the last one counts, in its old place. `key` is the
         instant of its validity."""
         source, outcome = said.get("source"), said.get("outcome")
         if not (isinstance(source, str) and isinstance(outcome, str) and key is not None):

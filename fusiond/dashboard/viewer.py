@@ -43,7 +43,7 @@ class Viewer:
         self._count = 0
         self._replies: list[dict[str, Any]] = []
 
-    async def run(self) -> None:
+    async def serve(self) -> None:
         """Send and receive; returns when the browser has left or has been given up."""
         tasks = [asyncio.create_task(self._send()), asyncio.create_task(self._receive())]
         try:

@@ -35,7 +35,7 @@ HEADERS = (
     (b"x-content-type-options", b"nosniff"),
     (b"cache-control", b"no-cache"),
 )
-"""Of every answer."""
+"""Headers of every response."""
 
 
 def application(
@@ -53,7 +53,7 @@ def application(
         return Response(status_code=204) if base_map is None else FileResponse(base_map)
 
     async def watch(socket: WebSocket) -> None:
-        if not of_our_page(socket.headers):
+        if not is_same_origin(socket.headers):
             await socket.close(1008, "of another site")
             return
         if len(viewers) >= MOST_VIEWERS:
@@ -63,7 +63,7 @@ def application(
         viewer = Viewer(hub, socket, token)
         viewers.add(viewer)
         try:
-            await viewer.run()
+            await viewer.serve()
         finally:
             viewers.discard(viewer)
 
@@ -78,7 +78,7 @@ def application(
     )
 
 
-def of_our_page(headers: Mapping[str, str]) -> bool:
+def is_same_origin(headers: Mapping[str, str]) -> bool:
     """True if no browser asks, or one that shows our own page."""
     origin = headers.get("origin")
     return origin is None or urlsplit(origin).netloc == headers.get("host")

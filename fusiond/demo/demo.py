@@ -29,14 +29,15 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
+from fusiond.demo.outage_report import outage_report
 from fusiond.demo.page import DemoPage
-from fusiond.demo.papers import paper_play, town
-from fusiond.demo.play import Play, Pulled
-from fusiond.demo.story import story
+from fusiond.demo.papers import paper_setup, town
+from fusiond.demo.setup import DemoSetup, Unplugged
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -69,8 +70,8 @@ def demo(
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
     full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
     are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
-    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if
-    something is not installed.
+    and `rejected` count measurements (IMU samples stand in `fused_by_source`). Raises `DemoError`
+    if something is not installed.
     """
     with (
         DemoBroker() as broker,
@@ -78,14 +79,14 @@ def demo(
         DemoPage(broker.port) if dashboard else contextlib.nullcontext() as page,
         _log_kept_out(headless),
     ):
-        play = demo_play() if paper is None else paper_play(paper)
+        play = demo_setup() if paper is None else paper_setup(paper)
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
         live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
-        return asyncio.run(_Run(play, live, view, Path(folder), record).run())
+        return asyncio.run(_Run(play, live, view, Path(folder), record).drive())
 
 
-def demo_play() -> Play:
+def demo_setup() -> DemoSetup:
     """The shipped car in town streets, its receiver unplugged for a while of every minute."""
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
     config = load_config(CONFIG).model_copy(
@@ -93,20 +94,20 @@ def demo_play() -> Play:
     )
     scenario = replace(SCENARIOS["drive"].fitted(config), path=town)
     rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S, convoy=True)
-    pulled = Pulled("gnss", OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S)
-    return Play(config, replace(scenario, rdss=rdss), ("imu", "gnss", "rdss"), pulled)
+    pulled = Unplugged("gnss", OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S)
+    return DemoSetup(config, replace(scenario, rdss=rdss), ("imu", "gnss", "rdss"), pulled)
 
 
 class View(Protocol):
     """Shows what has come out of the broker."""
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Show until cancelled."""
 
 
 class _Run:
     def __init__(
-        self, play: Play, live: Live, view: View, folder: Path, record: Path | None
+        self, play: DemoSetup, live: Live, view: View, folder: Path, record: Path | None
     ) -> None:
         self._play = play
         self._duration_s = duration_s = live.duration_s
@@ -119,10 +120,13 @@ class _Run:
         self._score = Score()
         self._without_gnss: list[tuple[float, float]] = []
         self._daemon = Daemon(config, on_solution=self._on_solution)
+        publisher = self._daemon.outputs["mqtt"]
+        assert isinstance(publisher, MqttPublisher), "the demo's configuration has a broker"
+        publisher.begin_with_3_1_1()  # amqtt says nothing to 5: a second in which `nav` is lost
         self._live = live
         self._view = view
 
-    async def run(self) -> dict[str, Any]:
+    async def drive(self) -> dict[str, Any]:
         """Drive until the end, Ctrl-C or SIGTERM; then the summary."""
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -134,7 +138,7 @@ class _Run:
             asyncio.create_task(self._vehicle.run(), name="vehicle"),
             asyncio.create_task(self._subscribe(), name="subscriber"),
             asyncio.create_task(self._outages(), name="outages"),
-            asyncio.create_task(self._view.run(self._live), name="view"),
+            asyncio.create_task(self._view.show(self._live), name="view"),
         ]
         ended = asyncio.create_task(stop.wait())
         try:
@@ -153,11 +157,11 @@ class _Run:
             await asyncio.gather(*others, ended, return_exceptions=True)
             await asyncio.wait([daemon])
         daemon.result()
-        self._print_story()
+        self._print_outages()
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
-        self._score.add(solution, self._daemon.navigator.serving.covariance)
+        self._score.add(solution, self._daemon.navigator.active_filter.covariance)
 
     async def _subscribe(self) -> None:
         """Listen as a dashboard does."""
@@ -230,12 +234,12 @@ class _Run:
             "rejected_by_source": {name: source.rejected for name, source in health.items()},
         }
 
-    def _print_story(self) -> None:
+    def _print_outages(self) -> None:
         """Report an event on standard error: the last line of the output is the summary."""
         t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
         start_s = self._vehicle.start_ns * 1e-9
         outages = [(begin - start_s, end - start_s) for begin, end in self._without_gnss]
-        for sentence in story(t_s, error_m, sigma_m, outages):
+        for sentence in outage_report(t_s, error_m, sigma_m, outages):
             print(sentence, file=sys.stderr)
 
 
@@ -247,7 +251,7 @@ class Score:
         self._rows: list[tuple[float, ...]] = []
 
     def add(self, s: Solution, covariance: Array) -> None:
-        """A solution, and P (n, n) with position n, e at 6 and 7."""
+        """Add a solution with P (n, n), whose position north, east is at 6 and 7."""
         if s.mode not in (Mode.NAVIGATING, Mode.COASTING) or s.t_ns // _SCORE_NS == self._last:
             return
         self._last = s.t_ns // _SCORE_NS
@@ -299,13 +303,13 @@ def ned_error(position: Array, truth: Array) -> Array:
 
 
 def wrapped(angle: Array) -> Array:
-    """Into [-pi, pi)."""
+    """Angles wrapped into [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @contextlib.contextmanager
 def _log_kept_out(headless: bool) -> Iterator[None]:
-    """Events are in the view; only errors go to the terminal, and none while it shows the view."""
+    """Keep the log off the terminal, which shows events itself; errors only if headless."""
     log = logging.getLogger("fusiond")
     handler = logging.StreamHandler(sys.stderr) if headless else logging.NullHandler()
     handler.setLevel(logging.ERROR)

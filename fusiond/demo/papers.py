@@ -16,7 +16,7 @@ from typing import Any
 
 from drivers.shipped import shipped
 from fusiond.configuration.schema import Config
-from fusiond.demo.play import Play, Pulled
+from fusiond.demo.setup import DemoSetup, Unplugged
 from fusiond.simulation.gnss.raw_stream import RawFormat
 from fusiond.simulation.scenarios import SCENARIOS, Scenario
 from fusiond.simulation.trajectories import Leg, Path, flight, follow, level_flight
@@ -62,7 +62,7 @@ class Paper:
     devices: tuple[Device, ...]
     scenario: Callable[[], Scenario]
     start: dict[str, Any]
-    pulled: Pulled | None = None
+    pulled: Unplugged | None = None
     raw: RawFormat | None = None
 
 
@@ -138,7 +138,7 @@ PAPERS: dict[str, Paper] = {
             rdss=replace(SCENARIOS["drive"].rdss, service_frequency_s=1),
         ),
         {"aiding": {"gnss": _with_white_receiver()}},
-        pulled=Pulled("imu", 0.0, IMU_COMES_S),
+        pulled=Unplugged("imu", 0.0, IMU_COMES_S),
     ),
 }
 
@@ -167,7 +167,7 @@ def settings(number: str) -> dict[str, Any]:
     return merged(base, paper.lines)
 
 
-def paper_play(number: str) -> Play:
+def paper_setup(number: str) -> DemoSetup:
     """The demo of a paper, of `PAPERS`."""
     paper = PAPERS[number]
     found = merged(settings(number), {**paper.start, "vehicle": "demo"})
@@ -175,6 +175,6 @@ def paper_play(number: str) -> Play:
     scenario = paper.scenario().fitted(config)
     estimator = config.estimator
     about = {"paper": number, "filter": estimator.filter, "model": estimator.model}
-    return Play(
+    return DemoSetup(
         config, scenario, paper.devices, paper.pulled, paper.raw, f"{paper.title}: aligning", about
     )

@@ -19,7 +19,7 @@ from rich.text import Text
 REFRESH_S = 0.25
 LINE_EVERY_S = 5.0
 WIDE = 112
-"""Columns from which the two tables stand side by side."""
+"""Least width of a terminal, in columns, for two tables side by side."""
 RATE_WINDOW_S = 5.0
 _EVENTS = 40
 _LEAST_EVENTS = 3
@@ -69,7 +69,7 @@ class Live:
         self.errors: list[float] = []
         """True errors: m north, east, down; m/s; degrees roll, pitch, yaw."""
         self.outage: tuple[str, float] | None = None
-        """The device whose plug is pulled, and until when (monotonic, s)."""
+        """Unplugged device and the instant (monotonic, s) of its return."""
         self.aligning = ""
         """Display while there is no solution yet."""
         self.received = 0
@@ -122,7 +122,7 @@ class HeadlessView:
     def __init__(self, out: TextIO) -> None:
         self._out = out
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Write until cancelled."""
         if live.page is not None:
             print(f"dashboard: {live.page}", file=self._out, flush=True)
@@ -135,7 +135,7 @@ class HeadlessView:
 class LiveView:
     """The terminal, redrawn four times a second by a thread: drawing must not hold up a tick."""
 
-    async def run(self, live: Live) -> None:
+    async def show(self, live: Live) -> None:
         """Draw until cancelled."""
         console = Console()
         before = sys.getswitchinterval()

@@ -37,7 +37,7 @@ BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_80
 LISTEN_S = 2.2
 """At each baud rate: receivers speak once a second, so two epochs and the end of a third."""
 SOUND_ITEMS = 3
-"""Checksums that are right: one of eight bits is so by chance once in 256 lines of nonsense."""
+"""Correct checksums that identify a protocol: one in 256 random lines has a correct one."""
 TERMINAL_S = 25.0
 """Two families at three baud rates, 3 s each, and a reply."""
 EPOCH_S = 1.2
@@ -133,10 +133,10 @@ def _kind(item: Sentence | Frame) -> str:
     return "raw" if number in _MSM else "rtcm"
 
 
-async def on_port(
+async def device_on_port(
     port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S
 ) -> Device | SilentPort:
-    """The device on a serial port, or that nobody says anything there that is understood.
+    """Device on a serial port, or a note that none is recognised.
 
     `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
     """
@@ -205,7 +205,9 @@ async def _terminal(port: str) -> Device | None:
     return Device("rdss", {"port": port}, f"{port}: an RDSS terminal answers")
 
 
-async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) -> list[Device]:
+async def device_on_bus(
+    interface: Interface, channel: str, listen_s: float = BUS_S
+) -> list[Device]:
     """The devices on a CAN bus whose DBC file is shipped: IMU and receiver that fit best."""
     decoders: list[tuple[int, CanDecoder[Any]]] = []
     for number, known in enumerate(KNOWN_DEVICES):
@@ -238,8 +240,9 @@ async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) ->
 
 
 def down_axis(forces: list[tuple[float, ...]]) -> str | None:
-    """The sensor axis that points down, by specific forces (n, 3) in m/s^2 at rest; None where none
-    of them is gravity's alone: the unit moves, or stands more than `MOST_TILT_DEG` askew."""
+    """Sensor axis that points down, by specific forces (n, 3) in m/s^2 at rest.
+
+    None if no axis has gravity alone: the unit moves, or is tilted by more than `MOST_TILT_DEG`."""
     if not forces:
         return None
     mean, sd = np.mean(forces, axis=0), np.std(forces, axis=0)
@@ -270,7 +273,7 @@ def _on_bus(
 
 
 def round_rate(rate_hz: float) -> float:
-    """The rate that devices offer nearest to one that was counted."""
+    """Usual rate of devices that is nearest to a counted one."""
     nearest = min(RATES_HZ, key=lambda r: abs(r - rate_hz))
     return float(nearest if abs(nearest - rate_hz) <= RATE_TOLERANCE * nearest else round(rate_hz))
 

@@ -31,7 +31,7 @@ SAME_FORCE_M_S2 = 0.3
 LEAST_SPEED_M_S = 4.0
 """A slope that changes by 3 deg while it speeds up adds 1.5 m/s in 3 s: 21 deg of direction."""
 MOST_S = 8.0
-"""From standstill to that speed; a slower start leaves more to slopes than to the engine."""
+"""Longest time from standstill to that speed; in a slower start slopes outweigh the engine."""
 MOST_TURN_RAD = np.radians(15.0)
 MOST_ASIDE_RAD = np.radians(30.0)
 """From the nearest axis: beyond it the unit is not mounted parallel to the vehicle."""
@@ -114,7 +114,7 @@ class ForwardAxis:
 
 
 def axes_of(forward: str, down: str) -> tuple[str, str, str]:
-    """Sensor axes along forward, right and down, from two of them: right = down x forward."""
+    """Sensor axes along forward, right and down; right = down x forward."""
     right = np.cross(_unit(down), _unit(forward))
     k = int(np.argmax(np.abs(right)))
     return forward, ("+" if right[k] > 0.0 else "-") + "xyz"[k], down

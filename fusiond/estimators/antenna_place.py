@@ -40,9 +40,10 @@ Indices = NDArray[np.int64]
 
 
 def antenna_slots(model: Model) -> tuple[Indices, Indices]:
-    """Slots of what is left of the one lever arm that a model estimates (3,), and of the offset in
-    time of the same receiver's fixes (0 or 1,); none where it has no such lever, or several: what
-    is known of one place is then known by two ways."""
+    """Slots of a lever arm's remainder (3,) and of its fixes' time offset (0 or 1,).
+
+    None where the model estimates no lever arm, or several: what is known of one place is then
+    known by two ways."""
     levers = [block.name for block in model.blocks if block.name.startswith(ANTENNA_LEVER)]
     if len(levers) != 1:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)

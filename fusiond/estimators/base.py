@@ -6,7 +6,8 @@ error: one covariance and one error estimate for each filter that the estimator 
 (`feed_back`); parameters keep their estimates in `xi`.
 
 Gate: with S = H P H^T + R, nu^T S^-1 nu is chi-square with m degrees of freedom while filter and
-measurement agree; beyond the quantile of the aid's gate probability the measurement is left out.
+measurement agree; beyond the quantile of the measurement's gate probability the measurement is left
+out.
 
 Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
 """
@@ -73,7 +74,7 @@ def gate_threshold(probability: float, degrees: int) -> float:
 
 class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
-    L^-1 nu with S = L L^T). `rows`: of a screened aid, what became of each row
+    L^-1 nu with S = L L^T). `rows`: of a screened measurement, what became of each row
     (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
     that is out, the NIS if each of the faults for which it may be out lasts."""
 
@@ -110,7 +111,7 @@ class Estimator(Protocol):
     xi: Array
     step: Array
     passing: bool
-    """True if it was brought where it is in passing: before an aid is folded in it has to be
+    """True if it was brought where it is in passing: before a measurement is folded in it has to be
     propagated there otherwise."""
     published: Published
     """Axes and clock of publication: at first the clock of the model's receiver."""
@@ -139,7 +140,7 @@ class Estimator(Protocol):
 
     @property
     def runs(self) -> MeasurementRun | None:
-        """Aids in one call; None while it takes them one by one."""
+        """Measurements in one call; None while it takes them one by one."""
 
     @property
     def isolated(self) -> dict[str, str]:
@@ -158,13 +159,13 @@ class Estimator(Protocol):
         `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
         be had nobody asked."""
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not; the variances of its rows, up to three, count `noise`
-        times (3,)."""
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not; the variances of its rows, up to three, count
+        `noise` times (3,)."""
 
-    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
-        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
+    def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
+        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing is
+        folded in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -246,7 +247,7 @@ class ErrorStateFilter:
 
     @property
     def runs(self) -> MeasurementRun | None:
-        """Aids in one call; None while it takes them one by one."""
+        """Measurements in one call; None while it takes them one by one."""
         return None
 
     @property
@@ -338,23 +339,23 @@ class ErrorStateFilter:
             self.hypotheses.keep_fed_back(dx)
         feed_back(self.nav, self.xi, dx)
 
-    def _screen(self, aid: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
-        """Update by rows of a screened aid, without touching `cov` and `dx`; where its clock starts
-        anew, in `cov` too."""
-        return screened(aid, rows, self.model, gate_threshold(aid.gate, 1), cov, dx)
+    def _screen(self, measurement: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
+        """Update by rows of a screened measurement, without touching `cov` and `dx`; where its
+        clock starts anew, in `cov` too."""
+        return screened(measurement, rows, self.model, gate_threshold(measurement.gate, 1), cov, dx)
 
-    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
-        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
-        rows = self._linearise(aid)
+    def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
+        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing is
+        folded in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
+        rows = self._linearise(measurement)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
         z, h, r = rows
         cov, dx = self.covariance.copy(), self._dxs[0]
         if self.hypotheses is not None:
             cov += self.hypotheses.opened_of_all()
-        if aid.screened:
-            s = self._screen(aid, rows, cov, dx)
+        if measurement.screened:
+            s = self._screen(measurement, rows, cov, dx)
             codes = tuple(s.codes.tolist())
             return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
         y = np.zeros(z.shape[0])
@@ -375,23 +376,23 @@ class ErrorStateFilter:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _renew(self, renewal: Renewal) -> None:
-        """Errors that measurements share become what they are from an aid's instant on."""
+        """Errors that measurements share become what they are from a measurement's instant on."""
         others = [self.xi, *self._dxs]
         if self.hypotheses is not None:
             self.hypotheses.conclude()
             others.append(self.hypotheses.sensitivities)
         renew(renewal, self.model, self._covs, others)
 
-    def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
-        """The aid's innovation, linear in the error state."""
-        rows = aid.innovation(self._view)
-        return self._weighed(aid, rows) if aid.robust else rows
+    def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
+        """The measurement's innovation, linear in the error state."""
+        rows = measurement.innovation(self._view)
+        return self._weighed(measurement, rows) if measurement.robust else rows
 
     def _weighed(
-        self, aid: Linearised, rows: Innovation | NotApplicable
+        self, measurement: Linearised, rows: Innovation | NotApplicable
     ) -> Innovation | NotApplicable:
-        """The rows as a robust aid wants them; others as they are."""
-        if not aid.robust or isinstance(rows, NotApplicable):
+        """The rows as a robust measurement wants them; others as they are."""
+        if not measurement.robust or isinstance(rows, NotApplicable):
             return rows
         return reweighted(rows, self.model, self.covariance, self._dxs[0])
 

@@ -14,9 +14,10 @@ stops the largest difference of a sigma is 1e-4 of it or less
 
 Covariances are brought to an instant where the time, in whole multiples of `GRID_NS`, goes past one
 of them: at the first sample that ends there, whatever the calls are that it takes to get there;
-where an aid is to be folded in; and around samples that are no part of a mean: a gap, an interval
-at rest, each one where errors or a transition are carried along. Between two of them somebody may
-ask what P is now: covariances are then ahead of the sums, and how they were is kept (`HELD`).
+where a measurement is to be folded in; and around samples that are no part of a mean: a gap, an
+interval at rest, each one where errors or a transition are carried along. Between two of them
+somebody may ask what P is now: covariances are then ahead of the sums, and how they were is kept
+(`HELD`).
 """
 
 from __future__ import annotations

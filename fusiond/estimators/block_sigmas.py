@@ -77,7 +77,7 @@ def first_order(
     `sensor_terms` as of the model."""
     s, n = sums[SPAN], noise.shape[0] // 3
     mean, shaken = sums[STEPS:DENSITIES], sums[DENSITIES:]
-    begun, taken = between[:ENTRIES], between[3 * ENTRIES :]
+    first, taken = between[:ENTRIES], between[3 * ENTRIES :]
     weight, cross = taken[_TAKEN : _TAKEN + 12], taken[_TAKEN + 12 : _TAKEN + 30]
     weights(mean, sensor_terms, weight)
     for k in range(6):
@@ -110,12 +110,12 @@ def first_order(
         cross[a] = weight[a] * taken[_CLOCK + a]
     for i in range(3):
         u, w = s * mean[(i + 1) % 3], s * mean[(i + 2) % 3]
-        gained, turned = u * begun[18 + (i + 2) % 3] - w * begun[18 + (i + 1) % 3], 0.0
+        gained, turned = u * first[18 + (i + 2) % 3] - w * first[18 + (i + 1) % 3], 0.0
         for k in range(3):
             c = s * mean[STEP_DCM + 3 * i + k]
             turned += c * (cross[2 * k] + cross[2 * k + 1])
             gained += c * (cross[6 + 2 * k] + cross[7 + 2 * k])
-        out[12 + i], out[15 + i], out[18 + i] = s * begun[15 + i], gained, -turned
+        out[12 + i], out[15 + i], out[18 + i] = s * first[15 + i], gained, -turned
     out[21] = q * s * noise[n + time_slot]
 
 
@@ -124,12 +124,12 @@ def fill(
     between: Array, count: int, h: float, axes_sd_rad: float, wider: Array, sigma_out: Array, i: int
 ) -> None:
     """Write sigmas (9,) of the `count` samples before row i of `sigma_out` (9 m,), h = H."""
-    begun, now, whole = between[:ENTRIES], between[ENTRIES:], between[2 * ENTRIES :]
+    first, now, whole = between[:ENTRIES], between[ENTRIES:], between[2 * ENTRIES :]
     for row in range(count):
         kept = between[WAITING + ROW * row : WAITING + ROW * (row + 1)]
         share = (kept[ROW - 1] / h) ** 2
         for j in range(ENTRIES):
-            kept[j] += begun[j] + share * (now[j] - begun[j] - whole[j])
+            kept[j] += first[j] + share * (now[j] - first[j] - whole[j])
         at = 9 * (i - count + row)
         out = sigma_out[at : at + 9]
         sigmas_of(kept, kept[ENTRIES:], axes_sd_rad, out)

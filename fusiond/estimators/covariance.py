@@ -60,9 +60,10 @@ def weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
 
 @compiled("void(f8, f8[::1], i8, f8[::1])", forceinline=True)
 def decays(h: float, noise: Array, width: int, kept: Array) -> None:
-    """Write what each parameter decays by in h seconds, 1 where it does not, to `kept` from its
-    `KEPT` on, and `width` behind it the variance that each state grows by; `noise` (3 n,) as of the
-    model.
+    """Write decay factors and variances of growth of h seconds to `kept`.
+
+    From `KEPT` on the factor of each parameter, 1 where it does not decay; `width` behind it the
+    variance that each state grows by. `noise` (3 n,) as of the model.
 
     They are kept from one interval to the next, which is most often as long: an exponential a
     state, and one more for its estimate, cost a tenth of an interval.

@@ -58,8 +58,9 @@ LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(co
 BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
 PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
 PROMOTED = 3.0
-"""Log odds by which an onset must be likelier than one of the level above to take its place when
-its own turn to begin anew has come: twenty to one."""
+"""Log odds, twenty to one, by which an onset replaces one of the level above.
+
+Asked when its own turn to restart has come."""
 
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
@@ -67,8 +68,8 @@ attitude, about body axes, and of the mounting; of all that moves, as if it were
 from the start on; of what a source's faults, as they are weighed, have done to the filter."""
 POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(4, 12)
 """Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
-positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
-rows."""
+positions that grow as velocities say; a delay; a share of the speed; an offset of each of a
+measurement's rows."""
 PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
 """Kinds of a measurement's rows: a position, a velocity, a speed, something of its own, nothing
 that can be at fault."""
@@ -91,9 +92,9 @@ LOG_PRIOR = 7
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
-# aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
-# one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the row
-# width of the transition, by how much the unit has been found to have turned on the vehicle in
+# measurement lies, 1 if it is not the identity, the probability of any fault as it was judged last,
+# 1 if one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the
+# row width of the transition, by how much the unit has been found to have turned on the vehicle in
 # pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, and what has been
 # fed back of the velocity in all (m/s).
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
@@ -106,7 +107,7 @@ LANES = 8
 # of their numbers: J, N, onset (s), log odds, weight, what is left unexplained beyond chance, since
 # which epoch (s) it has been likely and explained all, or never, what it explains, l, and log of
 # what its rate counts by, then L and e: of one number eleven rows, of three nineteen. Of V and of
-# an aid's rows the columns of a component of eight lie so, too.
+# a measurement's rows the columns of a component of eight lie so, too.
 J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY = (LANES * row for row in range(7))
 EXPLAINED, COUNTS_BY, L_AT, E_AT, OF_ONE = (LANES * row for row in range(7, 12))
 L10, L11, L20, L21, L22, E1, E2, OF_THREE = (LANES * row for row in range(11, 19))
@@ -189,7 +190,8 @@ def bank_size(table: FaultTable, n: int, width: int) -> int:
 
 
 def columns_of(table: FaultTable) -> int:
-    """Columns of V, and of an aid's rows: whole steps of vector code, the last ones of nothing."""
+    """Columns of V, and of a measurement's rows: whole steps of vector code, the last ones of
+    nothing."""
     tiles, ones = -(-table.threes // LANES), -(-(table.groups - table.threes) // LANES)
     return -(-(3 * tiles + ones) // 4) * 4 * LANES
 
@@ -218,7 +220,7 @@ def group_at(bank: Array, number: int) -> int:
 
 @compiled("i8(f8[::1], i8, i8)", forceinline=True)
 def column_of(bank: Array, number: int, component: int) -> int:
-    """Column of a group's component, of V and of an aid's rows."""
+    """Column of a group's component, of V and of a measurement's rows."""
     threes = int(bank[THREES])
     column: int = (3 * (number // LANES) + component) * LANES + number % LANES
     if number >= threes:

@@ -1,9 +1,9 @@
-"""Compiled kernel: the sensitivities of a bank of hypotheses, carried on between two aids.
+"""Compiled kernel: the sensitivities of a bank of hypotheses, carried on between two measurements.
 
-What lies between two aids is one transition, which is carried from crossing to crossing as the
-covariance is (fusiond.estimators.block_covariance), and V is multiplied by it where an aid is to be
-folded in. Most rows of it are those of the identity: of navigation errors nine, of others those
-that decay, grow with a rate, or are turned at rest.
+What lies between two measurements is one transition, which is carried from crossing to crossing as
+the covariance is (fusiond.estimators.block_covariance), and V is multiplied by it where a
+measurement is to be folded in. Most rows of it are those of the identity: of navigation errors
+nine, of others those that decay, grow with a rate, or are turned at rest.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def carry_for(width: int) -> Callable[..., None]:
 
 @compiled("void(f8[::1], i8, i8)")
 def begin_transition(bank: Array, n: int, width: int) -> None:
-    """Nothing lies between the last aid and now."""
+    """Nothing lies between the last measurement and now."""
     phi = bank[int(bank[PHI]) :]
     for i in range(width):
         for j in range(width):
@@ -78,7 +78,7 @@ def begin_transition(bank: Array, n: int, width: int) -> None:
 
 @compiled("void(f8[::1], i8)", allocates=True)
 def settle(bank: Array, n: int) -> None:
-    """V <- Phi V of all that has been carried since the last aid."""
+    """V <- Phi V of all that has been carried since the last measurement."""
     if bank[WAITS] == 0.0:
         return
     width = int(bank[WIDTH])

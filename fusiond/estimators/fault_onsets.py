@@ -159,8 +159,9 @@ def begin_all(
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
 def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
-    """A restart that is about to begin anew takes the place of the less likely one of the level
-    above, if that is much less likely."""
+    """Replace the less likely onset of the level above, if that is much less likely.
+
+    By the one whose turn to restart has come."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return

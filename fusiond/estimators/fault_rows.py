@@ -1,4 +1,5 @@
-"""Compiled kernels: what the hypotheses of a bank say of an aid's rows, and what these say of them.
+"""Compiled kernels: what the hypotheses of a bank say of a measurement's rows, and what these say
+of them.
 
 As fusiond.estimators.fault_bank says, with the path by dead reckoning that a delay needs.
 """
@@ -220,7 +221,7 @@ def _sign(
     columns: int,
     work: Single,
 ) -> None:
-    """Add D of the m rows of an aid that a kind concerns."""
+    """Add D of the m rows of a measurement that a kind concerns."""
     of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
     back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
     for a in range(m if size == 1 else min(m, size)):
@@ -301,8 +302,9 @@ def sensitivity_rows(
     g: Array,
     work: Single,
 ) -> int:
-    """Write L^-1 (H V + D) of an aid's rows at `t_ns` to `work`, a row of columns each; how many
-    columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav (10,)."""
+    """Write L^-1 (H V + D) of a measurement's rows at `t_ns` to `work`, a row of columns each; how
+    many columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav
+    (10,)."""
     m, kinds = h.shape[0], ints.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns: int = v.shape[0] // n

@@ -35,10 +35,11 @@ Indices = NDArray[np.int64]
 def nis_if_sensors_fail(
     bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Single
 ) -> float:
-    """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
-    and those of sources that are over leave open, as they are weighed; `work` as
-    `sensitivity_rows` leaves it. Infinite unless they are likelier than all else
-    together."""
+    """Normalised innovation squared, sensor faults granted.
+
+    nu^T S^-1 nu of a whitened innovation y (m,), with S widened by what faults of the inertial unit
+    (class 0) and those of sources that are over leave open, as they are weighed. Infinite unless
+    they are likelier than all else together. `work` as `sensitivity_rows` leaves it."""
     rows = y.shape[0]
     c, m, likely = np.eye(rows), np.empty(12), 0.0
     for number in range(int(bank[ALL])):

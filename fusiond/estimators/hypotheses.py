@@ -96,26 +96,26 @@ class Hypotheses:
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].view(np.float32).reshape(self.n, -1)
-        """V (n, columns)."""
+        """Sensitivities V (n, columns)."""
         first = int(bank[PHI])
         self.transition = bank[first : first + self.width**2].reshape(self.width, -1)
         """Matrix (w, w) that V waits to be multiplied by; one where it waits for nothing."""
         self._nine = np.zeros((9, 9))
         self.of_source: dict[str, tuple[int, int]] = {}
 
-    def of(self, aid: Linearised) -> tuple[int, int]:
+    def of(self, measurement: Linearised) -> tuple[int, int]:
         """Kinds of a measurement's rows, as of fusiond.estimators.fault_bank, and the number of its
         device; -1 where no kind is of it."""
-        known = self.of_source.get(aid.source)
+        known = self.of_source.get(measurement.source)
         if known is None:
             devices = self.table.devices
-            device = devices.index(aid.device) if aid.device in devices else -1
-            known = self.of_source[aid.source] = _measures(aid, device >= 0), device
+            device = devices.index(measurement.device) if measurement.device in devices else -1
+            known = self.of_source[measurement.source] = _measures(measurement, device >= 0), device
         return known
 
     @property
     def waits(self) -> bool:
-        """True if V is still that of the last aid, as it is after a look in passing."""
+        """True if V is still that of the last measurement, as it is after a look in passing."""
         return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
@@ -127,20 +127,22 @@ class Hypotheses:
             self.bank[TURNED_BY + k] = turned
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
-    def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
-        """An aid's series returns to service: what was shown of it before is why it was out, and
-        its hypotheses begin anew."""
-        begin_again(self.bank, self.table.ints, self.n, *self.of(aid), aid.t_ns, nav, step)
+    def begin_again(self, measurement: Linearised, nav: Array, step: Array) -> None:
+        """A measurement's series returns to service: what was shown of it before is why it was out,
+        and its hypotheses begin anew."""
+        begin_again(
+            self.bank, self.table.ints, self.n, *self.of(measurement), measurement.t_ns, nav, step
+        )
 
     def keep_fed_back(self, dx: Array) -> None:
         """An error (n,) is taken out of the filter's state: out of the path behind it as well."""
         keep_fed_back(self.bank, dx)
 
-    def adds(self, aid: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
-        """D b (3,): what a fault of size `b`, of such an age, does to an aid's rows."""
+    def adds(self, measurement: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
+        """D b (3,): what a fault of size `b`, of such an age, does to a measurement's rows."""
         out, table = np.empty(3), self.table
-        of = kind, *self.of(aid)
-        rows_of_fault(self.bank, *table[:2], *of, aid.t_ns * 1e-9, age_s, nav, b, out)
+        of = kind, *self.of(measurement)
+        rows_of_fault(self.bank, *table[:2], *of, measurement.t_ns * 1e-9, age_s, nav, b, out)
         return out
 
     def judge(self, t_ns: int) -> Array:
@@ -150,9 +152,10 @@ class Hypotheses:
         return self.found
 
     def take(self, t_ns: int, measured: bool, used: bool, fused: bool) -> Array | None:
-        """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
-        unless one is identified, what the weighed hypotheses leave open of what is published goes
-        to `wider`. None where all that can wait, of rows that were `fused`, until `conclude`."""
+        """After rows of a measurement: what is `found` of all if they were `measured` and `used`,
+        and, unless one is identified, what the weighed hypotheses leave open of what is published
+        goes to `wider`. None where all that can wait, of rows that were `fused`, until
+        `conclude`."""
         if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
             self.bank[UNJUDGED] = t_ns * 1e-9
             return None
@@ -242,13 +245,13 @@ class Hypotheses:
         return self.each(WEIGHT)
 
 
-def _measures(aid: Linearised, known: bool) -> int:
-    if aid.constraint and not (aid.no_slip or known):
+def _measures(measurement: Linearised, known: bool) -> int:
+    if measurement.constraint and not (measurement.no_slip or known):
         return NOTHING
-    if aid.screened:  # its rows are ranges
+    if measurement.screened:  # its rows are ranges
         return OTHER
-    if aid.locates:
+    if measurement.locates:
         return PLACES
-    if aid.moves:
+    if measurement.moves:
         return MOVES
-    return ROLLS if aid.rolls else OTHER
+    return ROLLS if measurement.rolls else OTHER

@@ -29,8 +29,8 @@ may double, and grows sure of heading and pitch for it. To first order, at the s
 
 with E (v_t - eta_v) in place of E v_t, and E eta_v, where v_t is the speed. What does not turn
 keeps the axes of the estimate: R in R eta is that of xi_i, and no slope of psi. Between updates P
-is that of dx, so kernels and aids are those of every filter. An update runs in xi about the state
-before it and is linearised about the one that it leads to (Gauss-Newton): with
+is that of dx, so kernels and measurements are those of every filter. An update runs in xi about the
+state before it and is linearised about the one that it leads to (Gauss-Newton): with
 P_xi = J_0^-1 P J_0^-T
 
     nu_i = z(x_i) + H_i J_i xi_i,   xi_(i+1) = K_i nu_i,   P = J_i P_xi J_i^T  after it
@@ -95,7 +95,7 @@ ITERATIONS, CONVERGED = 8, 0.1
 WIDE_SD_RAD = math.radians(30.0)
 # Where else it is begun then, if the heading's variance falls by more than a hundredth.
 BEGINNINGS_RAD = (0.5 * math.pi, -0.5 * math.pi, math.pi)
-TOLD = 0.99
+PROBABILITY = 0.99
 # What was felt is motion beyond so many sigmas of what does not turn.
 SENSED_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
@@ -117,7 +117,7 @@ class Turning(NamedTuple):
 
 class Sought(NamedTuple):
     """Result of an update: the error xi (n,), P_xi (n, n) after it, and how the innovation stands
-    to its gate; of a screened aid what became of each row."""
+    to its gate; of a screened measurement what became of each row."""
 
     error: Array
     covariance: Array
@@ -220,8 +220,8 @@ class InvariantFilter(TiltAxesFilter):
         about_down(-psi, back)
         rotation_vector(back @ turn, tilt)
         error[PHI : PHI + 2], error[PHI + 2] = tilt[:2], psi
-        apart = self.nav[VN : VN + 3] - nav[VN : VN + 3], _way(nav, self.nav)
-        for first, d, part in zip((DV, DR), apart, turning[:2], strict=True):
+        differences = self.nav[VN : VN + 3] - nav[VN : VN + 3], _way(nav, self.nav)
+        for first, d, part in zip((DV, DR), differences, turning[:2], strict=True):
             axes = turn.T if turning.speeds and first == DV else back
             error[first : first + 3] = axes @ (d - part + turn @ part)
         error[~self.model.active] = 0.0
@@ -237,28 +237,28 @@ class InvariantFilter(TiltAxesFilter):
         super().adopt(mean, spread)
         self.turns |= self._settles and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
         if self._settles and not self.turns:
             variance = self.covariance[PHI + 2, PHI + 2]
             self.turns = self._known and bool(variance > LARGE_SD_RAD**2)
             self._known |= bool(variance < PLAIN_SD_RAD**2)
-        return super().update(aid, noise)
+        return super().update(measurement, noise)
 
-    def _turn_in(self, aid: Linearised) -> Outcome:
-        """Fold one aid in, or name why not, by an update in xi."""
+    def _turn_in(self, measurement: Linearised) -> Outcome:
+        """Fold one measurement in, or name why not, by an update in xi."""
         self.turned = 0.0
-        outcome = self._update(aid)
-        if aid.screened:  # what it leaves to the next is of the state that it has led to
-            aid.innovation(self.state)
+        outcome = self._update(measurement)
+        if measurement.screened:  # what it leaves to the next is of the state that it has led to
+            measurement.innovation(self.state)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = False
         return outcome
 
-    def _update(self, aid: Linearised) -> Outcome:
-        if aid.screened and aid.renewal is not None:
-            self._renew(aid.renewal)
-        rows = aid.innovation(self.state)
+    def _update(self, measurement: Linearised) -> Outcome:
+        if measurement.screened and measurement.renewal is not None:
+            self._renew(measurement.renewal)
+        rows = measurement.innovation(self.state)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
         own = Innovation(rows.z.copy(), rows.h.copy(), rows.r.copy())
@@ -270,18 +270,18 @@ class InvariantFilter(TiltAxesFilter):
         turning = self.turning(self.nav, p)
         straight = self.straight(turning)
         p = straight @ p @ straight.T
-        found = self._seek(aid, p, turning, rows)
+        found = self._seek(measurement, p, turning, rows)
         if isinstance(found, NotApplicable):
             return Outcome(found.outcome)
-        if prior > WIDE_SD_RAD**2 and found.covariance[PHI + 2, PHI + 2] < TOLD * prior:
+        if prior > WIDE_SD_RAD**2 and found.covariance[PHI + 2, PHI + 2] < PROBABILITY * prior:
             for beginning in BEGINNINGS_RAD:
-                other = self._seek(aid, p, turning, None, beginning)
+                other = self._seek(measurement, p, turning, None, beginning)
                 if not isinstance(other, NotApplicable) and other.likelier(found):
                     found = other
         self.log_likelihood = found.log_likelihood
         if not math.isfinite(found.nis):
             return Outcome("not_finite", found.nis, found.degrees)
-        self._hypothesise(aid, own, found, prior)
+        self._hypothesise(measurement, own, found, prior)
         if not found.passed:
             return Outcome("gated", found.nis, found.degrees, (), found.rows)
         nav, xi = self.without(self.nav, self.xi, found.error, turning)
@@ -300,7 +300,9 @@ class InvariantFilter(TiltAxesFilter):
         turn_step(self.step, self.turned, NOTHING_LEFT)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
-    def _hypothesise(self, aid: Linearised, rows: Innovation, found: Sought, prior: float) -> None:
+    def _hypothesise(
+        self, measurement: Linearised, rows: Innovation, found: Sought, prior: float
+    ) -> None:
         """Update the bank by an update, which is to first order that of dx while the heading's
         variance before it is not wide; else its hypotheses begin anew afterwards."""
         bank = self.hypotheses
@@ -313,7 +315,7 @@ class InvariantFilter(TiltAxesFilter):
             bank.begin(self.t_ns, self.nav, self.step)
         kept = np.array(found.rows) == KEPT if found.rows else np.ones(len(rows.z), dtype=np.bool_)
         if kept.any():
-            self._account_for(aid, rows, kept, found.passed)
+            self._account_for(measurement, rows, kept, found.passed)
 
     def _unfelt(self, p: Array) -> None:
         """Let a v_t that is no more than noise not turn in P (n, n): F counts what is felt at rest
@@ -327,7 +329,7 @@ class InvariantFilter(TiltAxesFilter):
 
     def _seek(
         self,
-        aid: Linearised,
+        measurement: Linearised,
         p: Array,
         turning: Turning,
         rows: Innovation | None,
@@ -341,34 +343,34 @@ class InvariantFilter(TiltAxesFilter):
             if rows is None:
                 nav, xi = self.without(self.nav, self.xi, error, turning)
                 step = self.step.copy()
-                turn_step(step, float(error[PHI + 2]), aid.remembered)
-                found = aid.innovation(State(nav, xi, step, self.model, self.covariance))
+                turn_step(step, float(error[PHI + 2]), measurement.remembered)
+                found = measurement.innovation(State(nav, xi, step, self.model, self.covariance))
                 if isinstance(found, NotApplicable):
                     return found
                 rows = found
             to_dx = self._to_dx(nav, xi, error, turning)
             h = np.ascontiguousarray(rows.h @ to_dx)
-            sought = self._solved(aid, Innovation(rows.z + h @ error, h, rows.r), p)
+            sought = self._solved(measurement, Innovation(rows.z + h @ error, h, rows.r), p)
             last, error, rows = error, sought.error, None
             sd = np.sqrt(np.maximum(np.diag(sought.covariance), 1e-30))
             if not np.abs((error - last) / sd).max() > CONVERGED:
                 break
         return sought
 
-    def _solved(self, aid: Linearised, rows: Innovation, p: Array) -> Sought:
+    def _solved(self, measurement: Linearised, rows: Innovation, p: Array) -> Sought:
         """The update of xi = 0 with P_xi (n, n) by rows that are linear in it."""
         nothing = np.zeros(self.model.size)
-        if aid.robust:
+        if measurement.robust:
             rows = reweighted(rows, self.model, p, nothing)
         nu, h, r = rows
-        if aid.screened:
-            by_rows = self._screen(aid, rows, p, nothing)
+        if measurement.screened:
+            by_rows = self._screen(measurement, rows, p, nothing)
             codes, passed = tuple(by_rows.codes.tolist()), bool((by_rows.codes == KEPT).any())
             y = tuple(by_rows.y.tolist())
             return Sought(by_rows.dx, by_rows.cov, by_rows.nis, passed, 0.0, y, codes)
         white, across = np.zeros(len(nu)), np.empty(h.shape)
         nis, log = solve(nu, h, r, p, white, across)
-        threshold = gate_threshold(aid.gate, len(nu))
+        threshold = gate_threshold(measurement.gate, len(nu))
         log = -0.5 * (min(nis, threshold) + log)
         gain, whitened = across.T, tuple(white.tolist())
         if not math.isfinite(nis):

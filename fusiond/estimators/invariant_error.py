@@ -192,8 +192,10 @@ def turn_step(step: Array, psi: float, before: Array) -> None:
     "Tuple((f8, f8))(f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])", allocates=True
 )
 def solve(nu: Array, h: Array, r: Array, p: Array, y: Array, gain: Array) -> tuple[float, float]:
-    """nu^T S^-1 nu and ln |S| for nu (m,), H (m, n), r (m,) variances and P (n, n), infinite and 0
-    where S is not positive; write L^-1 nu (m,), S = L L^T, and K^T (m, n)."""
+    """nu^T S^-1 nu and ln |S|; infinite and 0 where S is not positive.
+
+    Of nu (m,), H (m, n), variances r (m,) and P (n, n). Writes L^-1 nu (m,), where S = L L^T, and
+    K^T (m, n)."""
     m, n = h.shape
     nis = log = 0.0
     for a in range(m):

@@ -1,4 +1,4 @@
-r"""Extended Kalman filter on the error state, closed loop: one filter for all aids.
+r"""Extended Kalman filter on the error state, closed loop: one filter for all measurements.
 
 The error state is estimated, taken out of the navigation state at once and is zero again, so only
 its covariance is propagated.
@@ -48,8 +48,8 @@ class KalmanEstimator(ErrorStateFilter):
         self._runs = self._new_run(NO_AXES)
 
     def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Aids in one call, with what updates carry over; None without a bank, whose updates are
-        cheap, and of a filter whose updates differ."""
+        """Measurements in one call, with what updates carry over; None without a bank, whose
+        updates are cheap, and of a filter whose updates differ."""
         bank = self.hypotheses
         if bank is None or not self.packs:
             return None
@@ -57,40 +57,40 @@ class KalmanEstimator(ErrorStateFilter):
 
     @property
     def runs(self) -> MeasurementRun | None:
-        """Aids in one call; None while an estimate is held, or updates turn."""
+        """Measurements in one call; None while an estimate is held, or updates turn."""
         return None if self._holding or self.turns else self._runs
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not; `noise` (3,) times its variances."""
-        return self._fold_in(aid, noise)
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not; `noise` (3,) times its variances."""
+        return self._fold_in(measurement, noise)
 
-    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
-        if aid.screened and aid.renewal is not None:
-            self._renew(aid.renewal)
-        innovation = self._linearise(aid)
+    def _fold_in(self, measurement: Linearised, noise: Array) -> Outcome:
+        if measurement.screened and measurement.renewal is not None:
+            self._renew(measurement.renewal)
+        innovation = self._linearise(measurement)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
-        if aid.screened:
-            return self._update_by_rows(aid, innovation)
+        if measurement.screened:
+            return self._update_by_rows(measurement, innovation)
         z, h, r = innovation
         degrees = z.shape[0]
         if noise is not AS_STATED and degrees <= LENT_ROWS:
             r *= noise[:degrees]
-        threshold = THRESHOLDS[aid.gate, degrees]
+        threshold = THRESHOLDS[measurement.gate, degrees]
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
         bank = self.hypotheses
         if bank is None or degrees > LENT_ROWS:
             nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
         else:
-            of, table = bank.of_source.get(aid.source) or bank.of(aid), bank.table
+            of, table = bank.of_source.get(measurement.source) or bank.of(measurement), bank.table
             if not self._holding:
-                now = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
+                now = bank.bank, *table[:3], measurement.t_ns, *of, bank.rows, bank.found
                 nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
-                    of_row = bank.bank, *table[:3], aid.t_ns, *of, bank.rows, bank.found
+                    of_row = bank.bank, *table[:3], measurement.t_ns, *of, bank.rows, bank.found
                     account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_row)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
@@ -98,16 +98,16 @@ class KalmanEstimator(ErrorStateFilter):
             return Outcome("not_finite", nis, degrees)
         return Outcome("gated", nis, degrees)
 
-    def _update_by_rows(self, aid: Linearised, rows: Innovation) -> Outcome:
+    def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
         """Rows that pass are folded in, or none."""
         cov, dx = self._cov, self._dx
-        s = self._screen(aid, rows, cov, dx)
+        s = self._screen(measurement, rows, cov, dx)
         codes = tuple(s.codes.tolist())
         kept = codes.count(KEPT)
         if not kept:
             return Outcome("gated", s.nis, 0, (), codes)
         if self.hypotheses is not None:
-            self._account_for(aid, rows, s.codes == KEPT, True)
+            self._account_for(measurement, rows, s.codes == KEPT, True)
         cov[:] = s.cov
         dx[:] = s.dx
         if not self._holding:
@@ -116,15 +116,16 @@ class KalmanEstimator(ErrorStateFilter):
         return Outcome("fused", s.nis, kept, tuple(s.y.tolist()), codes)
 
     def _account_for(
-        self, aid: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
+        self, measurement: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
     ) -> None:
-        """Update the bank by rows of an aid that are about to be folded in, or have failed."""
+        """Update the bank by rows of a measurement that are about to be folded in, or have
+        failed."""
         bank, count = self.hypotheses, int(kept.sum())
         assert bank is not None
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
         y, g = work(count, self.model.width)
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            of_row = bank.bank, *bank.table[:3], aid.t_ns, *bank.of(aid)
+            of_row = bank.bank, *bank.table[:3], measurement.t_ns, *bank.of(measurement)
             space = np.empty(count * bank.columns, dtype=np.float32)
             account_for(self.nav, self.step, h, r, y, g, fused, *of_row, space, bank.found)
 

@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 
 
 class Ran(NamedTuple):
-    """Number of aids that are done, `DONE` or why there are no more, and results (k, RESULT)."""
+    """Number of measurements that are done, `DONE` or why there are no more, and results (k,
+    RESULT)."""
 
     done: int
     how: int

@@ -147,8 +147,10 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         noise: Array,
         work: Array,
     ) -> None:
-        """`cross`, and the sigmas of the `count` samples before row i that have waited for it, of
-        the covariance that begins `of` doubles behind the first."""
+        """Cross covariances, and the sigmas of the `count` samples before row i.
+
+        Those sigmas have waited for `cross`; the covariance begins `of` doubles behind the
+        first."""
         span = sums[SPAN]
         if count:
             whole = between[2 * ENTRIES : 3 * ENTRIES]

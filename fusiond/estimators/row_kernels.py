@@ -1,12 +1,14 @@
-"""Compiled kernels: a filter taken from aid to aid, with its bank of hypotheses, in one call.
+"""Compiled kernels: a filter taken from measurement to measurement, with its bank of hypotheses, in
+one call.
 
-Aids come as rows of numbers in order of validity (fusiond.aiding.packed). Each is what
+Measurements come as rows of numbers in order of validity (fusiond.aiding.packed). Each is what
 fusiond.estimators.kalman makes of it: propagated to, gated, folded in, taken for evidence, and the
 axes of a tilt carried over. The call ends where something is to be decided that is no arithmetic of
-a filter: an aid fails its gate, a hypothesis is likely, a checkpoint is due, a heading is wide.
+a filter: a measurement fails its gate, a hypothesis is likely, a checkpoint is due, a heading is
+wide.
 
 What hypotheses leave open of what is published is computed where somebody may read it: not before
-an aid that is measured, whose epoch says it anew.
+a measurement that is measured, whose epoch says it anew.
 """
 
 from __future__ import annotations
@@ -72,14 +74,14 @@ Indices = NDArray[np.int64]
 Single = NDArray[np.float32]
 
 FUSED, GATED, NOT_FINITE = 10, 11, 12
-"""Results of an aid beside those of `packed_rows`, which say why it does not apply."""
+"""Results of a measurement beside those of `packed_rows`, which say why it does not apply."""
 BECAME, NIS, MOVES, WHITENED, INNOVATION, OF_STATE = 0, 1, 2, 3, 6, 9
 RESULT = OF_STATE + LENT_ROWS * 6
-"""Layout of a result: what became of the aid, NIS, 1 if the vehicle moves, innovation whitened and
-as it is (3 each), and what its rows have of velocity and position (3 x 6)."""
+"""Layout of a result: what became of the measurement, NIS, 1 if the vehicle moves, innovation
+whitened and as it is (3 each), and what its rows have of velocity and position (3 x 6)."""
 DONE, KEEP, JUDGE, OTHERWISE = range(4)
-"""Ways in which a call ends: all is done; a checkpoint is due before the next aid; the last one is
-to be judged; the next one is no row of this kernel."""
+"""Ways in which a call ends: all is done; a checkpoint is due before the next measurement; the last
+one is to be judged; the next one is no row of this kernel."""
 KNOWN, TURNED, SETTLES, UNDOUBTED, PLAIN, LARGE, KNOWS = range(7)
 """State of a filter beside its memory: 1 if its heading has been known; by how much (rad) the
 last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the

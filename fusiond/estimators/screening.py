@@ -313,7 +313,7 @@ class Screened(NamedTuple):
 def screened(
     measurement: Linearised, rows: Innovation, model: Model, threshold: float, cov: Array, dx: Array
 ) -> Screened:
-    """Update by rows of a screened aid, without touching `cov` and `dx`.
+    """Update by rows of a screened measurement, without touching `cov` and `dx`.
 
     A receiver that sets its clock moves all ranges at once: where it says so, or where the better
     half of the ranges fails while the rates pass, the clock offset starts anew, in `cov` too, and

@@ -1,17 +1,19 @@
-r"""Solution separation in the filter: beside the estimate of all aids one without each device.
+r"""Solution separation in the filter: beside the estimate of all measurements one without each
+device.
 
-    x_0   of all aids                                P_0
-    x_k   of all aids but those of device k          P_k
+    x_0   of all measurements                                P_0
+    x_k   of all measurements but those of device k          P_k
 
-All are error estimates of the one navigation state: an aid is linearised once, and each subset
-folds it in with its own gain after its own gate; what is fed back is x_0, and x_k <- x_k - x_0.
-Then, where the noise is as modelled and both have taken the same aids,
+All are error estimates of the one navigation state: a measurement is linearised once, and each
+subset folds it in with its own gain after its own gate; what is fed back is x_0, and x_k <- x_k -
+x_0. Then, where the noise is as modelled and both have taken the same measurements,
 
     cov(x_k - x_0) = P_k - P_0
 
 as the error of an optimal estimate is orthogonal to what the same data could still change. A subset
-gates for itself: the aids that agree with a device that is wrong are not those that agree without
-it. With one device its subset is the IMU with what else there is (wheels, standstill): it drifts.
+gates for itself: the measurements that agree with a device that is wrong are not those that agree
+without it. With one device its subset is the IMU with what else there is (wheels, standstill): it
+drifts.
 
 The initial estimate is common to all: a start from a fix that was wrong shows in no separation.
 
@@ -41,7 +43,8 @@ POSITION = slice(6, 9)
 
 class SeparatedEstimator(KalmanEstimator):
     """The centralised filter with a subset for each of `devices`: sources of position, by the name
-    that their aids begin with. What is published is, to rounding, the filter's without subsets."""
+    that their measurements begin with. What is published is, to rounding, the filter's without
+    subsets."""
 
     packs = False
 
@@ -60,27 +63,27 @@ class SeparatedEstimator(KalmanEstimator):
         self._device_of: dict[str, int | None] = {}
 
     def covariances(self) -> Array:
-        """P (1 + devices, 3, 3), m^2, of the position north, east, down: of all aids, then of the
-        subsets."""
+        """P (1 + devices, 3, 3), m^2, of the position north, east, down: of all measurements, then
+        of the subsets."""
         return self._covs[:, POSITION, POSITION]
 
     def separations(self) -> Array:
         """(devices, 3), m: position of the solution without each device minus the published one."""
         return self._dxs[0, POSITION] - self._dxs[1:, POSITION]
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
-        if aid.screened and aid.renewal is not None:
-            super()._renew(aid.renewal)
-        innovation = self._linearise(aid)
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
+        if measurement.screened and measurement.renewal is not None:
+            super()._renew(measurement.renewal)
+        innovation = self._linearise(measurement)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         held, self._holding = self._holding, True
         try:
-            outcome = super().update(aid, noise)
+            outcome = super().update(measurement, noise)
         finally:
             self._holding = held
-        self._fold_into_subsets(aid, innovation)
+        self._fold_into_subsets(measurement, innovation)
         if not held:
             self._take_out()
         return outcome
@@ -88,13 +91,14 @@ class SeparatedEstimator(KalmanEstimator):
     def _renew(self, renewal: Renewal) -> None:
         """Nothing more: `update` does it before it linearises."""
 
-    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is
-        published changes. The subsets judge for themselves: there the aid may be the sound one."""
-        outcome = super().look(aid, lasting)
-        innovation = self._linearise(aid)
+    def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
+        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing
+        that is published changes. The subsets judge for themselves: there the measurement may be
+        the sound one."""
+        outcome = super().look(measurement, lasting)
+        innovation = self._linearise(measurement)
         if not isinstance(innovation, NotApplicable):
-            self._fold_into_subsets(aid, innovation)
+            self._fold_into_subsets(measurement, innovation)
         return outcome
 
     def adopt(self, mean: Array, spread: Array) -> None:
@@ -116,24 +120,25 @@ class SeparatedEstimator(KalmanEstimator):
             self._feed_back(self._dxs[0])
             self._dxs -= self._dxs[0].copy()
 
-    def _device(self, aid: Linearised) -> int | None:
+    def _device(self, measurement: Linearised) -> int | None:
         """Device of a measurement; None where from none of them."""
-        if aid.source not in self._device_of:
-            self._device_of[aid.source] = local_of(aid.source, self.devices)
-        return self._device_of[aid.source]
+        if measurement.source not in self._device_of:
+            self._device_of[measurement.source] = local_of(measurement.source, self.devices)
+        return self._device_of[measurement.source]
 
-    def _fold_into_subsets(self, aid: Linearised, i: Innovation) -> None:
-        """An aid into each subset but its own device's, if the subset's gate lets it pass."""
-        own = self._device(aid)
+    def _fold_into_subsets(self, measurement: Linearised, i: Innovation) -> None:
+        """A measurement into each subset but its own device's, if the subset's gate lets it
+        pass."""
+        own = self._device(measurement)
         for k in range(1, 1 + len(self.devices)):
             if k - 1 == own:
                 continue
             cov, dx = self._covs[k], self._dxs[k]
-            if aid.screened:
-                s = self._screen(aid, i, cov, dx)
+            if measurement.screened:
+                s = self._screen(measurement, i, cov, dx)
                 if (s.codes == KEPT).any():
                     cov[:], dx[:] = s.cov, s.dx
             else:
-                threshold = gate_threshold(aid.gate, i.z.shape[0])
+                threshold = gate_threshold(measurement.gate, i.z.shape[0])
                 y, g = work(i.z.shape[0], cov.shape[1])
                 fuse(self.nav, self.xi, cov, dx, i.z, i.h, i.r, threshold, True, y, g)

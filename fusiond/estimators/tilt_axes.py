@@ -97,9 +97,11 @@ Indices = NDArray[np.int64]
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
-    the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
-    of an antenna where a lever arm is estimated (fusiond.estimators.antenna_place)."""
+    """Centralised filter that carries the tilt's axes along with the heading.
+
+    In its P the axes of a tilt turn with the heading, the gyros' part stays with the turn that it
+    is known of (fusiond.estimators.turn_rate), and, where a lever arm is estimated, so does the
+    place of an antenna (fusiond.estimators.antenna_place)."""
 
     def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
         super().__init__(model, gap_s, faults=faults)
@@ -137,20 +139,20 @@ class TiltAxesFilter(KalmanEstimator):
     def undoubted(self, true: bool) -> None:
         self._knows[UNDOUBTED] = true
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
         if self.turns and not self._holding:
-            return self._turn_in(aid)
+            return self._turn_in(measurement)
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
-            return self._fold_in(aid, noise)
+            return self._fold_in(measurement, noise)
         before = self._estimate()
-        outcome = self._fold_in(aid, noise)
+        outcome = self._fold_in(measurement, noise)
         if outcome.name == "fused":
             self._carry_over(before)
         return outcome
 
-    def _turn_in(self, aid: Linearised) -> Outcome:
+    def _turn_in(self, measurement: Linearised) -> Outcome:
         """The same while the heading may be far off."""
         raise NotImplementedError
 

@@ -102,8 +102,10 @@ _GYROS, _ARM, _FORCES, _TOLD, _ARM_AFTER, ESTIMATE_SIZE = NAV_SIZE, 13, 16, 19, 
 def remember_estimate(
     nav: Array, xi: Array, biases: Indices, gyros: Indices, lever: Indices, before: Array
 ) -> None:
-    """Write `before` (25,) of nav (10,) and of the slots (0 to 3,) in xi (n,), those of the force
-    `biases` with their axes (2, k)."""
+    """Write the estimate to `before` (25,).
+
+    Taken from nav (10,) and the slots (0 to 3,) in xi (n,), those of the force `biases` with their
+    axes (2, k)."""
     for j in range(NAV_SIZE):
         before[j] = nav[j]
     for j in range(biases.shape[1]):

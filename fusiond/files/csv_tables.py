@@ -46,8 +46,9 @@ class MissingPackageError(Exception):
 
 @immutable()
 class Rejection:
-    """A row that is not used: line in the file (the header is 1; 0: it has none), reason's name,
-    what was seen, and how often; 0 times: a note on the whole file."""
+    """A rejected row: line in the file (the header is 1; 0: it has none), reason, value and count.
+
+    Count 0: a note on the whole file."""
 
     line: int
     reason: str
@@ -215,7 +216,7 @@ def _read_plain(data: Text, start: int, rows: int, header: list[str]) -> _Parsed
 
 
 def _read_clean(data: Text, rows: int, header: list[str], text: Sequence[str]) -> _Parsed | None:
-    """The whole file through numpy's C reader; None if anything in it asks for a closer look."""
+    """Table by numpy's C reader; None if anything needs a closer look."""
     with _as_text(data) as stream:
         stream.readline()
         try:
@@ -308,8 +309,8 @@ def _column_rules(columns: Sequence[Column]) -> list[Rule]:
 
 
 def _not_given(columns: Sequence[Column], named: dict[str, Floats]) -> list[Rejection]:
-    """Optional sigmas that are 0 in all rows become NaN: the writer had none. One sentence on it,
-    which rejects no row."""
+    """Replace optional sigmas that are 0 in all rows by NaN: the writer had none. Returns a
+    note."""
     zero = []
     for c in columns:
         values = named[c.name]

@@ -88,7 +88,7 @@ def flat(values: dict[str, Any], before: str = "") -> Row:
 
 
 def _journal(path: Path) -> list[Row]:
-    """Its rows but for a last line that was cut short, which is taken off the file."""
+    """Rows of the journal; a last line that was cut short is removed from the file."""
     if not path.exists():
         return []
     data = path.read_bytes()

@@ -18,7 +18,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 SMOOTHED = "smoothed"
-"""Instead of a mode: the row is of all measurements, not of those until then."""
+"""Status of a smoothed row, in place of a mode."""
 STATUS: tuple[str, ...] = (*Mode, SMOOTHED)
 """The words of the column `status`; a row's status code is an index into them."""
 

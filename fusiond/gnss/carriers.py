@@ -173,7 +173,7 @@ def _delay(
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8, f8[::1])")
-def _tell(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
+def _write_rates(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
     """The slant delay, its variance, and twice its covariance with the code."""
     if plan[GAMMA] == 0.0 or state[_PAIR] != plan[PAIR] or state[_T] - state[_T_PAIR] > 0.0:
         return
@@ -208,7 +208,7 @@ def follow(
         if kept[0, j] > MOST_COUNT:
             kept[0, j] *= 0.5
             kept[0, j - 1] *= 0.5
-    apart = np.empty(n)
+    residuals = np.empty(n)
     many = 0
     for i in range(n):
         state = kept[int(plan[i, SLOT])]
@@ -231,18 +231,18 @@ def follow(
         out[i, MOVED_VARIANCE] = 2.0 * phase / (span * span)
         d = moved - 0.5 * (first[i, RATE] + state[_RATE])
         if not math.isnan(d):
-            apart[many] = d
+            residuals[many] = d
             many += 1
     common = 0.0
     if many > 0:
-        ordered = np.sort(apart[:many])
+        ordered = np.sort(residuals[:many])
         common = ordered[many // 2]
     jumped = abs(common) > JUMP_M_S
     for i in range(n):
         state = kept[int(plan[i, SLOT])]
         span = now - state[_T]
         if span <= 0.0:  # seen already
-            _tell(state, plan[i], first[i], scale, out[i])
+            _write_rates(state, plan[i], first[i], scale, out[i])
             continue
         l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
         pair = plan[i, GAMMA] > 0.0 and not math.isnan(second[i, P_B])
@@ -274,5 +274,5 @@ def follow(
             state[_T_PAIR], state[_PAIR], state[_L_AB] = now, plan[i, PAIR], l_ab
         state[_T], state[_SIGNAL], state[_L_A] = now, plan[i, SIGNAL], l_a
         state[_RATE] = first[i, RATE]
-        _tell(state, plan[i], first[i], scale, out[i])
+        _write_rates(state, plan[i], first[i], scale, out[i])
     return int(jumped)

@@ -114,7 +114,7 @@ _NONE = np.zeros(0)
 
 class Levels(NamedTuple):
     """An epoch at `t_s`: levels (SLOTS, 4) before it, r and V (n,) of its `rows`, and where it may
-    teach: what its aid will have `seen` of the filter, z and the place's variances (n,)."""
+    teach: what its measurement will have `seen` of the filter, z and the place's variances (n,)."""
 
     t_s: float
     before: Array

@@ -214,7 +214,7 @@ def satellite_states(
 
 
 NOT_CORRECTED = (0.0,) * 14
-"""The last columns of a satellite by its own ephemeris alone."""
+"""Last columns of a satellite without corrections."""
 
 
 def elements_row(ephemeris: Ephemeris, corrected: Sequence[float] = NOT_CORRECTED) -> Array:

@@ -370,5 +370,5 @@ def _gamma(a: RawSignal, b: RawSignal) -> float:
 
 
 def _number(a: str, b: str) -> int:
-    """A number, not 0, of a pair of signals."""
+    """Positive number of a pair of signals."""
     return int.from_bytes((a + b).encode("ascii"))

@@ -103,9 +103,9 @@ GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(S
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # Columns of `first` as the receiver says them; NaN where it does not.
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
-# Results; the first seventeen are what an aid takes (fusiond.aiding.pseudorange).
+# Results; the first seventeen are what a measurement takes (fusiond.aiding.pseudorange).
 ROW_COLUMNS = 29
-AID_ROWS = 17
+RANGE_VALUES = 17
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
     COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL,

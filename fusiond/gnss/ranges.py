@@ -123,7 +123,7 @@ class Rows:
 
     @property
     def azimuth_rad(self) -> Array:
-        """(n,), from north to east, 0 .. 2 pi."""
+        """Azimuth (n,), from north to east, 0 .. 2 pi."""
         found: Array = np.arctan2(self.values[rk.EAST], self.values[rk.NORTH]) % (2.0 * np.pi)
         return found
 
@@ -156,9 +156,10 @@ class Picked(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """Picked signals with what their carriers tell (n, 6) after the epochs before, what the model's
-    sigmas of codes are multiplied by, and whose carriers tell nothing and why: all that does not
-    need the receiver."""
+    """Picked signals with the results of their carriers (n, 6).
+
+    Everything that needs no receiver: those results after the epochs before, the factors on the
+    model's sigmas of codes, and the carriers without a result, with the reason."""
 
     picked: Picked
     carriers: Array

@@ -323,8 +323,10 @@ def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirem
     The sum of squared residuals is a sanity check: a fault outside the modes shows there.
     """
     gain, threshold = protection.separation.gain, protection.separation.threshold
-    apart = np.abs((gain[1:] - gain[0]) @ y)
-    ratio = np.divide(apart, threshold[1:], out=np.zeros_like(apart), where=threshold[1:] > 0.0)
+    separations = np.abs((gain[1:] - gain[0]) @ y)
+    ratio = np.divide(
+        separations, threshold[1:], out=np.zeros_like(separations), where=threshold[1:] > 0.0
+    )
     residual, degrees = _residual(epoch, y)
     false_alarm = requirement.residual_false_alarm / requirement.samples
     bound = quantile(degrees, false_alarm) if degrees else math.inf

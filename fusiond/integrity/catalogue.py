@@ -63,7 +63,7 @@ DEG = math.degrees(1.0)
 BODY = ("x", "y", "z")
 SENSOR, PLACE, MOTION, TIME, OWN, OVER = range(6)
 """Classes: between kinds of one class nobody has to choose before something is done."""
-RECEIVER_PER_H, LATE_PER_H, SPOOFED_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1e-4, 1.0
+RECEIVER_PER_H, DELAYED_PER_H, SPOOFED_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1e-4, 1.0
 TURNS_PER_H = 0.01
 """A unit works loose in its mount now and then in the life of a vehicle, not once an hour: what may
 have begun a moment ago is 0.2 deg of tilt for ever then, of a unit that knows it to 0.05."""
@@ -201,7 +201,7 @@ def delay_kinds(device: str) -> list[Kind]:
     return [
         Kind(
             *(name, text, "s", DELAY, of),
-            *((LAG_SPREAD,), LATE_PER_H, lag_s),
+            *((LAG_SPREAD,), DELAYED_PER_H, lag_s),
             device=device,
             lag_s=lag_s,
             mean=1.0,
@@ -226,7 +226,7 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
     step = Kind(
         *("time_offset", f"{device} stamps have stepped", "s", STATES, TIME),
         # As rare as any delay: once an hour it is 13 cm along the way behind a minute's outage.
-        *((max(float(model.initial[slot]) for slot in slots),), LATE_PER_H),
+        *((max(float(model.initial[slot]) for slot in slots),), DELAYED_PER_H),
         device=device,
         slots=tuple(slots),
         bounded=True,
@@ -253,7 +253,7 @@ def speed_kinds(device: str) -> list[Kind]:
     """Of a wheel: its scale, of which minus one is a wheel that stands still."""
     of = Kind(
         *("wheel_scale", f"{device} speed is off by", "%", SPEED, OWN),
-        *((0.5,), LATE_PER_H, 100.0),
+        *((0.5,), DELAYED_PER_H, 100.0),
         device=device,
         axes=("",),
     )
@@ -316,7 +316,7 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
     found.append(over_kind())
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
     of_ground = "zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY
-    found += row_kinds(*of_ground, per_hour=LATE_PER_H)
+    found += row_kinds(*of_ground, per_hour=DELAYED_PER_H)
     return sorted(found, key=lambda kind: -kind.size)  # as a table of them has to be
 
 

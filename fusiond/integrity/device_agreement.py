@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 
@@ -34,10 +34,10 @@ class Agreement(NamedTuple):
         """For how long they have fitted."""
         return self.upto_ns - self.since_ns
 
-    def with_aid(self, aid: Aid) -> Agreement:
+    def with_measurement(self, measurement: AidingMeasurement) -> Agreement:
         """With one position or velocity more."""
         found = self
-        for candidate in aid.candidates():
+        for candidate in measurement.candidates():
             if isinstance(candidate, PositionCandidate):
                 found = found._replace(position=candidate)
             elif isinstance(candidate, VelocityCandidate):

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import (
@@ -83,7 +83,8 @@ class Memory(NamedTuple):
 
 
 class Diagnosis:
-    """Judges each aid once it has been looked at; a function of the aids in order alone."""
+    """Judges each measurement once it has been looked at; a function of the measurements in order
+    alone."""
 
     def __init__(self, kinds: Sequence[Kind] = ()) -> None:
         self._kinds = tuple(kinds)
@@ -93,7 +94,7 @@ class Diagnosis:
         self._agreement: Mapping[str, Agreement] = {}
         """By device that is out; replaced, never changed."""
         self._lasting: Mapping[str, Lasting] = {}
-        """By series, why it left service last; replaced, never changed."""
+        """Last reason of exclusion by series; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
         """Identified faults since the start, the last of each kind and device."""
 
@@ -103,7 +104,7 @@ class Diagnosis:
         return Memory(self._series.copy(), self.findings, self._agreement, self._lasting)
 
     def restore(self, memory: Memory) -> None:
-        """Back to a snapshot."""
+        """Restore a snapshot."""
         self._series, self.findings = memory.series.copy(), memory.findings
         self._shared, self._agreement = set(self._series), memory.agreement
         self._lasting = memory.lasting
@@ -148,40 +149,43 @@ class Diagnosis:
 
     # ------------------------------------------------------------------ judgement
 
-    def own(self, aid: Aid) -> Series:
-        """The series of an aid, which may be changed."""
-        one = self._series.get(aid.source)
-        if one is not None and aid.source not in self._shared:
+    def own(self, measurement: AidingMeasurement) -> Series:
+        """The series of a measurement, which may be changed."""
+        one = self._series.get(measurement.source)
+        if one is not None and measurement.source not in self._shared:
             return one
-        self._shared.discard(aid.source)
-        one = self._series[aid.source] = Series.of(aid) if one is None else one.copied()
+        self._shared.discard(measurement.source)
+        one = self._series[measurement.source] = (
+            Series.of(measurement) if one is None else one.copied()
+        )
         return one
 
-    def plain(self, aid: Aid) -> Series | None:
-        """The series of an aid of which nothing is to be judged beyond its gate and hypotheses: it
-        is nominal, and nothing of its device is out; None of another. It may be changed."""
-        one = self._series.get(aid.source)
+    def plain(self, measurement: AidingMeasurement) -> Series | None:
+        """The series of a measurement of which nothing is to be judged beyond its gate and
+        hypotheses: it is nominal, and nothing of its device is out; None of another. It may be
+        changed."""
+        one = self._series.get(measurement.source)
         if one is None or one.state is not Service.NOMINAL or one.failed:
             return None
         if one.device in self._agreement:
             return None
-        return self.own(aid) if aid.source in self._shared else one
+        return self.own(measurement) if measurement.source in self._shared else one
 
-    def comes(self, aid: Aid, estimator: Estimator) -> Series:
-        """The series of an aid, before it is folded in; one that repeats itself leaves service,
-        with all of its device."""
+    def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
+        """The series of a measurement, before it is folded in; one that repeats itself leaves
+        service, with all of its device."""
         # By its class: one that stands for another has its own offers.
-        one, shown = self._series.get(aid.source), getattr(type(aid), "shown", None)
-        if one is None or aid.source in self._shared:
-            one = self.own(aid)
-        if aid.t_ns - one.heard_ns > FORGET_NS:
-            one.hear(aid.t_ns)
-        one.heard_ns = aid.t_ns
-        if aid.constraint:
+        one, shown = self._series.get(measurement.source), getattr(type(measurement), "shown", None)
+        if one is None or measurement.source in self._shared:
+            one = self.own(measurement)
+        if measurement.t_ns - one.received_ns > FORGET_NS:
+            one.received(measurement.t_ns)
+        one.received_ns = measurement.t_ns
+        if measurement.constraint:
             if estimator.hypotheses is not None:  # it is no evidence of what waits to be judged
                 estimator.hypotheses.conclude()
             return one
-        value = value_of(aid.candidates()) if shown is None else shown(aid)
+        value = value_of(measurement.candidates()) if shown is None else shown(measurement)
         if value is None:
             return one
         # A position that differs repeats nothing, whether it moves or not. How often others do in
@@ -189,41 +193,41 @@ class Diagnosis:
         same = value == one.value
         moving = (same or not one.locates) and estimator.surely_moves(published=same)
         if one.repeats_itself(value, moving) and not one.out:
-            self._exclude(aid.t_ns, REPEATS, lambda s: s.device == aid.device)
-            one = self._series[aid.source]
+            self._exclude(measurement.t_ns, REPEATS, lambda s: s.device == measurement.device)
+            one = self._series[measurement.source]
         return one
 
     def judge(
-        self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
+        self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
-        """Take in how an aid ended; what to take out of the filter's state, if anything."""
-        e, t_ns, correction, explained = estimator, aid.t_ns, None, False
-        bank, measured, used = e.hypotheses, not aid.constraint, not one.out
+        """Take in how a measurement ended; what to take out of the filter's state, if anything."""
+        e, t_ns, correction, explained = estimator, measurement.t_ns, None, False
+        bank, measured, used = e.hypotheses, not measurement.constraint, not one.out
         if one.out or one.device in self._agreement:
-            self._agrees(aid, one)
+            self._agrees(measurement, one)
         if bank is not None:
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
             if found is not None and measured and used:
                 if identified(found):
                     correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
-                one = self._series[aid.source]
+                one = self._series[measurement.source]
         if not used:
-            correction = self._looked_at(aid, one, outcome, estimator)
+            correction = self._looked_at(measurement, one, outcome, estimator)
         elif one.out:  # by that decision
             return correction
         elif outcome.name == "fused":
-            one.fused(t_ns, () if aid.constraint else outcome.whitened)
-        elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
+            one.fused(t_ns, () if measurement.constraint else outcome.whitened)
+        elif outcome.name == "gated" and (not measurement.constraint or measurement.no_slip):
             one.gated(t_ns, explained)
         return correction
 
     def _looked_at(
-        self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
+        self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
-        """One that is out was compared with what is published."""
-        correction, t_ns, bank = None, aid.t_ns, estimator.hypotheses
-        passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
+        """Judge an excluded source by its innovation against the published solution."""
+        correction, t_ns, bank = None, measurement.t_ns, estimator.hypotheses
+        passes = outcome.nis <= gate_threshold(measurement.gate, max(outcome.degrees, 1))
         if outcome.lasting:
             known = self._lasting[one.source].judged(outcome.lasting)
             self._lasting = {**self._lasting, one.source: known}
@@ -231,12 +235,12 @@ class Diagnosis:
         others = self._over_by_others(one)
         one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others)
         if self._goes_its_own_way(one):
-            correction = _somewhere_else(aid, estimator)
+            correction = _somewhere_else(measurement, estimator)
             one.readmit(t_ns)
         if not one.out:
             self._is_over(one)
             if bank is not None:
-                bank.begin_again(aid, estimator.nav, estimator.step)
+                bank.begin_again(measurement, estimator.nav, estimator.step)
         return correction
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
@@ -310,15 +314,17 @@ class Diagnosis:
                 self._changed(name).reason = STILL
         self._lasting = lasting
 
-    def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
+    def lasting(
+        self, measurement: AidingMeasurement, one: Series, estimator: Estimator
+    ) -> Array | None:
         """Terms of each fault in an innovation of a series that may be out (k, 3), if it lasts;
         None where none is known."""
         bank, added = estimator.hypotheses, []
         if bank is None:
             return None
         for f in self._lasting.get(one.source, Lasting()).findings:
-            b, age_s = np.array(f.size) / f.kind.per_unit, aid.t_ns * 1e-9 - f.since_s
-            added.append(bank.adds(aid, self._kinds.index(f.kind), b, age_s, estimator.nav))
+            b, age_s = np.array(f.size) / f.kind.per_unit, measurement.t_ns * 1e-9 - f.since_s
+            added.append(bank.adds(measurement, self._kinds.index(f.kind), b, age_s, estimator.nav))
         return np.array(added) if added else None
 
     def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
@@ -345,8 +351,10 @@ class Diagnosis:
         return self._series[name]
 
     def _goes_its_own_way(self, one: Series) -> bool:
-        """True if a position whose fault is over has gone the way that the velocity of its device
-        says, which is in service, for a minute: it is the filter that is somewhere else."""
+        """True if the filter, not the device, is somewhere else.
+
+        A position whose fault is over has followed its device's velocity, which is in service, for
+        a minute."""
         if not (one.out and one.locates and one.reason == STILL):
             return False
         moves = [s for s in self._series.values() if s.device == one.device and s.moves]
@@ -355,21 +363,24 @@ class Diagnosis:
             known and known.lasted_ns > FITS_AGAINST_NS and moves and not any(s.out for s in moves)
         )
 
-    def _agrees(self, aid: Aid, one: Series) -> None:
+    def _agrees(self, measurement: AidingMeasurement, one: Series) -> None:
         """One of a device that is out, or was, has come: does the device fit itself? What repeats
         itself while the vehicle moves says nothing of that."""
-        if not (one.locates or one.moves) or aid.screened or one.repeats > 0:
+        if not (one.locates or one.moves) or measurement.screened or one.repeats > 0:
             return
-        known = self._agreement.get(aid.device, Agreement())
-        self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
+        known = self._agreement.get(measurement.device, Agreement())
+        self._agreement = {
+            **self._agreement,
+            measurement.device: known.with_measurement(measurement),
+        }
 
 
-def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
+def _somewhere_else(measurement: AidingMeasurement, estimator: Estimator) -> Correction:
     """The filter's position is open by how far a position is from it."""
     spread = np.zeros((estimator.model.size, estimator.model.size))
     nav = estimator.nav
     lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)
-    for candidate in aid.candidates():
+    for candidate in measurement.candidates():
         if isinstance(candidate, PositionCandidate):
             north = (candidate.lat_rad - lat) * meridian_radius(lat)
             east = (candidate.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)

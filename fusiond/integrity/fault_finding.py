@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from fusiond.estimators.fault_bank import DECIDED
 from fusiond.integrity.catalogue import Kind
-from fusiond.integrity.service import MOST_TOLD
+from fusiond.integrity.service import MOST_EVIDENCE
 
 
 class Finding(NamedTuple):
@@ -54,7 +54,7 @@ class Lasting(NamedTuple):
         is none that another one explains better, a thousand to one."""
         best = min(nis)
         worse = [
-            w + 0.5 * min(one - best, MOST_TOLD) for w, one in zip(self.worse, nis, strict=True)
+            w + 0.5 * min(one - best, MOST_EVIDENCE) for w, one in zip(self.worse, nis, strict=True)
         ]
         kept = [k for k, w in enumerate(worse) if w - min(worse) < DECIDED]
         return Lasting(tuple(self.findings[k] for k in kept), tuple(worse[k] for k in kept))

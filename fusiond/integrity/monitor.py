@@ -143,7 +143,7 @@ _TOO_FEW = WORDS.index("too_few")
 
 
 class ConsistencyMonitor:
-    """Sliding window over the innovations of one kind of aid of one source.
+    """Sliding window over the innovations of one kind of measurement of one source.
 
     Give it what the filter fused, in order. A changed dimension m starts over. `verdict` changes
     once the window's has differed from it for half a window of epochs in a row: neighbouring

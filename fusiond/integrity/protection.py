@@ -74,8 +74,8 @@ class Level(NamedTuple):
 
 
 def axis_level(variance: Array, separation: Array, share: float, limits: IntegrityRisk) -> Level:
-    """The level of an axis: `variance` (1 + k,) m^2 of all aids and of the subsets, `separation`
-    (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
+    """The level of an axis: `variance` (1 + k,) m^2 of all measurements and of the subsets,
+    `separation` (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
     sigma = np.sqrt(variance)
     k_fa = -gaussian_quantile(
         limits.false_alarm

@@ -36,7 +36,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import (
     Candidate,
     PositionCandidate,
@@ -48,7 +48,7 @@ from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
-LASTS_S, RETURNS, MOST_TOLD, MOST_SURE = 60.0, 2.0, 12.0, 24.0
+LASTS_S, RETURNS, MOST_EVIDENCE, MOST_SURE = 60.0, 2.0, 12.0, 24.0
 """A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
 to one; the most (chi-square) that one measurement tells of that; and the most (log likelihood) that
 one series does, four such measurements."""
@@ -84,14 +84,14 @@ class Series:
     out: bool = False
     """True if it is looked at, and not fused."""
     since_ns: int = 0
-    heard_ns: int = 0
+    received_ns: int = 0
     reason: str = ""
     failed: int = 0
     passed: int = 0
     out_ns: int = 0
     """Instant (ns) of its last exclusion."""
     proven_ns: int = 0
-    """Until when (ns) it is on probation: for as long as it was out."""
+    """End of probation (ns), which is as long as the exclusion was."""
     over: float = 0.0
     """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: object = None
@@ -103,9 +103,15 @@ class Series:
     """Probability that a value repeats the one before it, as shown so far in motion."""
 
     @staticmethod
-    def of(aid: Aid) -> Series:
+    def of(measurement: AidingMeasurement) -> Series:
         """A new one, for the first of its measurements."""
-        return Series(aid.source, aid.device, aid.locates, aid.moves, since_ns=aid.t_ns)
+        return Series(
+            measurement.source,
+            measurement.device,
+            measurement.locates,
+            measurement.moves,
+            since_ns=measurement.t_ns,
+        )
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""
@@ -113,13 +119,13 @@ class Series:
         other.noise = self.noise.copy()
         return other
 
-    def hear(self, t_ns: int) -> None:
+    def received(self, t_ns: int) -> None:
         """One has come."""
-        if t_ns - self.heard_ns > FORGET_NS:
+        if t_ns - self.received_ns > FORGET_NS:
             self.failed = self.passed = self.repeats = 0
             if self.state is Service.SUSPECTED:
                 self.state, self.since_ns = Service.NOMINAL, t_ns
-        self.heard_ns = t_ns
+        self.received_ns = t_ns
 
     def exclude(self, t_ns: int, reason: str) -> None:
         """It leaves service."""
@@ -160,8 +166,8 @@ class Series:
             passes = False
         self.passed = self.passed + 1 if passes else 0
         if math.isfinite(lasting):
-            self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
-            self.over = max(-MOST_TOLD, min(self.over, MOST_SURE))
+            self.over += 0.5 * max(-MOST_EVIDENCE, min(lasting, MOST_EVIDENCE))
+            self.over = max(-MOST_EVIDENCE, min(self.over, MOST_SURE))
             prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
             if self.over + others + prior < RETURNS:
                 return
@@ -179,7 +185,7 @@ class Series:
     def went_on(self, t_ns: int, value: object, moved: int) -> None:
         """Several have come while it was nominal, the last at `t_ns`, none with the `value` of the
         one before it; None of a constraint. The vehicle `moved` at so many of them."""
-        self.heard_ns = t_ns
+        self.received_ns = t_ns
         if value is None:
             return
         self.value, self.repeats, self.unchanged = value, 0, False

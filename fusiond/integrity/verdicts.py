@@ -1,4 +1,4 @@
-"""One consistency monitor for each source of aids: what its innovations say of the filter's
+"""One consistency monitor for each source of measurements: what its innovations say of the filter's
 sigma."""
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.screening import KEPT
 from fusiond.integrity.consistency import (
@@ -37,13 +37,13 @@ class _Series:
 class Verdicts:
     """Feeds the innovations that were fused to their sources' monitors.
 
-    An aid may hold several series (`Aid.series`), each with a monitor of its own: a receiver's raw
-    epochs have one for each satellite system, `<source>_<system>`.
+    A measurement may hold several series (`AidingMeasurement.series`), each with a monitor of its
+    own: a receiver's raw epochs have one for each satellite system, `<source>_<system>`.
 
-    Innovations are kept as they come, and judged together by `tell`: a run of minutes through files
-    has hundreds of them at once. `on_change(source, verdict)` hears then when a verdict turns.
-    Constraints are not judged. What the aids of a source share by the states of `model` no
-    innovation shows (`Aid.shares`).
+    Innovations are kept as they come, and judged together by `report`: a run of minutes through
+    files has hundreds of them at once. `on_change(source, verdict)` hears then when a verdict
+    turns. Constraints are not judged. What the measurements of a source share by the states of
+    `model` no innovation shows (`AidingMeasurement.shares`).
     """
 
     def __init__(
@@ -53,36 +53,39 @@ class Verdicts:
         self._on_change = on_change
         self._series: dict[str, _Series] = {}
         self._heard = 0
-        self.waiting: list[tuple[Aid, Outcome]] = []
+        self.waiting: list[tuple[AidingMeasurement, Outcome]] = []
         """Fused and not judged yet, once each though a rewind brings it again."""
         self._turned: list[tuple[int, str, Verdict]] = []
         """Verdicts that have turned and are not told yet, with the number of the innovation."""
 
-    def judge(self, aid: Aid, outcome: Outcome) -> None:
-        """An aid has been fused; to be called once for each, though a rewind brings it again."""
-        if aid.constraint or not outcome.whitened:
+    def judge(self, measurement: AidingMeasurement, outcome: Outcome) -> None:
+        """A measurement has been fused; to be called once for each, though a rewind brings it
+        again."""
+        if measurement.constraint or not outcome.whitened:
             return
-        if not aid.screened:
-            series = self._series.get(aid.source) or self._begin(aid.source, aid)
+        if not measurement.screened:
+            series = self._series.get(measurement.source) or self._begin(
+                measurement.source, measurement
+            )
             self._heard += 1
             whitened = outcome.whitened
             series.waiting.append((len(whitened), self._heard, whitened, outcome.nis))
             return
         kept = np.array(outcome.rows) == KEPT
-        for name, row in aid.series(outcome.whitened, kept).items():
-            source = f"{aid.source}_{name}"
-            series = self._series.get(source) or self._begin(source, aid)
+        for name, row in measurement.series(outcome.whitened, kept).items():
+            source = f"{measurement.source}_{name}"
+            series = self._series.get(source) or self._begin(source, measurement)
             self._heard += 1
             series.waiting.append((len(row), self._heard, row, float(row @ row)))
 
-    def _begin(self, source: str, aid: Aid) -> _Series:
-        window = max(FEWEST, self._window // 2) if aid.late else self._window
-        shared = self._model.slots_of_all(aid.shares).size > 0
-        options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
+    def _begin(self, source: str, measurement: AidingMeasurement) -> _Series:
+        window = max(FEWEST, self._window // 2) if measurement.delayed else self._window
+        shared = self._model.slots_of_all(measurement.shares).size > 0
+        options = ConsistencyOptions(window, self._alpha, gate=measurement.gate, shared=shared)
         series = self._series[source] = _Series(ConsistencyMonitor(options))
         return series
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Judge what has come since the last time, and say which verdicts have turned, in the order
         in which they did."""
         self._judge_all()
@@ -91,8 +94,8 @@ class Verdicts:
         self._turned.clear()
 
     def _judge_all(self) -> None:
-        for aid, outcome in self.waiting:
-            self.judge(aid, outcome)
+        for measurement, outcome in self.waiting:
+            self.judge(measurement, outcome)
         self.waiting.clear()
         for source, series in self._series.items():
             waiting = series.waiting

@@ -27,7 +27,7 @@ from fusiond.navigator.timeline import Entry
 
 class Chain:
     """One vehicle's way from inputs to the solution. `saved` is the state that a start may align
-    from; `on_outcome` hears how each aid ended."""
+    from; `on_outcome` hears how each measurement ended."""
 
     def __init__(
         self,

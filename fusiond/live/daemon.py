@@ -132,7 +132,7 @@ class Daemon:
 
     def _send_event(self, message: EventMessage) -> None:
         for output in self.outputs.values():
-            output.take(EVENT, message)
+            output.publish(EVENT, message)
 
     async def reload_when(self, again: asyncio.Event, read: Callable[[], Config]) -> None:
         """`reload` whenever `again` is set, until cancelled; what is set meanwhile counts once."""
@@ -272,7 +272,7 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def run(
+def run_daemon(
     config: Config,
     config_path: Path,
     read: Callable[[], Config],

@@ -22,7 +22,7 @@ from fusiond.outputs.catalogue import make_outputs
 from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.commands import Command, CommandRefusedError
 from fusiond.outputs.messages.health import SchedulerStatus
-from fusiond.outputs.messages.status import RecordingStatus, status_message
+from fusiond.outputs.messages.status import DaemonState, status_message
 from fusiond.outputs.topics import STATUS
 from fusiond.workers.forked import Forked
 
@@ -115,24 +115,19 @@ class Front:
         mqtt = self.outputs.get("mqtt")
         if mqtt is None:
             return
-        mqtt.take(
+        mqtt.publish(
             STATUS,
             status_message(
                 Solution(t_ns, Mode.WAITING, text),
                 self.clock.utc_ns(t_ns),
-                since_utc_ns=self.clock.utc_ns(self.started_ns),
-                version=version("fusiond"),
-                config_digest=config_digest(self.config),
-                uptime_s=(t_ns - self.started_ns) * 1e-9,
-                scheduler=_NO_TICK,
-                fused=0,
-                rejected=0,
-                calibrated=False,
-                imu=None,
-                faults=(),
-                recording=RecordingStatus(),
-                injected=(),
-                mqtt=mqtt.counters,
+                DaemonState(
+                    since_utc_ns=self.clock.utc_ns(self.started_ns),
+                    version=version("fusiond"),
+                    config_digest=config_digest(self.config),
+                    uptime_s=(t_ns - self.started_ns) * 1e-9,
+                    scheduler=_NO_TICK,
+                    mqtt=mqtt.counters,
+                ),
             ),
         )
 

@@ -22,8 +22,8 @@ class Innovations:
         self._ended: dict[Key, Entry] = {}
 
     def add(self, entry: Entry) -> None:
-        """An aid has ended; one that a rewind brings again is there already."""
-        if entry.aid.constraint:
+        """A measurement has ended; one that a rewind brings again is there already."""
+        if entry.measurement.constraint:
             return
         self._ended[entry.key] = entry
         if len(self._ended) > MOST:
@@ -41,7 +41,7 @@ class Innovations:
         if outcome is None:
             return None
         return Innovation(
-            source=entry.aid.source,
+            source=entry.measurement.source,
             t_ms=stamp(self._clock.utc_ns(entry.key[0]))[1],
             outcome=outcome.name,
             nis=round(outcome.nis, 3) if isfinite(outcome.nis) else None,

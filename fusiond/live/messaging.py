@@ -224,7 +224,7 @@ class Messaging:
             driver = self._terminals.get(name)
             if driver is not None:
                 restore(box, driver.outbox, driver.inbox, t_ns)
-                driver.tell_stages(t_ns)
+                driver.report_stages(t_ns)
             elif box.waiting:
                 text = f"no source {name!r} any more: {len(box.waiting)} messages are given up"
                 self._on_event("messages", "message_failed", text)

@@ -18,7 +18,7 @@ class OutputTasks:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def start(self, outputs: Mapping[str, Output]) -> None:
-        """Serve those that are not served yet."""
+        """Start a task for each output that has none."""
         for name, output in outputs.items():
             if name not in self._tasks:
                 fell = partial(self._on_event, name, "output_fault")
@@ -26,7 +26,7 @@ class OutputTasks:
                 self._tasks[name] = asyncio.create_task(serve, name=f"output {name}")
 
     async def stop(self, names: Iterable[str] | None = None) -> None:
-        """End these, or all; returns when they have said farewell."""
+        """Stop these outputs, or all; returns once they have disconnected."""
         ending = [
             self._tasks.pop(name)
             for name in (tuple(self._tasks) if names is None else names)

@@ -53,8 +53,9 @@ def release_compiler_memory() -> None:
 
 
 def _clean_mappings(library: str) -> Iterator[tuple[int, int]]:
-    """First and last address of the read-only mappings of a library in which no page was written:
-    the linker writes to one when it resolves addresses, and the file has no copy of that."""
+    """First and last address of a library's read-only mappings without a written page.
+
+    The linker writes to a page when it resolves addresses; the file has no copy of that."""
     try:
         lines = SMAPS.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # the pages stay

@@ -21,7 +21,7 @@ from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, health_message
 from fusiond.outputs.messages.innovations import innovations_message
 from fusiond.outputs.messages.nav import nav_message
-from fusiond.outputs.messages.status import RecordingStatus, status_message
+from fusiond.outputs.messages.status import DaemonState, RecordingStatus, status_message
 from fusiond.outputs.topics import (
     CALIBRATION,
     CONSISTENCY,
@@ -97,7 +97,7 @@ class Publishing:
 
     def _publish(self, topic: Topic, message: Message) -> None:
         for output in self._outputs.values():
-            output.take(topic, message)
+            output.publish(topic, message)
 
     def _publish_nav(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         due = [output for output, every in self._nav if every.due(t_ns)]
@@ -110,7 +110,7 @@ class Publishing:
         if utc_ns is not None and not self._clock.sets_others:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:
-            output.take(NAV, settled if output.sets_clocks else message)
+            output.publish(NAV, settled if output.sets_clocks else message)
 
     def _publish_messages(self) -> None:
         for topic, message in self._messaging.take_waiting():
@@ -135,19 +135,21 @@ class Publishing:
             status_message(
                 solution,
                 utc_ns,
-                since_utc_ns=self._clock.utc_ns(self._since_ns),
-                version=self._version,
-                config_digest=self._digest,
-                uptime_s=(t_ns - self._started_ns) * 1e-9,
-                scheduler=self._scheduler(),
-                fused=fused,
-                rejected=rejected,
-                imu=self._sources.imu.used,
-                faults=self._sources.faults(t_ns),
-                calibrated=self._navigator.calibrating.settled,
-                recording=self._recording(),
-                injected=self._injection.active,
-                mqtt={} if mqtt is None else mqtt.counters,
+                DaemonState(
+                    since_utc_ns=self._clock.utc_ns(self._since_ns),
+                    version=self._version,
+                    config_digest=self._digest,
+                    uptime_s=(t_ns - self._started_ns) * 1e-9,
+                    scheduler=self._scheduler(),
+                    fused=fused,
+                    rejected=rejected,
+                    imu=self._sources.imu.used,
+                    faults=self._sources.faults(t_ns),
+                    calibrated=self._navigator.calibrating.settled,
+                    recording=self._recording(),
+                    injected=self._injection.active,
+                    mqtt={} if mqtt is None else mqtt.counters,
+                ),
             ),
         )
 

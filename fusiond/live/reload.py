@@ -1,6 +1,6 @@
 """Reload of a configuration; what needs a restart.
 
-Taken are the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every aid) and
+Taken are the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every measurement) and
 `log_level`: what can change without the solution losing what it knows. All else goes into the
 model, the buffers or the drivers when they are made.
 """
@@ -30,7 +30,7 @@ class Difference:
     outputs: frozenset[str]
     """Those that are made anew, are new or are no more."""
     gates: Mapping[str, float]
-    """By section of `aiding`."""
+    """New gate probability, by section of `aiding`."""
 
 
 def difference(running: Config, read: Config) -> Difference:

@@ -21,10 +21,10 @@ class RestoredState:
     warm: KeptState | None = None
     calibration: SavedCalibration | None = None
     messages: str | None = None
-    """As `fusiond.live.stored_messages` has them in JSON."""
+    """Stored messages, as JSON of `fusiond.live.stored_messages`."""
 
     def restore_into(self, chain: Chain) -> None:
-        """Let a chain that was made with `saved` go on from the rest. Raises `DamagedStateError`
+        """Restore the rest into a chain that was made with `saved`. Raises `DamagedStateError`
         for a state of another model."""
         chain.navigator.calibration = self.calibration
         if self.messages is not None:

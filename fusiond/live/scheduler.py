@@ -41,7 +41,7 @@ class Every:
         return True
 
 
-class LatenessHistogram:
+class LatencyHistogram:
     """Lateness in fixed log-spaced bins, ten a decade from 10 us to 10 s; constant memory."""
 
     def __init__(self) -> None:
@@ -103,7 +103,7 @@ class Scheduler:
         self._sleep = sleep
         self._on_time = on_time
         self._collector = Collector(now)
-        self.lateness = LatenessHistogram()
+        self.lateness = LatencyHistogram()
         self.ticks = 0
         self.overruns = 0
 

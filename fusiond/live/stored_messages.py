@@ -49,8 +49,10 @@ class KeptMessage:
 
 @dataclass(frozen=True, slots=True)
 class KeptBox:
-    """One terminal's: `number` the last given to a text that asks for a receipt, `seen` those that
-    came and asked for one."""
+    """Messages of one terminal.
+
+    `number`: the last given to a text that asks for a receipt; `seen`: received texts that asked
+    for one."""
 
     number: Natural
     waiting: tuple[KeptMessage, ...]
@@ -82,7 +84,7 @@ def kept_box(outbox: Outbox, inbox: Inbox, t_ns: int) -> KeptBox:
 
 
 def restore(box: KeptBox, outbox: Outbox, inbox: Inbox, t_ns: int) -> None:
-    """Let a terminal go on from what was kept, at `t_ns`."""
+    """Restore a terminal's messages at `t_ns`."""
     inbox.seen.update(dict.fromkeys(box.seen))
     outbox.restore([_outgoing(m, t_ns) for m in box.waiting], box.number)
 

@@ -122,7 +122,8 @@ def parameter(
 
 
 def position_bias(name: str, sd_m: float, tau_s: float, axes: str = "ne") -> Block:
-    """A first-order Gauss-Markov error (m) along some axes that an aid's measurements share."""
+    """A first-order Gauss-Markov error (m) along some axes that successive measurements
+    share."""
     columns = (-1,) * len(axes)
     return Block(name, "m", tuple(axes), columns, initial=sd_m, steady=sd_m, tau_s=tau_s)
 

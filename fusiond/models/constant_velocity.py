@@ -3,9 +3,9 @@ r"""The model of a vehicle without an inertial unit: it goes on as it goes, but 
     dr' = dv,   dv' = w,   w white with the density q = 2 s^2 tau
 
 which is what accelerations of sigma s that last for tau, as a first-order Markov process, do over
-times that are long against tau. Six states, north-east-down, and what the aids need beside them;
-no attitude. It runs in the kernels of inertial navigation, on samples of a vehicle that is level,
-faces north and is pulled by gravity alone (fusiond.navigator.without_imu).
+times that are long against tau. Six states, north-east-down, and what the measurements need beside
+them; no attitude. It runs in the kernels of inertial navigation, on samples of a vehicle that is
+level, faces north and is pulled by gravity alone (fusiond.navigator.without_imu).
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), section 6.2.2 (white noise acceleration model); paper
 004, experiments 3 and 4.
@@ -23,7 +23,7 @@ NAME = "constant_velocity"
 
 def constant_velocity(manoeuvre: tuple[float, float, float], extra: Sequence[Block] = ()) -> Model:
     """The model with acceleration sigmas (m/s^2), horizontal and vertical, that last for a time (s)
-    and the further blocks of its aids."""
+    and the further blocks of its measurements."""
     level, vertical, lasts_s = manoeuvre
     return Model(
         NAME,

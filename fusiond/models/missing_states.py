@@ -1,4 +1,4 @@
-r"""Process noise in the place of biases that a model has no state for.
+r"""Process noise that replaces biases without states in the model.
 
 A bias left out is a force error in body axes, b = b_0 + b_m: a constant of sigma s_0 and a
 first-order Gauss-Markov process of sigma s and correlation time tau. White noise that adds the same

@@ -115,8 +115,8 @@ class Model:
 
     @cached_property
     def indices(self) -> _Indices:
-        """By the name of a block or by several names, `slots_of_all` of them: what aids ask at each
-        of their instants."""
+        """By the name of a block or by several names, `slots_of_all` of them: what measurements ask
+        at each of their instants."""
         return _Indices(self)
 
     @cached_property
@@ -138,7 +138,8 @@ class Model:
         return self.listed[names]
 
     def slots_of_each(self, *lists: tuple[str, ...]) -> tuple[Indices, ...]:
-        """`slots_of_all` of several lists of blocks: what an aid asks at each of its instants."""
+        """`slots_of_all` of several lists of blocks: what a measurement asks at each of its
+        instants."""
         found = self._each.get(lists)
         if found is None:
             found = self._each[lists] = tuple(self.slots_of_all(blocks) for blocks in lists)
@@ -196,7 +197,7 @@ class Model:
 
     @cached_property
     def sensor_errors(self) -> bool:
-        """True if it has states for what each gyro and each accelerometer errs by."""
+        """True if the model has states for the errors of every gyro and accelerometer."""
         return all(self.parameters(axis) for axis in range(RATE_ERROR, FORCE_ERROR + 3))
 
     def parameters(self, column: int) -> list[int]:

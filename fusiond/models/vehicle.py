@@ -1,7 +1,8 @@
 """Blocks of what an owner cannot measure: how sensors sit on the vehicle, and when they speak.
 
 Each is a constant, or nearly one, that driving shows; what a drive does not show stays at its
-prior. The aids that hold them say how they act (fusiond.aiding.body_velocity, position, velocity).
+prior. The measurements that hold them say how they act (fusiond.aiding.body_velocity, position,
+velocity).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ WHEEL_SCALE = "wheel_scale"
 WHEEL_LATENCY = "wheel_latency"
 WHEEL_ROUNDING = "wheel_rounding"
 FIX_TIME = "gnss_time"
-FIX_WANDER = "gnss_wander"
+FIX_MARKOV = "gnss_wander"
 VELOCITY_TIME = "gnss_velocity_time"
 CLOCK_SKEW = "gnss_clock_skew"
 ANTENNA_LEVER = "antenna_lever"
@@ -51,7 +52,7 @@ def drift(name: str, sd_m_s: float, lasts_s: float) -> Block:
 
 
 def wheel_scale(name: str, sd: float) -> Block:
-    """By what share a wheel's speed is too high: a tyre's radius, worn or under pressure."""
+    """Relative error of a wheel's speed: a tyre's radius, worn or under pressure."""
     return _constant(name, "1", ("scale",), sd)
 
 
@@ -73,9 +74,9 @@ def clock_skew(name: str) -> Block:
     return _constant(name, "1", ("rate",), CLOCK_SKEW_SD)
 
 
-def fix_wander(name: str, lasts_s: float) -> Block:
-    """An error that fixes share for a while, of sigma one: an aid says how many metres it counts
-    (fusiond.aiding.fix_errors)."""
+def fix_markov_block(name: str, lasts_s: float) -> Block:
+    """An error that fixes share for a while, of sigma one: a measurement says how many metres it
+    counts (fusiond.aiding.fix_errors)."""
     return Block(name, "1", ("n", "e", "d"), (-1,) * 3, initial=1.0, steady=1.0, tau_s=lasts_s)
 
 
@@ -91,8 +92,7 @@ def barometer_offset(name: str, sd_m: float, walk_m_sqrt_s: float) -> Block:
 
 
 def barometer_scale(name: str, sd: float) -> Block:
-    """By what share a barometer's metres are too many: how much colder than the standard the air
-    is."""
+    """Relative error of a barometer's heights: air colder or warmer than the standard."""
     return _constant(name, "1", ("scale",), sd)
 
 

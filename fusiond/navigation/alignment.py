@@ -75,20 +75,22 @@ def judge_sensed(
     force_variance: float,
     rate_variance: float,
     g: float,
-    late: float,
-    sd_late_s: float,
+    delay: float,
+    sd_delay_s: float,
     left: Array,
     rows: Array,
 ) -> None:
-    """Residuals of a guess for k velocities, in sigmas (k, 3), and the slopes (k, 3, 13) of what it
-    says by phi, biases (6,) of force and rate, offset in time and first velocity
+    """Residuals of a guess for k velocities, in sigmas (k, 3), and their slopes (k, 3, 13).
+
+    The slopes are by phi, biases (6,) of force and rate, offset in time and first velocity
     (`fusiond.navigator.alignment.motion_fit`).
 
     Of a stretch of samples: seconds (k,), rate and force (k, 6) as sensed at the fixes; the
     integrals over it (fusiond.navigation.preintegration), with the biases that were taken off; of
     the fixes velocity, sigma and lever (k, 3). Of the guess: C_0 (3, 3), the velocity (3,) at the
-    first fix, biases, C_0 D (3, 3) of the last fix, the offset `late` in its sigmas, `sd_late_s`. A
-    velocity gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its own.
+    first fix, biases, C_0 D (3, 3) of the last fix, the offset `delay` in its sigmas, `sd_delay_s`.
+    A velocity gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its
+    own.
     """
     more = biases - sensed_biases
     there, acceleration, arm, body = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -116,7 +118,7 @@ def judge_sensed(
                 there[i] += dcm[i, j] * body[j]
                 acceleration[i] += turn[i, j] * (means[k, 3 + j] - biases[j])
             weight[i] = 1.0 / np.sqrt(sd[k, i] * sd[k, i] + white)
-            said = first[i] + down * t + there[i] + late * sd_late_s * acceleration[i]
+            said = first[i] + down * t + there[i] + delay * sd_delay_s * acceleration[i]
             left[k, i] = (velocity[k, i] - said) * weight[i]
         for i in range(3):
             row, one, two = rows[k, i], (i + 1) % 3, (i + 2) % 3
@@ -130,7 +132,7 @@ def judge_sensed(
                 ahead, behind = (j + 1) % 3, (j + 2) % 3
                 row[6 + j] -= there[two] * dcm_turns[one, j] - there[one] * dcm_turns[two, j]
                 row[6 + j] += turn[i, ahead] * lever[behind] - turn[i, behind] * lever[ahead]
-            row[9] = sd_late_s * acceleration[i]
+            row[9] = sd_delay_s * acceleration[i]
             row[10], row[11], row[12] = 0.0, 0.0, 0.0
             row[10 + i] = 1.0
             for j in range(13):

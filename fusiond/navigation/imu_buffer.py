@@ -1,4 +1,4 @@
-"""The IMU's recent past in arrays that the kernels read: body axes, own time offset taken out.
+"""Recent IMU samples in arrays for the kernels: body axes, own time offset removed.
 
 Samples keep an absolute number for ever: sample k lies at row k - start. Rows move to the front
 when the arrays are full, so that the kernels always see one contiguous run of at least `keep_s`

@@ -49,7 +49,7 @@ TAKEN, SATURATED, REPEATED, NO_GRAVITY, SPIKE, STAMP_AHEAD, AXIS_DEAD = range(7)
 LEAP = 30.0
 # So many leaps may add up while samples are refused: then the new level must last for DEAD_S, in
 # which a sensor that is at its unknown full scale is seen to be dead.
-LEAPS_ALLOWED = 3.0
+JUMPS_ALLOWED = 3.0
 # Mean leaps of a good sensor on a quiet ride; with LEAP they allow what a shock does from rest:
 # 0.9 rad/s and 15 m/s^2 from sample to sample. Cars showed 1.7 and 10, shaken long before.
 RATE_FLOOR_RAD_S, FORCE_FLOOR_M_S2 = 0.03, 0.5
@@ -58,7 +58,7 @@ RATE_FLOOR_RAD_S, FORCE_FLOOR_M_S2 = 0.03, 0.5
 LEAST_RATE_RAD_S, LEAST_FORCE_M_S2 = 0.003, 0.05
 BACK = 0.25
 # Samples that the running mean of leaps and the running probability of repetition remember.
-LEAPS_KEPT, REPEATS_KEPT = 100.0, 500.0
+JUMPS_KEPT, REPEATS_KEPT = 100.0, 500.0
 # The probability of repetition falls no further: after half an hour at 200 Hz it would be no normal
 # number, which takes the processor three times as long. A repetition makes the same of both.
 LEAST_P = 1e-30
@@ -164,7 +164,7 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
             return AXIS_DEAD
     if memory[_REFUSED] > DEAD_S * rate_hz:
         return TAKEN
-    since = min(memory[_REFUSED] + 1.0, LEAPS_ALLOWED)
+    since = min(memory[_REFUSED] + 1.0, JUMPS_ALLOWED)
     for j in range(6):
         floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
         most = LEAP * max(floor, memory[_LEAP + j]) * since
@@ -174,7 +174,7 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
 
 
 @compiled("b1(f8[::1], f8[:, ::1], i8)", forceinline=True)
-def _leaps(memory: Array, samples: Array, i: int) -> bool:
+def _jumps(memory: Array, samples: Array, i: int) -> bool:
     """True if sample i may be a spike, if the next one is back."""
     for j in range(6):
         least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
@@ -203,7 +203,7 @@ def _take(memory: Array, samples: Array, i: int) -> None:
         leap = abs(samples[i, j] - memory[_GOOD + j]) / (memory[_REFUSED] + 1.0)
         usual = memory[_LEAP + j]
         # A single leap weighs no more than eight usual ones.
-        memory[_LEAP + j] += (min(leap, 8.0 * max(floor, usual)) - usual) / LEAPS_KEPT
+        memory[_LEAP + j] += (min(leap, 8.0 * max(floor, usual)) - usual) / JUMPS_KEPT
         memory[_GOOD + j] = samples[i, j]
     memory[_REFUSED] = 0.0
 
@@ -236,9 +236,9 @@ def _check(
             i += 1
             continue
         gap = times[i] - last_ns > hold_ns
-        leaps = not gap and memory[_REFUSED] == 0.0 and _leaps(memory, samples, i)
+        jumps = not gap and memory[_REFUSED] == 0.0 and _jumps(memory, samples, i)
         k = i + 1
-        if gap or leaps:
+        if gap or jumps:
             while k < m and times[k] <= last_ns:
                 k += 1
             if k == m:
@@ -252,7 +252,7 @@ def _check(
         _count_repeats(memory, samples, i, limits[0])
         since_s = 1.0 / limits[0] if gap else (times[i] - last_ns) * 1e-9
         codes[i] = _judged(memory, samples, i, since_s, limits)
-        if codes[i] == TAKEN and leaps and _comes_back(memory, samples, i, k):
+        if codes[i] == TAKEN and jumps and _comes_back(memory, samples, i, k):
             codes[i] = SPIKE
         # After a gap there is nothing to compare with.
         if codes[i] == TAKEN or (codes[i] == SPIKE and gap):

@@ -155,7 +155,7 @@ class KernelCache(NullCache):
 
 
 def _file_name(name: str, signature: str, *processor: str) -> str:
-    """Native code differs by signature, system, processor and its features."""
+    """File name of native code: by signature, system, processor and its features."""
     made_for = repr((signature, processor)).encode()
     return f"{name}-{hashlib.sha256(made_for).hexdigest()[:16]}.kernel"
 
@@ -170,7 +170,7 @@ def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | Non
         damaged(path, "a folder")
         return None
     except OSError as error:
-        _tell(f"{path} cannot be read ({error})")
+        _report(f"{path} cannot be read ({error})")
         return None
     kept = data[_DIGEST_SIZE:]
     if hashlib.sha256(kept).digest() != data[:_DIGEST_SIZE]:
@@ -181,9 +181,10 @@ def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | Non
 
 @cache
 def _name_runtime() -> None:
-    """Tell the linker where the functions are that kernels make arrays with. What else numba's
-    runtime consists of lies in each kernel that needs it; numba compiles it for the first that is
-    compiled, which takes as long as linking twenty."""
+    """Name the functions that kernels make arrays with to the linker.
+
+    The rest of numba's runtime is part of each kernel that needs it; numba compiles it for the
+    first one, which takes as long as linking twenty."""
     for name, address in c_helpers.items():
         _add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
@@ -217,8 +218,8 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
     alone, which no kernel here is compiled in."""
     known = _known_environment(name)
     if known is None:
-        loaded = sys.modules.get(module)
-        known = _Environment({"__name__": module} if loaded is None else loaded.__dict__)
+        imported = sys.modules.get(module)
+        known = _Environment({"__name__": module} if imported is None else imported.__dict__)
         known.consts[:] = constants
         known.env_name = name
         _Environment._memo[name] = known
@@ -339,11 +340,11 @@ def kept_in(folder: Path) -> set[str]:
 
 
 def _leave(path: Path, reason: str) -> None:
-    _tell(f"{path} is damaged ({reason}): install the package again")
+    _report(f"{path} is damaged ({reason}): install the package again")
 
 
 def _discard(path: Path, reason: str) -> None:
-    _tell(f"{path} is damaged ({reason})")
+    _report(f"{path} is damaged ({reason})")
     with contextlib.suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -351,5 +352,5 @@ def _discard(path: Path, reason: str) -> None:
             path.unlink()
 
 
-def _tell(what: str) -> None:
+def _report(what: str) -> None:
     warnings.warn(f"{what}: the kernel is compiled anew", RuntimeWarning, stacklevel=2)

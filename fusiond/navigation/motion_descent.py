@@ -24,8 +24,8 @@ from fusiond.navigation.rotation import turn_to_dcm
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-BIASES, LATE, FIRST, GUESS_SIZE = 9, 15, 16, 19
-PRIORS, YAW, GRAVITY, LATE_S, BY_T, ASKED_SIZE = 10, 10, 11, 12, 13, 15
+BIASES, DELAY, FIRST, GUESS_SIZE = 9, 15, 16, 19
+PRIORS, YAW, GRAVITY, DELAY_S, BY_T, ASKED_SIZE = 10, 10, 11, 12, 13, 15
 SOUGHT = 13
 # Steps of Gauss-Newton at most, and the one, in sigmas, that ends them; how often one is halved,
 # and the one that ends them where no part of it is any better, for the valley is bent.
@@ -70,10 +70,11 @@ def judge_guess(
     z: Array,
     rows: Array,
 ) -> None:
-    """Write what a guess leaves (3 k + 10,) and the slopes (3 k + 10, 13) of what it says by its
-    steps, in sigmas; the rest as of `judge_sensed`."""
+    """Write a guess's residuals (3 k + 10,) and their slopes (3 k + 10, 13), in sigmas.
+
+    The slopes are by the steps of the guess; the rest as of `judge_sensed`."""
     k = t_s.shape[0]
-    biases, first = guess[BIASES:LATE], guess[FIRST:]
+    biases, first = guess[BIASES:DELAY], guess[FIRST:]
     # C_0, since which the axes have turned to C_T.
     turn, since, dcm, dcm_turns = (
         np.empty((3, 3)),
@@ -116,14 +117,14 @@ def judge_guess(
         asked[BY_T],
         asked[BY_T + 1],
         asked[GRAVITY],
-        guess[LATE],
-        asked[LATE_S],
+        guess[DELAY],
+        asked[DELAY_S],
         z[: 3 * k].reshape((k, 3)),
         rows[: 3 * k].reshape((k, 3, SOUGHT)),
     )
-    apart = asked[YAW] - math.atan2(guess[3], guess[0])
-    apart = (apart + math.pi) % (2.0 * math.pi) - math.pi
-    z[3 * k], z[3 * k + 1], z[3 * k + 2] = guess[5], -guess[2], apart
+    yaw_residual = asked[YAW] - math.atan2(guess[3], guess[0])
+    yaw_residual = (yaw_residual + math.pi) % (2.0 * math.pi) - math.pi
+    z[3 * k], z[3 * k + 1], z[3 * k + 2] = guess[5], -guess[2], yaw_residual
     for i in range(3, PRIORS):
         z[3 * k + i] = -guess[BIASES - 3 + i]
     for i in range(PRIORS):
@@ -219,8 +220,8 @@ def descend(
     made_there, there = made.copy(), guess.copy()
     left, by_steps, step = z.copy(), rows.copy(), np.empty(SOUGHT)
     seconds = t_s[t_s.shape[0] - 1]
-    if _bent(guess[BIASES:LATE], made, seconds):
-        made[:] = guess[BIASES:LATE]
+    if _bent(guess[BIASES:DELAY], made, seconds):
+        made[:] = guess[BIASES:DELAY]
         integrate_sensed(times, samples, made, counts, gained, turned, slopes)
     judge_guess(
         t_s, means, gained, turned, slopes, made, velocity, sd, levers, asked, guess, z, rows
@@ -239,10 +240,10 @@ def descend(
         converged, taken = size < CONVERGED, False
         for _ in range(HALVINGS):
             moved(guess, step, there)
-            anew = _bent(there[BIASES:LATE], made, seconds)
-            if anew:
+            rebuilt = _bent(there[BIASES:DELAY], made, seconds)
+            if rebuilt:
                 a, b, c, taken_off = gained_there, turned_there, slopes_there, made_there
-                taken_off[:] = there[BIASES:LATE]
+                taken_off[:] = there[BIASES:DELAY]
                 integrate_sensed(times, samples, taken_off, counts, a, b, c)
             else:
                 a, b, c, taken_off = gained, turned, slopes, made
@@ -266,7 +267,7 @@ def descend(
                 less += left[k] * left[k]
             if converged or less < cost:
                 guess[:], z[:], rows[:], taken = there, left, by_steps, True
-                if anew:
+                if rebuilt:
                     gained, gained_there = gained_there, gained
                     turned, turned_there = turned_there, turned
                     slopes, slopes_there = slopes_there, slopes

@@ -156,13 +156,13 @@ def strapdown_step(
     step[0], step[1], step[2] = d0 * inverse, d1 * inverse, d2 * inverse
     # Nothing before: what is smoothed begins with this interval.
     b = STEP_FORCE_B
-    begun = step[b] != 0.0 or step[b + 1] != 0.0 or step[b + 2] != 0.0
-    gain = h / (h + SMOOTH_S) if begun else 1.0
+    started = step[b] != 0.0 or step[b + 1] != 0.0 or step[b + 2] != 0.0
+    gain = h / (h + SMOOTH_S) if started else 1.0
     for j in range(3):
         step[STEP_SMOOTH_N + j] += gain * (step[j] - step[STEP_SMOOTH_N + j])
         d = rate[j] - step[STEP_SMOOTH_RATE_B + j]
         step[STEP_SMOOTH_RATE_B + j] += gain * d
-        forgotten = h / (h + NOISE_S) if begun else 1.0
+        forgotten = h / (h + NOISE_S) if started else 1.0
         step[STEP_NOISE_B + j] += forgotten * (0.5 * gain * d * d - step[STEP_NOISE_B + j])
         step[STEP_RATE_B + j] = rate[j]
         step[STEP_FORCE_B + j] = force[j]

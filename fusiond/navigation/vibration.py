@@ -61,9 +61,10 @@ _FINE, _OF_FINE, _COARSE, _OF_COARSE, _KNOWN, _PART_SIZE = range(6)
 
 @compiled("f8(f8[:, ::1], f8[:, :])")
 def _risen(parts: Array, memory: Array) -> float:
-    """The density that all of the `parts` (PARTS + 1, 5) of an axis show, the first of which has
-    just ended, where it is new; else 0. The means of the axis, `memory` (LEVELS, 6), begin anew
-    with it then."""
+    """Noise density of an axis where it is new; else 0.
+
+    The one that all of its `parts` (PARTS + 1, 5) show, the first of which has just ended. The
+    axis's means, `memory` (LEVELS, 6), restart with a new one."""
     least = RISEN * parts[PARTS, _KNOWN]
     fine = of_fine = coarse = of_coarse = 0.0
     for k in range(PARTS):
@@ -92,8 +93,10 @@ def _follow(
     lately: Array,
     out: Array,
 ) -> None:
-    """Write `out` (m, 6), the smallest density so far after each of `samples` (m, 6) beyond that of
-    `sheet` (6,), 0 where it is not above it by EXCESS.
+    """Write the smallest noise density so far beyond the sheet's, `out` (m, 6).
+
+    After each of `samples` (m, 6), beyond that of `sheet` (6,); 0 where it is not above it by
+    EXCESS.
 
     `memory` (LEVELS, 6, 6) and `lately` (6, PARTS + 1, 5) go on from call to call.
     """

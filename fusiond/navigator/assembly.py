@@ -22,7 +22,7 @@ from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_WANDER
+from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 
 def model_of(config: Config, *extra: Block) -> Model:
-    """The error-state model of a configuration, with the blocks that its aids need; without those
-    that nobody asked for, where there is no room for them.
+    """Error-state model of a configuration, with the blocks that its measurements need.
+
+    Optional blocks are left out where there is no room for them.
 
     Raises `ConfigError` where those are more states than the kernels hold.
     """
@@ -48,8 +49,8 @@ def model_of(config: Config, *extra: Block) -> Model:
                 return model_of(config, *asked)
         names = ", ".join(block.name for block in extra)
         raise ConfigError(
-            f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
-            " 'ins15', or fewer aids"
+            f"estimator.model: {error}; the measurements add {names}: choose a smaller model,"
+            " such as 'ins15', or fewer sections [aiding]"
         ) from error
 
 
@@ -60,7 +61,7 @@ def _skews(_: Config, block: Block) -> bool:
 
 def _wanders(_: Config, block: Block) -> bool:
     """True if a block is that of an error which fixes share for seconds."""
-    return block.name.startswith(FIX_WANDER)
+    return block.name.startswith(FIX_MARKOV)
 
 
 def _unasked(config: Config, block: Block) -> bool:
@@ -127,8 +128,8 @@ def estimator_without_imu(config: Config, model: Model, gap_s: float) -> Estimat
     receiver where the configuration says so, else the Kalman filter."""
     if config.estimator.filter == "federated":
         names = config.estimator.federated.sources or tuple(config.aiding)
-        heard = tuple(name for name in names if name in config.positioning)
-        return _federated(config, model, heard or names, gap_s)
+        received = tuple(name for name in names if name in config.positioning)
+        return _federated(config, model, received or names, gap_s)
     return KalmanEstimator(model, gap_s)
 
 

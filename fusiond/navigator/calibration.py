@@ -179,7 +179,7 @@ class CalibrationWatch:
         yaws = (k for k, s in enumerate(self._slots) if s.kind == MOUNTING and "yaw" in s.name)
         self._yaws = tuple(yaws)
         self._event = on_event
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.restart()
 
     def restart(self) -> None:
@@ -234,7 +234,7 @@ class CalibrationWatch:
             _parameter(s, float(now[i]), float(sd[i]), None if before is None else before[i])
             for i, s in enumerate(self._slots)
         )
-        self._tell()
+        self._report()
         return True
 
     def _compare(self, t_ns: int, now: Array, variance: Array) -> None:
@@ -260,10 +260,10 @@ class CalibrationWatch:
         self._known[row] = np.sqrt(known) <= KNOWN_SHARE * self._prior[yaws]
         self._row += 1
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         for p in self.parameters:
-            if p.state is CalibrationState.SETTLED and p.name not in self._told:
-                self._told.add(p.name)
+            if p.state is CalibrationState.SETTLED and p.name not in self._reported:
+                self._reported.add(p.name)
                 rest = "all settled" if self.settled else "others still settling"
                 self._event("calibrated", f"{_label(p)}, one sigma {p.sd:.2g}; {rest}")
 

@@ -33,7 +33,7 @@ from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude
 from fusiond.integrity.protection import INDEPENDENT_PER_HOUR
 from fusiond.navigation.distributions import gaussian_quantile
 from fusiond.navigation.strapdown import LAT, LON
-from fusiond.navigator.raw_gnss import RawEpochAid
+from fusiond.navigator.raw_gnss import RawEpochMeasurement
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ NO_BOUND = EpochLevel(math.inf, math.inf)
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Received:
     """An epoch at `t_ns`: its ranges z (n,) m less the solution's, the shared displacement t (3,) m
     north, east, down; its level once that was asked for."""
 
@@ -95,7 +95,7 @@ class EpochProtection:
     def __init__(self, risk: float, false_alarm: float) -> None:
         self._requirement = requirement(risk, false_alarm)
         self._risk = risk
-        self._heard: dict[str, _Heard] = {}
+        self._received: dict[str, _Received] = {}
 
     @cached_property
     def _quantile(self) -> float:
@@ -104,22 +104,22 @@ class EpochProtection:
 
     def clear(self) -> None:
         """The solution has begun anew."""
-        self._heard.clear()
+        self._received.clear()
 
-    def look(self, aid: RawEpochAid, state: State) -> None:
+    def look(self, measurement: RawEpochMeasurement, state: State) -> None:
         """An epoch, and the filter's state at its instant when it has been looked at."""
-        self._heard.pop(aid.source, None)
-        corrected = aid.memory.corrected
+        self._received.pop(measurement.source, None)
+        corrected = measurement.memory.corrected
         if corrected is None:
             return
-        rows, ranges = corrected.rows, np.isfinite(corrected.aid.ranges)
-        innovation = corrected.aid.innovation(state)
+        rows, ranges = corrected.rows, np.isfinite(corrected.measurement.ranges)
+        innovation = corrected.measurement.innovation(state)
         if isinstance(innovation, NotApplicable):
             return
         n = int(ranges.sum())
         axes = ned_axes(float(state.nav[LAT]), float(state.nav[LON]))
-        _, clocks = np.unique(corrected.aid.clock[ranges], return_inverse=True)
-        sigma = np.sqrt(corrected.aid.total_variance[ranges])
+        _, clocks = np.unique(corrected.measurement.clock[ranges], return_inverse=True)
+        sigma = np.sqrt(corrected.measurement.total_variance[ranges])
         epoch = Epoch(
             rows.line_of_sight[ranges] @ axes,
             clocks.astype(np.int64),
@@ -130,35 +130,35 @@ class EpochProtection:
             np.full(int(clocks.max(initial=-1)) + 1, CONSTELLATION_FAULT),
         )
         slots = [slot for block in RANGE_BIAS for slot in state.model.slots_of(block)]
-        shared = corrected.aid.shape @ state.xi[slots] if len(slots) == 3 else np.zeros(3)
+        shared = corrected.measurement.shape @ state.xi[slots] if len(slots) == 3 else np.zeros(3)
         # Of an epoch alone nothing is known of what its ranges share.
         columns = state.model.slots_of_all(RANGE_SHARED)
         z = innovation.z[:n] + innovation.h[:n, columns] @ state.xi[columns]
         names = tuple(s for s, here in zip(rows.satellites, ranges, strict=True) if here)
-        self._heard[aid.source] = _Heard(aid.t_ns, names, epoch, z, shared)
+        self._received[measurement.source] = _Received(measurement.t_ns, names, epoch, z, shared)
 
     def level(self, source: str, estimator: Estimator) -> EpochLevel:
         """Of the estimator's present state, by the last epoch of a receiver."""
-        heard = self._heard.get(source)
-        if heard is None or not 0 <= estimator.t_ns - heard.t_ns <= HOLDS_NS:
+        received = self._received.get(source)
+        if received is None or not 0 <= estimator.t_ns - received.t_ns <= HOLDS_NS:
             return NO_BOUND
-        if heard.level is None:
-            heard.level = self._level(heard)
+        if received.level is None:
+            received.level = self._level(received)
         north, east, down = estimator.sigmas()[3:6].tolist()
-        grown = self._quantile * (estimator.t_ns - heard.t_ns) * 1e-9
-        found = heard.level
+        grown = self._quantile * (estimator.t_ns - received.t_ns) * 1e-9
+        found = received.level
         return found._replace(
             hpl_m=found.hpl_m + grown * math.hypot(north, east), vpl_m=found.vpl_m + grown * down
         )
 
-    def _level(self, heard: _Heard) -> EpochLevel:
-        found = exclude(heard.epoch, self._requirement, heard.z)
+    def _level(self, received: _Received) -> EpochLevel:
+        found = exclude(received.epoch, self._requirement, received.z)
         if found is None:
             return NO_BOUND
         kept = ~found.out
         gain = found.protection.separation.gain[0]
-        north, east, down = (gain @ heard.z[kept] - heard.shared).tolist()
-        left_out = tuple(s for s, out in zip(heard.satellites, found.out, strict=True) if out)
+        north, east, down = (gain @ received.z[kept] - received.shared).tolist()
+        left_out = tuple(s for s, out in zip(received.satellites, found.out, strict=True) if out)
         return EpochLevel(
             found.protection.hpl_m + math.hypot(north, east),
             found.protection.vpl_m + abs(down),

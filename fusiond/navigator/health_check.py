@@ -1,7 +1,7 @@
-"""Unexpected failures: an aid that raises, a filter of no numbers.
+"""Unexpected failures: a measurement that raises, a filter of no numbers.
 
-An exception costs the aid that raised it, never the tick. A filter that has lost its numbers never
-gets them back: it is started anew.
+An exception costs the measurement that raised it, never the tick. A filter that has lost its
+numbers never gets them back: it is started anew.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ def broken(estimator: Estimator) -> str:
     return f"{_STATE[what]} not finite"
 
 
-class FailedAids:
-    """Tells once of each source of which an aid raised."""
+class FailedMeasurements:
+    """Tells once of each source of which a measurement raised."""
 
-    def __init__(self, tell: Callable[[str, str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str, str], None]) -> None:
+        self._report = report
         self._known: set[str] = set()
 
-    def tell(self, source: str, error: str) -> None:
-        """An aid of `source` is `failed` for `error`."""
+    def report(self, source: str, error: str) -> None:
+        """A measurement of `source` is `failed` for `error`."""
         if source not in self._known:
             self._known.add(source)
-            self._tell("aid_failed", f"{source} could not be used: {error}")
+            self._report("measurement_failed", f"{source} could not be used: {error}")

@@ -35,7 +35,7 @@ class ImuNoise:
         of_class = imu.sensor_class is not None and imu.misalignment_deg > 0.0
         self._unit = UnitGrade(model) if of_class else None
         self._grade = self._unit
-        """None where nothing tells how good the unit is."""
+        """None where nothing shows the unit's quality."""
         self._axes_sd_rad = imu.misalignment_deg * DEG
         self._cell = self._at_ns = -1
 

@@ -86,7 +86,7 @@ class ImuScreening:
         return reason("imu_silent", seconds=silent_s) + why
 
     def restarts(self, imu: ImuBuffer) -> bool:
-        """True if stamps went back for good; then the next may have any."""
+        """True if stamps went back for good; the next stamp may then be any."""
         stuck_s = imu.backward_in_a_row / self._config.rate_hz
         if stuck_s <= self._config.gap_s:
             return False

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drivers.measurements import PositionFix
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
@@ -128,7 +128,7 @@ class CourseTurns:
             return None
         return reason("rate_turns", factor=factor)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget the turns so far."""
         self._product = self._square = self._turn = 0.0
 
@@ -169,7 +169,7 @@ class RateUnits:
             columns = [*range(RATE_ERROR, RATE_ERROR + 3), *range(FORCE_ERROR, FORCE_ERROR + 3)]
             slots = [(c, s) for c in columns for s in model.parameters(c)[:1]]
             self._first = model, slots
-        worst, told, xi = SHEET_SIGMAS, None, estimator.xi
+        worst, found, xi = SHEET_SIGMAS, None, estimator.xi
         for column, slot in self._first[1]:
             bias = abs(xi.item(slot))
             sigmas = bias / model.initial.item(slot)
@@ -177,11 +177,11 @@ class RateUnits:
                 gyro, worst = column < FORCE_ERROR, sigmas
                 size, unit = (math.degrees(bias), "deg/s") if gyro else (bias, "m/s^2")
                 sensor = "Gyro" if gyro else "Accelerometer"
-                told = reason("bias_size", sensor=sensor, size=size, unit=unit, sigmas=sigmas)
-        return told
+                found = reason("bias_size", sensor=sensor, size=size, unit=unit, sigmas=sigmas)
+        return found
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
-        """The samples from row `new` on have come."""
+        """Take the samples from row `new` on."""
         count = imu.end - new
         if not count:
             return
@@ -193,17 +193,19 @@ class RateUnits:
         self._squares += squares(imu.samples, new, imu.end)
         self._count += count
         if imu.latest_ns - self._since_ns >= RMS_S * 1e9:
-            self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
+            self._report(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
             self._squares, self._count = 0.0, 0
 
-    def fix(self, m: object, t_ns: int, imu: ImuBuffer, aids: Sequence[Aid]) -> None:
-        """A measurement, valid at `t_ns`, as the aids it stands for: velocities count, and
+    def fix(
+        self, m: object, t_ns: int, imu: ImuBuffer, measurements: Sequence[AidingMeasurement]
+    ) -> None:
+        """A measurement, valid at `t_ns`, as the measurements it stands for: velocities count, and
         positions of a source that gives none."""
         if not isinstance(m, PositionFix) or m.v_ned_m_s is None:
-            for aid in () if self.fits else aids:
-                for candidate in aid.candidates():
+            for measurement in () if self.fits else measurements:
+                for candidate in measurement.candidates():
                     if isinstance(candidate, PositionCandidate):
-                        way = self._ways.setdefault(aid.source, WayTurns(self._bias_sd))
+                        way = self._ways.setdefault(measurement.source, WayTurns(self._bias_sd))
                         way.fix(candidate._replace(t_ns=t_ns))
             return
         turns = self._turns.get(m.source)
@@ -212,21 +214,21 @@ class RateUnits:
         turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
         self.due_ns[m.source] = turns.next_ns
         if turns.decided:
-            self._tell(turns.said())
+            self._report(turns.said())
             self.fits = self.wrong is None and (self.fits or turns.fits)
-            turns.begin_anew()
+            turns.restart()
 
     def _weigh(self, way: WayTurns) -> None:
         """A way has gone on: what it tells of the unit."""
-        evidence = way.told()
+        evidence = way.log_odds()
         if abs(evidence) <= PROOF:
             return
         well = evidence > 0.0
-        self._tell(None if well else reason("rate_path"))
+        self._report(None if well else reason("rate_path"))
         self.fits = well
-        way.begin_anew()
+        way.restart()
 
-    def _tell(self, wrong: str | None) -> None:
+    def _report(self, wrong: str | None) -> None:
         if wrong is not None and self.wrong is None:
             self._event("imu_units", wrong)
         elif wrong is None and self.wrong is not None:

@@ -1,4 +1,4 @@
-"""Aids of a timeline as rows of numbers, for runs of an estimator over many of them."""
+"""Measurements of a timeline as rows of numbers, for runs of an estimator over many of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, NAMES, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.hypotheses import Hypotheses
@@ -51,7 +51,7 @@ class Span:
 
 
 class MeasurementRows:
-    """Rows for one estimator; none for one that takes aids one by one."""
+    """Rows for one estimator; none for one that takes measurements one by one."""
 
     def __init__(self, estimator: Estimator) -> None:
         runs = estimator.runs
@@ -62,8 +62,9 @@ class MeasurementRows:
         self._noise = np.zeros((0, NOISE_SIZE))
         self._spans: dict[str, Span] = {}
 
-    def packed(self, measurement: Aid) -> tuple[bytes, object]:
-        """An aid's row, empty where it has none, and what a frozen sensor would repeat of it."""
+    def packed(self, measurement: AidingMeasurement) -> tuple[bytes, object]:
+        """A measurement's row, empty where it has none, and what a frozen sensor would repeat of
+        it."""
         bank = None if measurement.robust else self._bank
         packed = None if bank is None else measurement.packed(self._model)
         if bank is None or packed is None:
@@ -74,8 +75,8 @@ class MeasurementRows:
         shown = None if measurement.constraint else type(measurement).shown
         return row + body + _PADDING[len(body)], None if shown is None else shown(measurement)
 
-    def _new(self, measurement: Aid, bank: Hypotheses) -> tuple[int, int, int, int]:
-        """Constants of an aid's source."""
+    def _new(self, measurement: AidingMeasurement, bank: Hypotheses) -> tuple[int, int, int, int]:
+        """Constants of a measurement's source."""
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not measurement.constraint:
@@ -95,7 +96,7 @@ class MeasurementRows:
             entry = entries[k]
             if not entry.row:
                 break
-            measurement, value = entry.aid, entry.value
+            measurement, value = entry.measurement, entry.value
             source = measurement.source
             if source not in spans:
                 one = diagnosis.plain(measurement)
@@ -116,10 +117,11 @@ class MeasurementRows:
         return np.frombuffer(bytearray().join(rows)).reshape(-1, SIZE), self._noise
 
     def went_on(self, entries: Sequence[Entry], results: Sequence[Sequence[float]]) -> None:
-        """Tell the series of a batch that so many of its aids have come, with these results."""
+        """Tell the series of a batch that so many of its measurements have come, with these
+        results."""
         spans = self._spans
         for entry, result in zip(entries, results, strict=True):
-            span = spans[entry.aid.source]
+            span = spans[entry.measurement.source]
             span.t_ns, span.value = entry.key[0], entry.value
             span.moved += result[MOVES] > 0.0
         for span in spans.values():
@@ -129,7 +131,7 @@ class MeasurementRows:
 
 
 def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:
-    """Outcome of an measurement with a row, by what a run has made of it."""
+    """Outcome of a measurement with a row, by what a run has made of it."""
     became, degrees = int(result[BECAME]), HEADER.unpack_from(row)[2]
     if became == FUSED:
         whitened = tuple(result[WHITENED : WHITENED + degrees])

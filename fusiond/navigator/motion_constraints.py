@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fusiond.aiding.base import Aid
-from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.rest_evidence import RestEvidence
-from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
+from fusiond.aiding.standstill import Rest, ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.configuration.constraints import Constraints, NonHolonomic
 from fusiond.configuration.settings import DEG, quiet_limits
 from fusiond.models.blocks import Block, ImuNoise
@@ -17,14 +17,14 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
 
 GATE = 0.9999
-"""Gate probability, as the measured aids' default."""
+"""Gate probability, as the measured measurements' default."""
 
 
 class Sensed(NamedTuple):
-    """The windows that have ended, and the aids that hold."""
+    """The windows that have ended, and the measurements that hold."""
 
     windows: list[Window]
-    aids: list[Aid]
+    measurements: list[AidingMeasurement]
 
 
 def vehicle_blocks(options: NonHolonomic) -> list[Block]:
@@ -58,16 +58,16 @@ class ConstraintMaker:
         windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
         if windows:
             self.rest_evidence.catch_up()
-        aids: list[Aid] = []
+        measurements: list[AidingMeasurement] = []
         if self._options.zero_velocity.enabled:
             for window in windows:
                 if window.quiet:
-                    aids += self._standstill(window)
+                    measurements += self._standstill(window)
         if self._options.non_holonomic.enabled:
-            aids += self._no_sliding(imu, new)
-        return Sensed(windows, aids)
+            measurements += self._no_sliding(imu, new)
+        return Sensed(windows, measurements)
 
-    def _standstill(self, w: Window) -> list[Aid]:
+    def _standstill(self, w: Window) -> list[AidingMeasurement]:
         z = self._options.zero_velocity
         rest = Rest(
             w,
@@ -80,19 +80,19 @@ class ConstraintMaker:
         )
         rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
         return [
-            ZeroVelocityAid("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, rest),
-            ZeroRateAid("zero_rate", w.end_ns, GATE, rate, rest.rate_sd_rad_s, rest),
+            ZeroVelocityUpdate("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, rest),
+            ZeroAngularRateUpdate("zero_rate", w.end_ns, GATE, rate, rest.rate_sd_rad_s, rest),
         ]
 
-    def _no_sliding(self, imu: ImuBuffer, new: int) -> list[Aid]:
-        """One at the first sample of each interval."""
+    def _no_sliding(self, imu: ImuBuffer, new: int) -> list[AidingMeasurement]:
+        """Non-holonomic constraints, one at the first sample of each interval."""
         o = self._options.non_holonomic
         width, rows, row = round(o.interval_s * 1e9), [], new
         while (row := next_cell(imu.times, row, imu.end, width, self._last_cell)) >= 0:
             self._last_cell = int(imu.times[row]) // width
             rows.append(row)
         return [
-            NonHolonomicAid(
+            NonHolonomicConstraint(
                 "non_holonomic",
                 int(imu.times[row]),
                 GATE,

@@ -36,13 +36,13 @@ from fusiond.navigator.assembly import (
     verdicts_of,
 )
 from fusiond.navigator.calibration import CalibrationWatch
-from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
+from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_noise import ImuNoise
 from fusiond.navigator.imu_screening import ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.intake.gnss import told_by_operator
+from fusiond.navigator.intake.gnss import operator_position
 from fusiond.navigator.motion_constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.protection import NO_BOUND, ProtectionWatch
 from fusiond.navigator.published_solution import publish_by_own_clock, solution_of
@@ -91,8 +91,8 @@ class Navigator:
         self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
-        of_aids = self._intake.extra_blocks()
-        self.model = model_of(config, *of_vehicle, *of_aids)
+        shared_blocks = self._intake.extra_blocks()
+        self.model = model_of(config, *of_vehicle, *shared_blocks)
         self.imu = imu_buffer_of(config)
         self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
@@ -107,7 +107,7 @@ class Navigator:
         self._on_outcome = on_outcome
         self._constraints = ConstraintMaker(config.constraints, self._noise)
         names = e.federated.sources or tuple(config.aiding)
-        self._failed = FailedAids(self._event)
+        self._failed = FailedMeasurements(self._event)
         self._service_events = ServiceEvents(self.timeline, self._event)
         self.service = SourceService(self.timeline, names)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
@@ -115,10 +115,10 @@ class Navigator:
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self.without_imu = WithoutImu(
-            config, of_aids, self._event, self.last_fused_ns, self._on_outcome
+            config, shared_blocks, self._event, self.last_fused_ns, self._on_outcome
         )
         self._last_position_ns = self._verdicts_ns = 0
-        self._heading = ""
+        self._basis = ""
         self.started: Start | None = None
         self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
@@ -169,12 +169,12 @@ class Navigator:
         taken = 0
         for run in self._screening.admit(times, samples, self.imu, self.started is not None):
             if run.ends:
-                self._begin_anew(run.ends)
+                self._restart(run.ends)
             if appended := self.imu.append(run.times, run.samples):
                 self._sense(appended)
             taken += appended
         if self._screening.restarts(self.imu):
-            self._begin_anew(reason("imu_stamps_back"))
+            self._restart(reason("imu_stamps_back"))
         return taken
 
     def change_imu(self) -> None:
@@ -186,9 +186,9 @@ class Navigator:
         publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
             return hand_over(self.estimator, self.timeline, self.config.imu)
-        return self._begin_anew(reason("imu_spare"))
+        return self._restart(reason("imu_spare"))
 
-    def _begin_anew(self, why: str) -> None:
+    def _restart(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""
         saved = self._saved if self.started is None else None
         self.imu.restart()
@@ -200,9 +200,9 @@ class Navigator:
         sensed = self._constraints.feed(self.imu, new)
         self._units.samples(self.imu, new)
         if self.started is None:
-            self._aligner.sensed(sensed.windows, sensed.aids)
-        for aid in sensed.aids:
-            self.timeline.insert(aid)
+            self._aligner.sensed(sensed.windows, sensed.measurements)
+        for measurement in sensed.measurements:
+            self.timeline.insert(measurement)
 
     def learn(self, message: NavigationMessage) -> None:
         """Store a broadcast message, for the raw epochs of the same source."""
@@ -218,24 +218,24 @@ class Navigator:
         if sd_time_s > UNKNOWN_TIME_S:
             return self._refuse(m.source, "time_unknown")
         try:
-            aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
+            measurements = self._intake.measurements_of(m, t_ns, sd_time_s, seen_ns)
         except RAISED_BY_NUMBERS as error:
-            self._failed.tell(m.source, repr(error))
+            self._failed.report(m.source, repr(error))
             return self._refuse(m.source, "failed")
-        if isinstance(aids, str):
-            return self._refuse(m.source, aids)
-        self.without_imu.receive(aids, seen_ns)
+        if isinstance(measurements, str):
+            return self._refuse(m.source, measurements)
+        self.without_imu.receive(measurements, seen_ns)
         if self.started is not None and m.source in self._latency.on_time:
-            self._latency.waiting.append((m.source, aids))
+            self._latency.waiting.append((m.source, measurements))
         else:
-            aids = self._latency.hear(m.source, aids)
+            measurements = self._latency.receive(m.source, measurements)
         if self.started is None:
-            self._aligner.aids(aids)
+            self._aligner.receive(measurements)
         if t_ns >= self._units.due_ns.get(m.source, 0):
-            self._units.fix(m, t_ns, self.imu, aids)
-        self._constraints.rest_evidence.waiting.extend(aids)
-        for aid in aids:
-            self.timeline.insert(aid)
+            self._units.fix(m, t_ns, self.imu, measurements)
+        self._constraints.rest_evidence.waiting.extend(measurements)
+        for measurement in measurements:
+            self.timeline.insert(measurement)
         return "accepted"
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
@@ -256,13 +256,13 @@ class Navigator:
         outcome is returned."""
         where, without = (lat_rad, lon_rad, height_m), self.without_imu
         if without.takes_over(t_ns, self.imu):
-            return without.take_position(told_by_operator(t_ns, where, sd_m), t_ns) or "beginning"
+            return without.take_position(operator_position(t_ns, where, sd_m), t_ns) or "beginning"
         if without.active:
-            without.take_position(told_by_operator(t_ns, where, sd_m), t_ns)
-        aid = told_by_operator(self.imu.latest_ns, where, sd_m)
+            without.take_position(operator_position(t_ns, where, sd_m), t_ns)
+        measurement = operator_position(self.imu.latest_ns, where, sd_m)
         if self.started is None:
-            self._aligner.aids([aid])
-        entry = self.timeline.insert(aid)
+            self._aligner.receive([measurement])
+        entry = self.timeline.insert(measurement)
         self.advance()
         return "aligning" if entry.outcome is None else entry.outcome.name
 
@@ -278,7 +278,11 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None or self._late() or self._aligner.waits(start, self._latency):
+            if (
+                start is None
+                or self._start_is_too_old()
+                or self._aligner.waits(start, self._latency)
+            ):
                 return
             if self.calibration is not None and not self.on_trial:
                 start = self.calibration.taken_up(start, self.model)
@@ -292,13 +296,13 @@ class Navigator:
             self.started = start
             self._start_check = StartCheck(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._heading = reason("heading_from", how=start.how)
-            self._event("aligned", self._heading)
-        self.timeline.run(record)
+            self._basis = reason("heading_from", how=start.how)
+            self._event("aligned", self._basis)
+        self.timeline.advance(record)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
             self._verdicts_ns = e.t_ns
-            self.verdicts.tell()
+            self.verdicts.report()
         if first_not_finite(e.nav, e.xi, e.covariance) >= 0:
             what = broken(e)
             self._event("filter_not_finite", f"{what}: aligning again")
@@ -306,7 +310,7 @@ class Navigator:
             return
         if self.timeline.decided:
             self.timeline.decided = False
-            if self._service_events.tell():
+            if self._service_events.report():
                 self.calibrating.corrected()
                 self._imu_noise.corrected(e)
         if self._refuted():  # before it is a failure, of which it would be the reason
@@ -322,7 +326,7 @@ class Navigator:
             self.reset(why)
             return
         if self._protection.watches:
-            self._protection.tell()
+            self._protection.report()
         self._imu_noise.look(self.timeline, self.imu)
         if e.t_ns >= self.calibrating.due_ns or self.calibrating.turned:
             self._calibrate()
@@ -348,10 +352,10 @@ class Navigator:
             return False
         self._event(*wrong)
         self.reset(wrong[1])
-        self._aligner.known.told.add(wrong[0])
+        self._aligner.known.reported.add(wrong[0])
         return True
 
-    def _late(self) -> bool:
+    def _start_is_too_old(self) -> bool:
         """True if a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
         found = self._latency.look(self.imu)
@@ -359,7 +363,7 @@ class Navigator:
             return False
         publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
         self.reset(found.why)
-        self._aligner.aids(self._latency.kept())
+        self._aligner.receive(self._latency.kept())
         return True
 
     def _warm_start(self) -> Start | None:
@@ -375,7 +379,8 @@ class Navigator:
 
     @property
     def on_trial(self) -> bool:
-        """Started from the state of the last run, and no position aid has confirmed it yet."""
+        """Started from the state of the last run, and no position measurement has confirmed it
+        yet."""
         return self.warm is not None and self.warm.on_trial
 
     @property
@@ -390,8 +395,8 @@ class Navigator:
 
         Later than the newest sample it is carried ahead by holding that sample's rates, at most for
         `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state of
-        that very instant, by the aids valid until then; before what is kept of it (`buffer_s`, and
-        the start) nothing is known. The mode is always that of now.
+        that very instant, by the measurements valid until then; before what is kept of it
+        (`buffer_s`, and the start) nothing is known. The mode is always that of now.
         """
         if self.without_imu.estimator is not None:
             return self.without_imu.solution(t_ns, self.mode(t_ns)[1], self._protection.unknown())
@@ -414,11 +419,11 @@ class Navigator:
         """Mode at `t_ns`, and why."""
         started = None
         if self.started is not None:
-            started = StartedNavigation(self._heading, self.unconfirmed, self._last_position_ns)
+            started = StartedNavigation(self._basis, self.unconfirmed, self._last_position_ns)
         return self._status.of(t_ns, started, self._aligner.reason)
 
     @property
-    def serving(self) -> Estimator:
+    def active_filter(self) -> Estimator:
         """The estimator of which the solution is."""
         return self.without_imu.estimator or self.estimator
 
@@ -433,26 +438,29 @@ class Navigator:
         return name
 
     def _outcome(self, entry: Entry) -> None:
-        outcome, aid = entry.outcome, entry.aid
+        outcome, measurement = entry.outcome, entry.measurement
         if outcome is None:
             return
-        name, source = outcome.name, aid.source
-        if self.warm is not None and aid.locates:
+        name, source = outcome.name, measurement.source
+        if self.warm is not None and measurement.locates:
             self.warm.judge(source, name)
         if name == "fused":
             if not entry.judged and outcome.whitened:
                 entry.judged = True
-                self.verdicts.waiting.append((aid, outcome))
+                self.verdicts.waiting.append((measurement, outcome))
             t_ns = entry.key[0]
             if t_ns > self.last_fused_ns.get(source, -1):
                 self.last_fused_ns[source] = t_ns
-            if aid.locates and t_ns > self._last_position_ns:
+            if measurement.locates and t_ns > self._last_position_ns:
+                unaided_s = (t_ns - self._last_position_ns) * 1e-9
+                if unaided_s > self.config.estimator.coast_after_s:
+                    self._basis = reason("fixes_back", source=source)
                 self._last_position_ns = t_ns
-        if aid.screened:
-            aid.judged(outcome.rows, outcome.whitened)
+        if measurement.screened:
+            measurement.judged(outcome.rows, outcome.whitened)
             if name in JUDGED:
-                self._protection.look(aid)
+                self._protection.look(measurement)
         if entry.error:
-            self._failed.tell(source, entry.error)
+            self._failed.report(source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)

@@ -4,8 +4,8 @@ What engine and road shake into the samples bounds the noise of a sensor (fusion
 vibration). A part of it is motion that the sensors measure, and vibration that averages out later
 than the longest of those means; neither the samples nor the innovations of one fix after another
 say how much, for a filter that follows its fixes hides it. So another filter carries the state on
-for `EVERY_NS` without any aid. With A its covariance then if the samples had no noise at all, A + B
-with the noise as it counts, and P of the filter, which has had the aids,
+for `EVERY_NS` without any measurement. With A its covariance then if the samples had no noise at
+all, A + B with the noise as it counts, and P of the filter, which has had the measurements,
 
     d = v_predicted - v,   var(d) = A + (g / g_0) B - P,        P' - P of estimates that are optimal
 
@@ -15,9 +15,9 @@ likelihood is summed up over predictions, none of which overlaps another, on a g
 likely at first as the next (nobody knows the size of it); E[g] is what counts. Noise of the data
 sheet counts in any case.
 
-A prediction tells nothing where the filter itself had no aids: P is no less than `KNOWN` of A + B
-then. It is made of what was valid `SETTLES_NS` ago, when nothing comes any more that is earlier, so
-that the order of arrival leaves no trace.
+A prediction tells nothing where the filter itself had no measurements: P is no less than `KNOWN` of
+A + B then. It is made of what was valid `SETTLES_NS` ago, when nothing comes any more that is
+earlier, so that the order of arrival leaves no trace.
 
 Source: Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15
 (1970), for predictions over several steps; Magill, Optimal adaptive estimation of sampled
@@ -51,7 +51,7 @@ many of them may have come, and one share counts for the whole of another predic
 GRID: Final = 2.0 ** -np.arange(0.0, 10.5, 0.5)
 """Shares of the density: all of it, down to a thirtieth of the sigma."""
 KNOWN = 0.25
-"""Share of a predicted variance: no more may be left of the velocity's with aids."""
+"""Share of a predicted variance: no more may be left of the velocity's with measurements."""
 HEADING_SD_RAD = math.radians(5.0)
 """Beyond it what a velocity is wrong by is no linear function of the heading."""
 FORGETS = 60.0

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.separation import SeparatedEstimator
@@ -52,10 +52,10 @@ class ProtectionWatch:
         self._inside_since_ns = 0
         self._last: tuple[int, Level] | None = None
 
-    def look(self, aid: Aid) -> None:
-        """An aid has been looked at; the estimator is where that left it."""
+    def look(self, measurement: AidingMeasurement) -> None:
+        """A measurement has been looked at; the estimator is where that left it."""
         if self._levels is not None:
-            self._levels.look(aid)
+            self._levels.look(measurement)
 
     def restart(self) -> None:
         """The solution begins anew: what was heard said nothing of it."""
@@ -77,7 +77,7 @@ class ProtectionWatch:
         state = BoundState.BEYOND if self._passed(found) else BoundState.WITHIN
         return Bound(state, found.hpl_m, vertical)
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Compute the levels of the estimator's present state, with events where they pass."""
         if self._levels is None:
             return

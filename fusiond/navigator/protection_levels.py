@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.protection import IntegrityRisk, filter_protection
 from fusiond.navigator.epoch_protection import EpochProtection
-from fusiond.navigator.raw_gnss import RawEpochAid
+from fusiond.navigator.raw_gnss import RawEpochMeasurement
 
 
 class Level(NamedTuple):
@@ -57,10 +57,10 @@ class Levels:
         """The state's instant."""
         return self._estimator.t_ns
 
-    def look(self, aid: Aid) -> None:
-        """An aid has been looked at; the estimator is where that left it."""
-        if isinstance(aid, RawEpochAid):
-            self._epochs.look(aid, self._estimator.state)
+    def look(self, measurement: AidingMeasurement) -> None:
+        """A measurement has been looked at; the estimator is where that left it."""
+        if isinstance(measurement, RawEpochMeasurement):
+            self._epochs.look(measurement, self._estimator.state)
 
     def restart(self) -> None:
         """The solution begins anew: what was heard said nothing of it."""

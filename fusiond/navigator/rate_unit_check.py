@@ -126,7 +126,7 @@ class WayTurns:
         if newest is None or position.t_ns > newest.t_ns:
             self._waiting.append(position)
 
-    def told(self) -> float:
+    def log_odds(self) -> float:
         """2 ln (L_1 / L_57) where the likelier of the two fits, of all that is remembered; 0 where
         neither does."""
         if len(self._chords) < 3:
@@ -135,7 +135,7 @@ class WayTurns:
         better = min(costs, key=lambda cost: cost[0])
         return costs[1][0] - costs[0][0] if better[1] else 0.0
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget the way so far."""
         self._chords.clear()
 
@@ -187,21 +187,22 @@ class WayTurns:
             if after.follows:
                 along = math.cos(after.course - before.course)
                 c[i, i - 1] = c[i - 1, i] = -before.ends[1] * after.ends[0] * along
-        apart = _unwound([x.course - x.turned[unit] for x in chords], np.sqrt(np.diag(c)))
+        residuals = _unwound([x.course - x.turned[unit] for x in chords], np.sqrt(np.diag(c)))
         bias_sd = self._bias_sd / UNITS[1] * UNITS[unit]
         c += np.outer(t, t) * bias_sd**2
         inverse = np.linalg.inv(c)
         information = float(inverse.sum())
-        mean = float((inverse @ apart).sum()) / information
-        off = apart - mean
+        mean = float((inverse @ residuals).sum()) / information
+        off = residuals - mean
         cost = float(off @ inverse @ off)
         determinant = float(np.linalg.slogdet(c)[1]) + math.log(information)
         return cost + determinant, cost <= quantile(n - 1, 1.0 - FITS)
 
 
 def _directions(faced: Array) -> tuple[float, float]:
-    """The mean of directions (m,) that were faced one after the other, in their own turns, and what
-    one of them, any, is off by, one sigma (rad)."""
+    """Mean of directions (m,) and one sigma (rad) of any of them.
+
+    They were faced one after the other, each in its own turn."""
     begin = float(faced[0])
     mean = complex(np.exp(1j * (faced - begin)).mean())
     spread = float(faced.max() - faced.min())

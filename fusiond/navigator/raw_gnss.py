@@ -1,4 +1,4 @@
-r"""Tight coupling: a receiver's raw epochs become aids of corrected ranges and rates.
+r"""Tight coupling: a receiver's raw epochs become measurements of corrected ranges and rates.
 
 What a receiver broadcasts on (ephemerides, ionosphere) is kept; each epoch is corrected for the
 place where the filter is at its instant (100 m off moves a correction by 1 cm). Before there is a
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from drivers.raw.messages import Ephemeris, NavigationMessage, RawGnssEpoch
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
-from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeMeasurement, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.climbing import take_off_climb
@@ -31,8 +31,8 @@ from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.levels import Levels, take_off
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.range_kernel import (
-    AID_ROWS,
     CARRIER_VARIANCE,
+    RANGE_VALUES,
     RATE_VARIANCE,
     VARIANCE,
 )
@@ -90,7 +90,7 @@ class _Corrected(NamedTuple):
     followed: Followed
     guess: Array
     rows: Rows
-    aid: PseudorangeAid
+    measurement: PseudorangeMeasurement
 
 
 @dataclass(slots=True)
@@ -116,7 +116,7 @@ class _Memory:
 
 
 @immutable(eq=False)
-class RawEpochAid(Aid):
+class RawEpochMeasurement(AidingMeasurement):
     """An epoch whose signals have been chosen, to be corrected where the filter is at its instant.
 
     So the order of arrival leaves no trace: what an epoch comes to depends on the state at its own
@@ -136,7 +136,7 @@ class RawEpochAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return RANGE_BIAS
 
-    def at(self, nav: Array) -> PseudorangeAid:
+    def at(self, nav: Array) -> PseudorangeMeasurement:
         """The epoch's ranges for a vehicle there; it may have no satellites left."""
         lat, lon, height = nav[:3].tolist()
         followed = self.receiver.followed(self)
@@ -145,11 +145,11 @@ class RawEpochAid(Aid):
             guess = np.array(to_ecef(lat, lon, height))
             found = _Corrected(key, followed, guess, *self.receiver.correct(self, followed, guess))
             if nav.size > VD:  # a place alone has no velocity
-                take_off_climb(found.aid.values, lat, height, -nav.item(VD))
+                take_off_climb(found.measurement.values, lat, height, -nav.item(VD))
             self.memory.corrected = found
-        return found.aid
+        return found.measurement
 
-    def unturned(self, way: WayFaced) -> LevelEpoch:
+    def without_attitude(self, way: HeadingHistory) -> LevelEpoch:
         return LevelEpoch(self.source, self.t_ns, self.gate, self, way, robust=self.robust)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -161,7 +161,7 @@ class RawEpochAid(Aid):
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
         found = self.memory.corrected
-        return {} if found is None else found.aid.series(whitened, kept)
+        return {} if found is None else found.measurement.series(whitened, kept)
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         if self.memory.corrected is not None:
@@ -169,23 +169,23 @@ class RawEpochAid(Aid):
 
 
 @immutable(eq=False)
-class LevelEpoch(Aid):
-    """An epoch for a vehicle whose attitude nobody knows (`Aid.unturned`)."""
+class LevelEpoch(AidingMeasurement):
+    """An epoch for a vehicle whose attitude nobody knows (`AidingMeasurement.unturned`)."""
 
     screened: ClassVar[bool] = True
     locates: ClassVar[bool] = True
     placed: ClassVar[bool] = True
 
-    epoch: RawEpochAid
-    way: WayFaced
+    epoch: RawEpochMeasurement
+    way: HeadingHistory
 
     @property
     def shares(self) -> tuple[str, ...]:
         return RANGE_BIAS
 
-    def at(self, nav: Array) -> PseudorangeAid:
+    def at(self, nav: Array) -> PseudorangeMeasurement:
         """The epoch's ranges for a vehicle there."""
-        return self.epoch.at(nav).unturned(self.way)
+        return self.epoch.at(nav).without_attitude(self.way)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return self.at(state.nav).innovation(state)
@@ -193,7 +193,7 @@ class LevelEpoch(Aid):
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         found = self.epoch.memory.corrected
         if found is not None:
-            level = found._replace(aid=found.aid.unturned(self.way))
+            level = found._replace(measurement=found.measurement.without_attitude(self.way))
             self.epoch.receiver.judged(self.epoch, level, codes, whitened)
 
 
@@ -212,9 +212,11 @@ class RawGnss:
         self._model = RangeModel(self._store, options)
         self._guess: Array | None = None
         self._left_out: dict[str, str] = {}
-        self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
+        self._judged: (
+            tuple[RawEpochMeasurement, _Corrected, Sequence[int], Sequence[float]] | None
+        ) = None
         self._counted_ns = -1
-        self.recent: list[RawEpochAid] = []
+        self.recent: list[RawEpochMeasurement] = []
         self._forgotten: tuple[Displacement | None, Levels | None] = None, None
         """Those of the last sky before them."""
         self.refused: Counter[str] = Counter()
@@ -226,11 +228,11 @@ class RawGnss:
         if self._store.replaced > replaced and isinstance(message, Ephemeris):
             self.refused[f"{message.system}_number_of_another"] += 1
 
-    def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
-        """The epoch as an aid, with the ephemerides that are known by now."""
+    def measurement(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochMeasurement:
+        """The epoch as a measurement, with the ephemerides that are known by now."""
         picked = self._model.pick(epoch)
-        aid = RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
-        insort(self.recent, aid, key=_instant)
+        measurement = RawEpochMeasurement(self.source, t_ns, self.gate, self, epoch, picked)
+        insort(self.recent, measurement, key=_instant)
         oldest = self.recent[-1].t_ns - REMEMBERED_NS
         forgotten = self.recent[: bisect_left(self.recent, oldest, key=_instant)]
         for earlier in forgotten:
@@ -238,17 +240,21 @@ class RawGnss:
             if memory.displacement is not None:
                 self._forgotten = memory.displacement, memory.levels
         del self.recent[: len(forgotten)]
-        return aid
+        return measurement
 
-    def followed(self, aid: RawEpochAid) -> Followed:
+    def followed(self, measurement: RawEpochMeasurement) -> Followed:
         """The epoch after all that are known by now to be before it, in whatever order they came:
         one that came late changes those behind it."""
         recent = self.recent
-        at = bisect_left(recent, aid.t_ns, key=_instant)
-        while at < len(recent) and recent[at] is not aid and recent[at].t_ns == aid.t_ns:
+        at = bisect_left(recent, measurement.t_ns, key=_instant)
+        while (
+            at < len(recent)
+            and recent[at] is not measurement
+            and recent[at].t_ns == measurement.t_ns
+        ):
             at += 1
-        if at == len(recent) or recent[at] is not aid:  # older than all that is remembered
-            return aid.memory.followed or self._follow(aid, None)
+        if at == len(recent) or recent[at] is not measurement:  # older than all that is remembered
+            return measurement.memory.followed or self._follow(measurement, None)
         first = at
         while first > 0 and not recent[first].memory.is_after(recent[first - 1].memory):
             first -= 1
@@ -258,70 +264,73 @@ class RawGnss:
                 self._follow(recent[k], None)
             elif before is not None and not memory.is_after(before):
                 self._follow(recent[k], before)
-        found = aid.memory.followed
+        found = measurement.memory.followed
         assert found is not None
         return found
 
-    def _follow(self, aid: RawEpochAid, before: _Memory | None) -> Followed:
-        memory = aid.memory
+    def _follow(self, measurement: RawEpochMeasurement, before: _Memory | None) -> Followed:
+        memory = measurement.memory
         memory.after = None if before is None else before.kept
         memory.kept = nothing_kept() if before is None else before.kept.copy()
         memory.before = nothing_left() if before is None else before.left
-        memory.followed = found = self._model.follow(aid.picked, memory.kept)
+        memory.followed = found = self._model.follow(measurement.picked, memory.kept)
         return found
 
-    def alone(self, aid: RawEpochAid) -> list[Candidate]:
+    def alone(self, measurement: RawEpochMeasurement) -> list[Candidate]:
         """Position and velocity of an epoch alone, for the alignment; none without a solution."""
-        found = single_point(self._model, self.followed(aid), self._guess)
+        found = single_point(self._model, self.followed(measurement), self._guess)
         candidates: list[Candidate] = []
         if isinstance(found, str) or not found.consistent:
             self.refused[found if isinstance(found, str) else "inconsistent"] += 1
         else:
             self._guess = found.position
-            candidates = self._fix(found, aid.t_ns)
-        left_out = aid.picked.plan.refused
+            candidates = self._fix(found, measurement.t_ns)
+        left_out = measurement.picked.plan.refused
         if self._guess is not None:
-            left_out = self._model.evaluate(self.followed(aid), self._guess).refused
+            left_out = self._model.evaluate(self.followed(measurement), self._guess).refused
         self._judged, self._left_out = None, dict(left_out)
-        self._count(aid, left_out)
+        self._count(measurement, left_out)
         return candidates
 
     def correct(
-        self, aid: RawEpochAid, followed: Followed, guess: Array
-    ) -> tuple[Rows, PseudorangeAid]:
-        """An epoch's rows for a vehicle at about `guess` (ECEF, m), and what they are as an aid."""
+        self, measurement: RawEpochMeasurement, followed: Followed, guess: Array
+    ) -> tuple[Rows, PseudorangeMeasurement]:
+        """An epoch's rows for a vehicle at about `guess` (ECEF, m), and what they are as a
+        measurement."""
         rows = self._model.evaluate(followed, guess)
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
-        t_s = aid.epoch.week * WEEK_S + aid.epoch.tow_s
-        before, last = self._sky_before(aid)
+        t_s = measurement.epoch.week * WEEK_S + measurement.epoch.tow_s
+        before, last = self._sky_before(measurement)
         levels = take_off(last, rows, t_s)
-        scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
+        scale, values = self._section.sigma_scale**2, rows.values[:RANGE_VALUES]
         if scale != 1.0:
             values = values.copy()
             values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
-        displacement, kept = self._displaced(aid, rows, levels, before)
-        return rows, PseudorangeAid(
+        displacement, kept = self._displaced(measurement, rows, levels, before)
+        return rows, PseudorangeMeasurement(
             self.source,
-            aid.t_ns,
-            aid.gate,
+            measurement.t_ns,
+            measurement.gate,
             rows.satellites,
             values,
             rows.clock,
             self._section.lever_arm_m,
-            aid.epoch.clock_reset,
-            aid.memory.before,
-            aid.memory.left,
+            measurement.epoch.clock_reset,
+            measurement.memory.before,
+            measurement.memory.left,
             displacement.shape,
             kept,
             levels.seen,
-            robust=aid.robust,
+            robust=measurement.robust,
         )
 
-    def _sky_before(self, aid: RawEpochAid) -> tuple[Displacement | None, Levels | None]:
+    def _sky_before(
+        self, measurement: RawEpochMeasurement
+    ) -> tuple[Displacement | None, Levels | None]:
         """Displacement and levels of the last epoch before one that had satellites."""
-        at = bisect_left(self.recent, aid.t_ns, key=_instant)
+        at = bisect_left(self.recent, measurement.t_ns, key=_instant)
         for k in range(at - 1, -1, -1):
             memory = self.recent[k].memory
             if memory.displacement is not None:
@@ -329,12 +338,16 @@ class RawGnss:
         return self._forgotten
 
     def _displaced(
-        self, aid: RawEpochAid, rows: Rows, levels: Levels, before: Displacement | None
+        self,
+        measurement: RawEpochMeasurement,
+        rows: Rows,
+        levels: Levels,
+        before: Displacement | None,
     ) -> tuple[Displacement, tuple[Array, Array] | None]:
         """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
         if not rows.satellites:
             return NOWHERE, None
-        memory, t_s = aid.memory, levels.t_s
+        memory, t_s = measurement.memory, levels.t_s
         memory.levels = levels
         if before is not None and before.holds(rows, t_s):
             memory.displacement = before
@@ -344,57 +357,59 @@ class RawGnss:
 
     def judged(
         self,
-        aid: RawEpochAid,
+        measurement: RawEpochMeasurement,
         corrected: _Corrected,
         codes: Sequence[int],
         whitened: Sequence[float],
     ) -> None:
         """The filter has looked at an epoch; one that a rewind brings again counts once."""
-        self._judged = aid, corrected, codes, whitened
+        self._judged = measurement, corrected, codes, whitened
         self._guess = corrected.guess
-        self._count(aid, corrected.rows.refused)
-        if not codes or aid.t_ns <= self._counted_ns:
+        self._count(measurement, corrected.rows.refused)
+        if not codes or measurement.t_ns <= self._counted_ns:
             return
-        self._counted_ns = aid.t_ns
+        self._counted_ns = measurement.t_ns
         if codes.count(KEPT) == len(codes):
             return
-        for (satellite, what), code in zip(corrected.aid.labels, codes, strict=True):
+        for (satellite, what), code in zip(corrected.measurement.labels, codes, strict=True):
             if code != KEPT:
                 self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
-    def _count(self, aid: RawEpochAid, refused: Sequence[tuple[str, str]]) -> None:
+    def _count(self, measurement: RawEpochMeasurement, refused: Sequence[tuple[str, str]]) -> None:
         """Satellites that do not serve, once an epoch."""
-        if not aid.memory.counted:
-            aid.memory.counted = True
+        if not measurement.memory.counted:
+            measurement.memory.counted = True
             for satellite, reason in refused:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
-            for satellite, reason in self.followed(aid).slips:
+            for satellite, reason in self.followed(measurement).slips:
                 self.refused[f"{satellite[0]}_{reason}" if satellite else reason] += 1
 
     def sky(self) -> Sky:
         """Result of the last epoch."""
         if self._judged is None:
             return Sky(refused=dict(self._left_out))
-        epoch_aid, corrected, codes, whitened = self._judged
+        epoch_measurement, corrected, codes, whitened = self._judged
         used, refused, squares = [], dict(corrected.rows.refused), []
-        aid = corrected.aid
+        measurement = corrected.measurement
         whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
-        for (satellite, what), code, innovation in zip(aid.labels, codes, whitened, strict=False):
+        for (satellite, what), code, innovation in zip(
+            measurement.labels, codes, whitened, strict=False
+        ):
             if what == "range":
                 if code == KEPT:
                     used.append(satellite)
                     squares.append(innovation**2)
                 else:
                     refused[satellite] = REASONS.get(code, "gated")
-        here = [k for k, name in enumerate(aid.satellites) if name in used]
-        sight = aid.position[here] - corrected.guess
+        here = [k for k, name in enumerate(measurement.satellites) if name in used]
+        sight = measurement.position[here] - corrected.guess
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         return Sky(
             tuple(used),
             refused,
-            dops(sight, aid.clock[here], corrected.guess) if used else None,
+            dops(sight, measurement.clock[here], corrected.guess) if used else None,
             math.sqrt(float(np.mean(squares))) if squares else None,
-            _seen(epoch_aid.epoch, corrected.rows),
+            _seen(epoch_measurement.epoch, corrected.rows),
         )
 
     def _fix(self, found: SinglePoint, t_ns: int) -> list[Candidate]:
@@ -412,8 +427,8 @@ class RawGnss:
         return candidates
 
 
-def _instant(aid: RawEpochAid) -> int:
-    return aid.t_ns
+def _instant(measurement: RawEpochMeasurement) -> int:
+    return measurement.t_ns
 
 
 def _seen(epoch: RawGnssEpoch, rows: Rows) -> dict[str, Seen]:

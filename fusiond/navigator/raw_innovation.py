@@ -3,10 +3,11 @@ has judged it.
 
     z = H_p dr + ...   or, where no position is measured,   z = H_v dv + ...
 
-Aids give their rows as their filter wants them, RDSS fixes whitened by their covariance. The raw
-innovation is solved for what the rows measure directly: as many axes (north, east, down) as there
-are rows; else each row along the direction of its own, z_i / |H_i|, as for a vehicle's wheels.
-Angles and pseudoranges have none: the rows of the latter are metres and m/s, but dozens an epoch.
+Measurements give their rows as their filter wants them, RDSS fixes whitened by their covariance.
+The raw innovation is solved for what the rows measure directly: as many axes (north, east, down) as
+there are rows; else each row along the direction of its own, z_i / |H_i|, as for a vehicle's
+wheels. Angles and pseudoranges have none: the rows of the latter are metres and m/s, but dozens an
+epoch.
 
 While an estimate is held back (RDSS by optimal prediction), the estimate is the navigation state
 without it.
@@ -37,12 +38,12 @@ class RawInnovation(NamedTuple):
     axes: str
 
 
-def raw_innovation(aid: Linearised, estimator: Estimator) -> RawInnovation | None:
-    """Of an aid that is about to be applied; None where it measures neither."""
-    if aid.screened or math.isfinite(aid.period):
+def raw_innovation(measurement: Linearised, estimator: Estimator) -> RawInnovation | None:
+    """Of a measurement that is about to be applied; None where it measures neither."""
+    if measurement.screened or math.isfinite(measurement.period):
         return None
     e = estimator
-    rows = aid.innovation(State(e.nav, e.xi, e.step, e.model, e.covariance))
+    rows = measurement.innovation(State(e.nav, e.xi, e.step, e.model, e.covariance))
     if isinstance(rows, NotApplicable):
         return None
     return of_rows(rows.z.tolist(), rows.h[:, VELOCITY_AND_POSITION].tolist())

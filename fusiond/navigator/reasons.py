@@ -277,9 +277,16 @@ SOLUTION: Mapping[str, Reason] = {
         "Check power and bus of the IMU, if there is one.",
     ),
     "heading_from": Reason("info", "Heading from {how}"),
-    "calibration_wrong": Reason("warning", "The saved calibration is wrong: {what}"),
-    "warm_start_wrong": Reason("warning", "{source} contradicts the state of the last run"),
-    "before_history": Reason("info", "Before the stored history"),
+    "fixes_back": Reason("info", "Position fixes of {source} are back"),
+    "calibration_wrong": Reason(
+        "warning",
+        "The saved calibration is wrong: {what}",
+        "If it repeats, check the IMU's mounting.",
+    ),
+    "warm_start_wrong": Reason(
+        "warning", "{source} contradicts the state of the last run", "Wait: alignment runs again."
+    ),
+    "before_history": Reason("info", "Before the stored history", "Ask for a later instant."),
 }
 
 REASONS: Mapping[str, Reason] = {**STARTING, **IMU, **ALIGNING, **SOLUTION}

@@ -19,10 +19,12 @@ class ServiceEvents:
         self._found_ns: dict[tuple[str, str], int] = {}
         """By kind and device: the last finding that was seen."""
 
-    def tell(self) -> bool:
-        """`sensor_fault` for each step that was corrected, `fault_over` for a source's fault that
-        the solution had followed, `isolated` and `readmitted` for each
-        series that has left or is back in service; whether there are new findings."""
+    def report(self) -> bool:
+        """Report changes of service; True if there are new findings.
+
+        Events: `sensor_fault` for each step that was corrected, `fault_over` for a source's fault
+        that the solution had followed, `isolated` and `readmitted` for each series that has left
+        service or is back."""
         diagnosis, found = self._timeline.diagnosis, False
         for finding in diagnosis.findings:
             key = finding.kind.name, finding.kind.device

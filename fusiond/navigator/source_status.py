@@ -2,7 +2,7 @@
 
 A fault of a source lasts from its finding until every series that it spoils is nominal again: while
 one of them is out of service or on probation, and has been since that finding or before. A fault
-that was corrected is over at once; it is told for `CORRECTED_TOLD_NS`.
+that was corrected is over at once; it is told for `CORRECTED_SHOWN_NS`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from fusiond.integrity.fault_finding import Finding
 from fusiond.integrity.service import Series, Service
 from fusiond.navigator.timeline import Timeline
 
-CORRECTED_TOLD_NS = 60_000_000_000
+CORRECTED_SHOWN_NS = 60_000_000_000
 """The longest usual interval of those who ask: Prometheus scrapes each minute by default."""
 WORST_FIRST = (Service.OUT, Service.PROBATION, Service.SUSPECTED, Service.NOMINAL)
 
@@ -41,7 +41,7 @@ class SourceService:
         diagnosis, found = self._timeline.diagnosis, []
         for finding in diagnosis.findings:
             if finding.kind.corrected:
-                if t_ns - finding.t_ns <= CORRECTED_TOLD_NS:
+                if t_ns - finding.t_ns <= CORRECTED_SHOWN_NS:
                     found.append(Fault(finding, ()))
                 continue
             spoiled = [name for name, s in diagnosis.series.items() if _suffers(finding, s)]
@@ -59,7 +59,7 @@ class SourceService:
         return {name: s.state for name, s in series.items() if source in (name, s.device)}
 
     def reason(self, source: str) -> str | None:
-        """Reason why a source of aids is left out; None if it is not."""
+        """Reason why a source of measurements is left out; None if it is not."""
         if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
             return reason
         local = self._local(source)

@@ -1,6 +1,6 @@
 """Navigation status: the mode of a running solution, from what is published of it.
 
-The first reason that holds is told; the order is that of their weight. What each mode means to who
+The first reason that holds is given; the order is that of their weight. What each mode means to who
 reads it: `fusiond.navigation.solution`.
 """
 
@@ -21,17 +21,20 @@ from fusiond.navigator.reasons import joined, reason
 
 
 class StartedNavigation(NamedTuple):
-    """Start of the navigation: how its `heading` came about, in words; `unconfirmed`: what that
-    hangs on and nothing has shown, empty where it does not; `position_ns`: of the last position
-    fused."""
+    """Navigation since its start.
 
-    heading: str
+    `basis`: why it navigates, in words: how its heading came about, or which fixes ended the last
+    coasting. `unconfirmed`: condition of the heading that nothing has shown yet, else empty.
+    `position_ns`: instant of the last position fused.
+    """
+
+    basis: str
     unconfirmed: str
     position_ns: int
 
 
 class NavigationStatus:
-    """Judges the solution of one navigator, whose parts it looks at and changes nothing of."""
+    """Judge of one navigator's solution; reads its parts and changes nothing."""
 
     def __init__(
         self,
@@ -67,18 +70,17 @@ class NavigationStatus:
         if not sd_m <= self._limits.invalid_sd_m:
             limit = self._limits.invalid_sd_m
             return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
-        heading = started.heading
         if started.unconfirmed:
-            return Mode.COASTING, joined((heading, started.unconfirmed))
+            return Mode.COASTING, joined((started.basis, started.unconfirmed))
         if not self._units.fits and (why := self._units.unproven(self._estimator)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - started.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:
             return Mode.COASTING, reason("no_fix", seconds=unaided)
-        return Mode.NAVIGATING, heading
+        return Mode.NAVIGATING, started.basis
 
     def failure(self, diagnosis: Diagnosis) -> str | None:
-        """Reason why navigation must begin anew; None while it need not."""
+        """Reason why navigation must restart; None while it need not."""
         e = self._estimator
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:

@@ -1,10 +1,10 @@
-"""The timeline: aids in order of validity, checkpoints of the filter, exact rewinding.
+"""The timeline: measurements in order of validity, checkpoints of the filter, exact rewinding.
 
-An aid whose instant has passed takes the filter back to the last checkpoint before it; it is
+A measurement whose instant has passed takes the filter back to the last checkpoint before it; it is
 applied at its own instant, and everything after it runs again. The state that results is, bit for
-bit, the one that would have come of arrival in order of validity, as long as the aid is younger
-than the oldest checkpoint. Aids of one instant are ordered by source, not by arrival; a feedback
-that is due comes first.
+bit, the one that would have come of arrival in order of validity, as long as the measurement is
+younger than the oldest checkpoint. Measurements of one instant are ordered by source, not by
+arrival; a feedback that is due comes first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Feedback
+from fusiond.aiding.base import AidingMeasurement, Feedback
 from fusiond.aiding.candidates import Candidate
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.estimators.row_kernels import INNOVATION, JUDGE, KEEP, RESULT
@@ -33,20 +33,20 @@ Key = tuple[int, str, int]
 
 # Outcomes that say something of a source.
 JUDGED = frozenset({"fused", "gated", "isolated"})
-# Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
-# vehicle sends. Beyond it the oldest are given up.
+# Measurements that may wait for the start or for the IMU: more than a minute of all that a
+# well-equipped vehicle sends. Beyond it the oldest are given up.
 MOST_WAITING = 4096
 
 
 @dataclass(slots=True)
 class Entry:
-    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `judged`
-    that its innovation has been told a verdict of: a rewind applies it again. `error` is what made
-    it `failed`; `raw` is kept where the timeline `keeps_raw`. `row` is the aid as a row of numbers,
-    empty where it has none, and `value` what a frozen sensor would repeat."""
+    """A measurement on the timeline and how it ended so far; `serial` tells equal sources apart,
+    `judged` that its innovation has been told a verdict of: a rewind applies it again. `error` is
+    what made it `failed`; `raw` is kept where the timeline `keeps_raw`. `row` is the measurement as
+    a row of numbers, empty where it has none, and `value` what a frozen sensor would repeat."""
 
     key: Key
-    aid: Aid
+    measurement: AidingMeasurement
     feedback: Feedback = "at_once"
     row: bytes = b""
     value: object = None
@@ -73,7 +73,7 @@ class Counters:
 
 
 class Timeline:
-    """Runs an estimator over IMU samples and aids in order of validity.
+    """Runs an estimator over IMU samples and measurements in order of validity.
 
     `on_outcome` is called with each entry whenever it has been applied, again after a rewind.
     """
@@ -91,10 +91,11 @@ class Timeline:
         self.imu = imu
         self.counters = Counters()
         self.keeps_raw = False
-        """True if entries are to have their raw innovation: a log wants it, at 10 us an aid."""
+        """True if entries are to have their raw innovation: a log wants it, at 10 us a
+        measurement."""
         self.decided = True
-        """True if anything was decided since somebody set this to False: more than that aids that
-        are in service were fused."""
+        """True if anything was decided since somebody set this to False: more than that
+        measurements that are in service were fused."""
         self._keep_ns = round(keep_s * 1e9)
         self._checkpoint_ns = round(checkpoint_s * 1e9)
         self._on_outcome = on_outcome
@@ -117,7 +118,7 @@ class Timeline:
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
         for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
-            candidates = self._entries[row].aid.candidates()
+            candidates = self._entries[row].measurement.candidates()
             if any(_same(one, other) for one in candidates for other in used):
                 self._count(self._entries[row], Outcome("start"))
                 del self._entries[row], self._keys[row]
@@ -133,24 +134,28 @@ class Timeline:
 
     @property
     def waiting(self) -> int:
-        """Number of aids whose instant the filter has not reached."""
+        """Number of measurements whose instant the filter has not reached."""
         return len(self._entries) - self._next
 
     @property
     def oldest_ns(self) -> int:
-        """The earliest instant that an aid may still be valid at."""
+        """The earliest instant that a measurement may still be valid at."""
         return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
 
-    def insert(self, aid: Aid, serial: int = 0) -> Entry:
-        """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
+    def insert(self, measurement: AidingMeasurement, serial: int = 0) -> Entry:
+        """Put a measurement in its place; refused at once as `too_old` or `duplicate`."""
         # What is due to be fed back is fed back before anything of the same instant is applied: the
         # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
         # Of one instant, velocities come first: after an outage a false position passes its gate by
         # the outage's sigma and takes the velocity along, and then the honest velocity would fail.
-        first = " " if aid.moves and not aid.locates else ""
-        feedback: Feedback = aid.feedback if aid.waits else "at_once"
-        key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
-        entry = Entry(key, aid, feedback, *self._rows.packed(aid))
+        first = " " if measurement.moves and not measurement.locates else ""
+        feedback: Feedback = measurement.feedback if measurement.waits else "at_once"
+        key = (
+            measurement.t_ns,
+            "" if feedback == "release" else first + measurement.source,
+            serial,
+        )
+        entry = Entry(key, measurement, feedback, *self._rows.packed(measurement))
         oldest = self._checkpoints[0] if self._checkpoints else None
         if oldest and key[0] <= oldest.snapshot.t_ns and not self._precedes(oldest, key):
             self._count(entry, Outcome("too_old"))
@@ -163,7 +168,7 @@ class Timeline:
         self._keys.insert(at, key)
         self._entries.insert(at, entry)
         if self._checkpoints and (
-            at < self._next or (at == self._next and aid.t_ns < self.estimator.t_ns)
+            at < self._next or (at == self._next and measurement.t_ns < self.estimator.t_ns)
         ):
             if at < self._next:
                 self._next += 1
@@ -172,8 +177,9 @@ class Timeline:
             self._give_up(1, "no_imu" if self._checkpoints else "no_alignment")
         return entry
 
-    def run(self, record: bool = False) -> None:
-        """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
+    def advance(self, record: bool = False) -> None:
+        """Apply every measurement whose instant the IMU has reached, and propagate to its last
+        sample."""
         latest, imu, kept = self.imu.latest_ns, self.imu, self._checkpoints
         estimator, end = self.estimator, bisect_left(self._keys, (latest + 1,), self._next)
         while self._next < end:
@@ -195,8 +201,8 @@ class Timeline:
 
     @contextmanager
     def past(self, t_ns: int) -> Iterator[None]:
-        """Within it the estimator is as it was at `t_ns`, from `oldest_ns` on, after every aid that
-        was valid until then; afterwards it is as before, bit for bit.
+        """Within it the estimator is as it was at `t_ns`, from `oldest_ns` on, after every
+        measurement that was valid until then; afterwards it is as before, bit for bit.
 
         It is run from the checkpoint before, so it costs as much as a rewind to that instant, but
         not beyond it: nothing is counted and nobody is told.
@@ -247,11 +253,11 @@ class Timeline:
         return ran.done > 0 or ran.how == KEEP
 
     def _judged(self, entry: Entry, outcome: Outcome) -> Outcome:
-        """Outcome of an aid that is judged."""
-        aid, self.decided = entry.aid, True
+        """Outcome of a measurement that is judged."""
+        measurement, self.decided = entry.measurement, True
         try:
-            one = self.diagnosis.series[aid.source]
-            correction = self.diagnosis.judge(aid, one, outcome, self.estimator)
+            one = self.diagnosis.series[measurement.source]
+            correction = self.diagnosis.judge(measurement, one, outcome, self.estimator)
             if correction is not None:
                 self.estimator.adopt(correction.mean, correction.spread)
         except RAISED_BY_NUMBERS as error:
@@ -267,28 +273,30 @@ class Timeline:
         del self._entries[rows], self._keys[rows]
 
     def _apply(self, entry: Entry) -> Outcome:
-        """An exception, wherever it comes from, costs the aid."""
+        """An exception, wherever it comes from, costs the measurement."""
         estimator, diagnosis, self.decided = self.estimator, self.diagnosis, True
         try:
             if entry.feedback == "release":
                 estimator.release()
             elif entry.feedback == "hold":
                 estimator.hold()
-            aid = entry.aid
-            if aid.placed:
-                aid = aid.at(estimator.nav)
-            entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
+            measurement = entry.measurement
+            if measurement.placed:
+                measurement = measurement.at(estimator.nav)
+            entry.raw = raw_innovation(measurement, estimator) if self.keeps_raw else None
             if self._isolates:
-                return estimator.update(aid)
-            one = diagnosis.comes(aid, estimator)
+                return estimator.update(measurement)
+            one = diagnosis.comes(measurement, estimator)
             if one.out:
-                outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
+                outcome = estimator.look(
+                    measurement, diagnosis.lasting(measurement, one, estimator)
+                )
             else:
-                outcome = estimator.update(aid, one.noise)
-            if aid.constraint and aid.rests_s:
-                estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
+                outcome = estimator.update(measurement, one.noise)
+            if measurement.constraint and measurement.rests_s:
+                estimator.step[STEP_RESTS_S] = measurement.rests_s * (outcome.name == "fused")
             if outcome.name in JUDGED:
-                correction = diagnosis.judge(aid, one, outcome, estimator)
+                correction = diagnosis.judge(measurement, one, outcome, estimator)
                 if correction is not None:
                     estimator.adopt(correction.mean, correction.spread)
         except RAISED_BY_NUMBERS as error:
@@ -299,7 +307,7 @@ class Timeline:
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome
         if before is None or before.name != outcome.name:
-            counts = self.counters.outcomes[entry.aid.source]
+            counts = self.counters.outcomes[entry.measurement.source]
             counts[outcome.name] += 1
             if before is not None:
                 counts[before.name] -= 1

@@ -28,8 +28,8 @@ phi_d = +theta for a vehicle that turned right unseen). A prior of white force a
 fusiond.estimators.propagation has it for a silent IMU, knows less: after 1 s in a bend it is 4.8
 sigma off in heading (90 deg in 6 s), where this is inside 3.
 
-What comes of it is on trial: until the first position aid has passed its gate nobody should steer
-by it, and one that does not pass ends it.
+What comes of it is on trial: until the first position measurement has passed its gate nobody should
+steer by it, and one that does not pass ends it.
 
 Source: Singer, Estimating Optimal Tracking Filter Performance for Manned Maneuvering Targets, IEEE
 Trans. AES-6 (1970), eq. 4 to 11: covariance of the integrals of such a process.
@@ -121,9 +121,9 @@ class WarmStart:
         self._state, self._model = state, model
         self._covariance = _checked(state, model)
         self.on_trial = False
-        """Started by it, and no position aid has confirmed it yet."""
+        """Started by it, and no position measurement has confirmed it yet."""
         self.refused_by: str | None = None
-        """The source of the position aid that spoke against it."""
+        """The source of the position measurement that spoke against it."""
 
     def start(self, t_ns: int) -> Start:
         """The start at `t_ns` (monotonic ns), the first IMU sample. Raises `RefusedStateError`."""
@@ -136,7 +136,8 @@ class WarmStart:
         return _after_gap(self._state, self._model, self._covariance, t_ns, gap_s)
 
     def judge(self, source: str, outcome: str) -> None:
-        """A position aid of `source` has been applied: the first to be fused or gated decides."""
+        """A position measurement of `source` has been applied: the first to be fused or gated
+        decides."""
         if self.on_trial and outcome in ("fused", "gated"):
             self.on_trial = False
             if outcome == "gated":

@@ -1,20 +1,20 @@
 r"""Navigation without an inertial unit: position and velocity by fixes and a constant velocity.
 
 While the unit is absent, or has been silent for longer than navigation can bridge
-(`fusiond.navigator.imu_screening`), the same timeline, filters and aids run on samples that a
-vehicle would feel which is level, faces north and goes on as it goes:
+(`fusiond.navigator.imu_screening`), the same timeline, filters and measurements run on samples that
+a vehicle would feel which is level, faces north and goes on as it goes:
 
     w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
 
 so that velocity changes by the model's noise and by what is measured alone. Attitude is not known
-and not published; a lever arm counts by its upward part (`Aid.unturned`). Of a vehicle that does
-not slide a heading says which way it goes, and a wheel how fast: both together carry the position
-on where no fix comes. Bearings say nothing without an attitude and are left out. With `[estimator]
-filter = "federated"` the receivers have a local filter each, as in experiments 3 and 4 of paper
-004; every other filter is here the Kalman filter.
+and not published; a lever arm counts by its upward part (`AidingMeasurement.unturned`). Of a
+vehicle that does not slide a heading says which way it goes, and a wheel how fast: both together
+carry the position on where no fix comes. Bearings say nothing without an attitude and are left out.
+With `[estimator] filter = "federated"` the receivers have a local filter each, as in experiments 3
+and 4 of paper 004; every other filter is here the Kalman filter.
 
 The first fix, or an operator's position, makes a start that knows next to nothing, and is then an
-aid like any other. When the
+measurement like any other. When the
 inertial unit has aligned, its navigation takes over.
 """
 
@@ -28,10 +28,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import HeadingCandidate, PositionCandidate
+from fusiond.aiding.heading_history import HeadingHistory, KnownHeading
 from fusiond.aiding.velocity import CORNER_RAD_S
-from fusiond.aiding.way_faced import Faced, WayFaced
 from fusiond.configuration.constraints import NonHolonomic
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
@@ -57,7 +57,7 @@ STEP_NS = 100_000_000
 GAP_S = 1.0
 # One sigma (m) of the first position before its fix has been told: no receiver errs by so much.
 START_SD_M = 1000.0
-# Aids that are remembered for a start: a minute of two receivers once a second.
+# Measurements that are remembered for a start: a minute of two receivers once a second.
 MOST_REMEMBERED = 128
 
 
@@ -66,14 +66,14 @@ class _Received:
 
     __slots__ = ("_asked", "_position", "measurement")
 
-    def __init__(self, measurement: Aid) -> None:
+    def __init__(self, measurement: AidingMeasurement) -> None:
         self.measurement = measurement
         self._asked = False
         self._position: PositionCandidate | None = None
 
     @property
     def position(self) -> PositionCandidate | None:
-        """Position by it alone; None where it says none."""
+        """Position by this measurement alone; None if it has none."""
         if not self._asked:
             self._asked = True
             for candidate in self.measurement.candidates():
@@ -92,7 +92,7 @@ def _slips_m_s(o: NonHolonomic) -> float:
 
 class WithoutImu:
     """Takes over where there is no inertial unit. `on_event(code, text)` hears of both changes,
-    `on_outcome` of each aid; `last_fused_ns` by source is kept."""
+    `on_outcome` of each measurement; `last_fused_ns` by source is kept."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class WithoutImu:
         """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
         self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
-        self._way = WayFaced(_slips_m_s(config.constraints.non_holonomic))
+        self._way = HeadingHistory(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None
         self._silent_ns = 0
         self._located_ns = 0
@@ -120,7 +120,7 @@ class WithoutImu:
         """True if it navigates."""
         return self.estimator is not None
 
-    def receive(self, measurements: Sequence[Aid], seen_ns: int) -> None:
+    def receive(self, measurements: Sequence[AidingMeasurement], seen_ns: int) -> None:
         """Measurements have come at `seen_ns`."""
         self._recent.extend(map(_Received, measurements))
         if self._first_ns is None and measurements:
@@ -128,7 +128,7 @@ class WithoutImu:
         for one in measurements if self._way.known else ():
             for candidate in one.candidates() if not one.locates else ():
                 if isinstance(candidate, HeadingCandidate):
-                    self._way.add(Faced(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
+                    self._way.add(KnownHeading(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
         if self.estimator is not None:
             for one in measurements:
                 self._insert(one)
@@ -137,7 +137,7 @@ class WithoutImu:
         """True if no inertial unit navigates at `t_ns`, nor will with its next sample."""
         return not imu.end or (t_ns - imu.latest_ns) * 1e-9 > BEARABLE_GAP_S
 
-    def take_position(self, fix: Aid, t_ns: int) -> str | None:
+    def take_position(self, fix: AidingMeasurement, t_ns: int) -> str | None:
         """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
         if self.estimator is None:
             self.receive([fix], t_ns)
@@ -246,8 +246,8 @@ class WithoutImu:
             "no inertial unit: position and velocity by fixes and a constant velocity, no attitude",
         )
 
-    def _insert(self, aid: Aid) -> Entry | None:
-        level = aid.unturned(self._way)
+    def _insert(self, measurement: AidingMeasurement) -> Entry | None:
+        level = measurement.without_attitude(self._way)
         return None if level is None else self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:
@@ -256,19 +256,19 @@ class WithoutImu:
         if count > 0:
             times = self._imu.latest_ns + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
             self._imu.append(times, np.repeat(_sensed(e.nav), count, axis=0))
-        self._timeline.run()
+        self._timeline.advance()
         if not (np.isfinite(e.nav).all() and np.isfinite(e.covariance).all()):
             self._event("filter_not_finite", "Without an IMU: starting again")
             self.stop()
 
     def _outcome(self, entry: Entry) -> None:
         if entry.outcome is not None and entry.outcome.name == "fused":
-            source, t_ns = entry.aid.source, entry.key[0]
+            source, t_ns = entry.measurement.source, entry.key[0]
             self._last_fused_ns[source] = max(t_ns, self._last_fused_ns.get(source, -1))
-            if entry.aid.locates:
+            if entry.measurement.locates:
                 self._located_ns = max(self._located_ns, t_ns)
-        if entry.aid.screened and entry.outcome is not None:
-            entry.aid.judged(entry.outcome.rows, entry.outcome.whitened)
+        if entry.measurement.screened and entry.outcome is not None:
+            entry.measurement.judged(entry.outcome.rows, entry.outcome.whitened)
         if self._on_outcome is not None:
             self._on_outcome(entry)
 
@@ -276,8 +276,8 @@ class WithoutImu:
 def counted_together(
     inertial: Mapping[str, Counter[str]], without: Mapping[str, Counter[str]]
 ) -> dict[str, Counter[str]]:
-    """Outcomes by source of both. An aid that was fused without an inertial unit, and came before
-    the alignment or where no sample reaches, is not counted as lost as well."""
+    """Outcomes by source of both. A measurement that was fused without an inertial unit, and came
+    before the alignment or where no sample reaches, is not counted as lost as well."""
     found = {name: Counter(counts) for name, counts in inertial.items()}
     for name, counts in without.items():
         both = found.setdefault(name, Counter())

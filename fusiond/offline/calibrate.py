@@ -122,9 +122,11 @@ class Calibration:
         }
 
 
-def files(imu_path: Path | None, aids: list[tuple[str, Path]], can_log: Path | None = None) -> Pass:
+def files(
+    imu_path: Path | None, measurements: list[tuple[str, Path]], can_log: Path | None = None
+) -> Pass:
     """A pass through files. Raises what `process` raises."""
-    return lambda config, look: process(config, imu_path, aids, can_log=can_log, watch=look)
+    return lambda config, look: process(config, imu_path, measurements, can_log=can_log, watch=look)
 
 
 def calibrate(
@@ -148,8 +150,8 @@ def calibrate(
     sentences = [f.text for f in findings.values()]
     if not drive.slots:
         sentences = [
-            "nothing to calibrate: no aid has a parameter to estimate; a road vehicle's mounting"
-            " and axle need constraints.non_holonomic.enabled = true"
+            "nothing to calibrate: no measurement has a parameter to estimate; a road vehicle's"
+            " mounting and axle need constraints.non_holonomic.enabled = true"
         ]
     sentences += [
         f"noise seen {when}: gyro {gyro:.2g} deg/sqrt(h), accelerometer {accel:.2g} m/s/sqrt(h);"
@@ -243,7 +245,7 @@ class _Drive:
         return speed, np.gradient(np.unwrap(rows[:, 3]), t), np.gradient(speed, t), rows
 
     def shown_s(self) -> dict[str, float]:
-        """Duration (s) of the motion that shows a parameter."""
+        """Duration (s) of the motion that makes a parameter observable."""
         speed, turn, change, _ = self._table()
         driving = speed > DRIVING_M_S
         step_s = STEP_NS * 1e-9

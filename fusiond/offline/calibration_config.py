@@ -121,8 +121,9 @@ def configured(config: Config, before: Config, p: Parameter) -> tuple[str, float
 def fragment(
     config: Config, now: Config, found: Mapping[str, Parameter], sentences: Iterable[str]
 ) -> str:
-    """TOML of the keys in which `now` differs from `config`, with smaller sigmas where something
-    was observed, and what there is to say of it as comments."""
+    """TOML of the keys in which `now` differs from `config`.
+
+    Observed parameters have smaller sigmas; `sentences` stand as comments."""
     seen = [p for p in found.values() if p.state is not CalibrationState.NOT_OBSERVED]
     lines = [f"# {text}" for text in sentences]
     lines += _table("imu", _changed(config.imu, now.imu, ("mounting_deg", "time_offset_s")))

@@ -40,7 +40,7 @@ from fusiond.offline.can_text import (
 
 FORMATS = (".log", ".asc", ".blf", ".trc", ".mf4")
 _GZIP = b"\x1f\x8b"
-_TOLD = 20
+_MOST_NAMED = 20
 """Refusals that are kept in words; of the others the number."""
 _STRAY = 1000
 """A channel with less than one of so many frames is damage in a name: what a device sends but once
@@ -58,13 +58,13 @@ class Refusals:
     """Unread lines of a log: the first of it with line and text, of the rest the number."""
 
     def __init__(self) -> None:
-        self._told: list[Rejection] = []
+        self._named: list[Rejection] = []
         self._more = Counter[str]()
 
     def add(self, line: int, reason: str, detail: str) -> None:
         """One more; `line` 0 where there are none."""
-        if len(self._told) < _TOLD:
-            self._told.append(Rejection(line, reason, detail))
+        if len(self._named) < _MOST_NAMED:
+            self._named.append(Rejection(line, reason, detail))
         else:
             self._more[reason] += 1
 
@@ -75,17 +75,17 @@ class Refusals:
     @property
     def first(self) -> str:
         """The first one, in words."""
-        return str(self._told[0]) if self._told else ""
+        return str(self._named[0]) if self._named else ""
 
     def all(self) -> list[Rejection]:
         """Of each reason what is told and how many more there are."""
-        told = Counter(each.reason for each in self._told)
+        told = Counter(each.reason for each in self._named)
         more = [
             Rejection(0, name, f"{n} {'more' if told[name] else 'times'}", n)
             for name, n in self._more.items()
             if n
         ]
-        return [*self._told, *more]
+        return [*self._named, *more]
 
 
 def messages(
@@ -191,7 +191,7 @@ def _text(
                     message.timestamp -= 2.0 * asc.before_trigger_s
                 if not began:
                     began = True
-                    _tell_zone(log, getattr(reader, "start_time", None), told)
+                    _report_zone(log, getattr(reader, "start_time", None), told)
                 yield message
             break
         except Exception:  # whatever a reader raises for a line that is none
@@ -222,7 +222,7 @@ def _binary(
         lost.add(0, "unreadable", f"its header: {error}")
         return
     containers.body()
-    _tell_zone(log, reader.start_timestamp, told)
+    _report_zone(log, reader.start_timestamp, told)
     reader.start_timestamp -= DAY_S
     try:
         yield from reader
@@ -250,8 +250,8 @@ def _mf4(
             gc.collect()
 
 
-def _tell_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
-    """In which zone the log's date was taken, or that it has none."""
+def _report_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
+    """Report the time zone of the log's date, or that it has none."""
     if log.suffix in _ZONES and not start:
         told("recorder_zone", _UNDATED)
     elif log.suffix in _ZONES:
@@ -271,7 +271,7 @@ def _zone(t_s: float | None) -> str:
 @contextlib.contextmanager
 def _warned(call: Callable[[], None]) -> Iterator[None]:
     """Hear of the lines that python-can only warns of, and keep that from the terminal."""
-    logger, handler = logging.getLogger("can.io"), _Heard(call)
+    logger, handler = logging.getLogger("can.io"), _Forwarded(call)
     propagated, logger.propagate = logger.propagate, False
     logger.addHandler(handler)
     try:
@@ -291,7 +291,7 @@ def _deleted_in_silence() -> Iterator[None]:
         sys.unraisablehook = hook
 
 
-class _Heard(logging.Handler):
+class _Forwarded(logging.Handler):
     def __init__(self, call: Callable[[], None]) -> None:
         super().__init__(logging.WARNING)
         self._call = call

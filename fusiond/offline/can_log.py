@@ -54,8 +54,8 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import ImuTable
-from fusiond.offline.aid_files import Arrival
 from fusiond.offline.can_frames import Refusals, channels, messages
+from fusiond.offline.measurement_files import Arrival
 
 REPORTS_WITHIN_NS = 120_000_000_000
 """So far ahead reports of UTC are looked for where a clock may have been set: tunnels are shorter,
@@ -84,8 +84,9 @@ REFUSALS = {
 
 
 class CanLog(NamedTuple):
-    """Contents of a log: IMU samples with what was refused of them, aids with their arrivals,
-    refusals of frames (`can`) and by source of an aid; `events` (code, text); how many `frames`.
+    """Contents of a log: IMU samples with their refusals, measurements with their arrivals,
+    refusals of frames (`can`) and by source of a measurement; `events` (code, text); how many
+    `frames`.
 
     `units` are the samples of all units with their instants (ns), in the order in which they came,
     where the configuration has a spare; `imu` is then of the first alone."""
@@ -117,7 +118,7 @@ class _LogTime:
 
 def read_can_log(path: Path, config: Config) -> CanLog:
     """Take the log apart by the drivers of the configuration. Raises `TableError`."""
-    return _Replay(path, config).run()
+    return _Replay(path, config).read()
 
 
 class _Replay:
@@ -130,7 +131,7 @@ class _Replay:
         self._recorder = RecorderClock()
         self._clock = Clock(config.clock, self._host)
         self._events: list[tuple[str, str]] = []
-        self._clock.on_event = self._clock_told
+        self._clock.on_event = self._on_clock_event
         self._arrivals: list[Arrival] = []
         self._imu: list[tuple[int, ImuSample]] = []
         self._reports: dict[str, deque[int]] = {}
@@ -147,12 +148,12 @@ class _Replay:
         now_ns = self._host.monotonic_ns
         return {name: make(name, o, emit, now_ns) for name, (make, o) in self._sources.items()}
 
-    def run(self) -> CanLog:
+    def read(self) -> CanLog:
         """Read the log to its end."""
         self._on_buses = buses = self._buses()
         refusals, refused = Refusals(), Counter[str]()
         recorder, host = self._recorder, self._host
-        frames = _Ahead(messages(self._path, refusals, self._told), refused)
+        frames = _Ahead(messages(self._path, refusals, self._on_refusal), refused)
         for message, stamp_ns in frames:
             if message.channel not in buses:
                 refused["unknown_channel"] += 1
@@ -169,7 +170,7 @@ class _Replay:
                 if len(recorder.steps) > steps:
                     self._follow(recorder.steps[-1].set_ns)
                 elif self._arrivals:
-                    self._tell_pause(stamp_ns - before_ns)
+                    self._report_pause(stamp_ns - before_ns)
             else:
                 recorder.next(stamp_ns, of)
             host.t_ns, host.stamp_ns = recorder.t_ns, recorder.stamp_ns
@@ -177,7 +178,7 @@ class _Replay:
             for driver in buses[message.channel]:
                 driver.feed(frame)
         refusals.count(refused)
-        self._tell_error()
+        self._report_error()
         self._shift()
         rejected, imu = {"can": refusals.all()}, self._imu_table()
         for name, driver in self._drivers.items():
@@ -214,28 +215,28 @@ class _Replay:
 
     # ------------------------------------------------------------------ the recorder's clock
 
-    def _told(self, code: str, text: str) -> None:
+    def _on_refusal(self, code: str, text: str) -> None:
         self._events.append((code, text))
 
-    def _clock_told(self, code: str, text: str) -> None:
-        self._told(code, f"{text}, at {self._host.stamp_ns * 1e-9:.3f} s of the log")
+    def _on_clock_event(self, code: str, text: str) -> None:
+        self._on_refusal(code, f"{text}, at {self._host.stamp_ns * 1e-9:.3f} s of the log")
 
-    def _tell_pause(self, passed_ns: int) -> None:
+    def _report_pause(self, passed_ns: int) -> None:
         """A step of the clock and a pause look alike where no device tells UTC."""
         if passed_ns > PAUSE_NS:
             text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
             if not any(self._reports.values()):
                 text += ": a pause, or its clock was set, of which no device tells UTC"
-            self._told("recorder_paused", text)
+            self._on_refusal("recorder_paused", text)
 
-    def _tell_error(self) -> None:
+    def _report_error(self) -> None:
         """Offset of a recorder that knows the date against a receiver's UTC at the end: a wrong
         zone shows so."""
         status = self._clock.status()
         off_s = status.system_error_s or 0.0
         if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):
             how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
-            self._told("recorder_clock_off", f"the recorder's clock is off {how}")
+            self._on_refusal("recorder_clock_off", f"the recorder's clock is off {how}")
 
     def _follow(self, set_ns: int) -> None:
         """Reports of UTC before a step as the clock would have stamped them that was set."""
@@ -244,8 +245,11 @@ class _Replay:
                 reports[k] = ahead_ns + set_ns
 
     def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
-        """By how much the recorder's clock was set before this frame, by the reports of UTC of the
-        sources that have told it before and go on to tell it: behind further leaps, too."""
+        """Step (ns) of the recorder's clock before this frame; None where no report of UTC says
+        one.
+
+        The reports are of the sources that gave UTC before and go on to give it: behind further
+        jumps, too."""
         known = {name for name, reports in self._reports.items() if reports}
         if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None
@@ -305,7 +309,7 @@ class _Replay:
         """As `fusiond.live.sources` does, at the instant of the frame."""
         match item:
             case DeviceEvent():
-                self._told(item.code, f"{item.source}: {item.text}")
+                self._on_refusal(item.code, f"{item.source}: {item.text}")
             case TimeReport():
                 if item.trusted:
                     reports = self._reports.setdefault(item.source, deque(maxlen=REPORTS))
@@ -327,7 +331,7 @@ class _Replay:
                 self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s, utc_ns))
 
     def _imu_table(self) -> ImuTable:
-        """Of the first source that has sent any, as the daemon does."""
+        """IMU samples of the first source that sent any, as the daemon uses them."""
         spare = self._config.imu.spare
         spare_name = None if spare is None else spare.source
         first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)

@@ -79,9 +79,9 @@ class TextLines:
         """The line that was pulled last is not read."""
         if self.number > self._refused_line:
             self._refused_line = self.number
-            told = self._line.strip()
-            cut = repr(told[:SHOWN] + ("..." if told[SHOWN:] else ""))
-            self._refused(self.number, cut if told else "a block of zeros")
+            shown = self._line.strip()
+            cut = repr(shown[:SHOWN] + ("..." if shown[SHOWN:] else ""))
+            self._refused(self.number, cut if shown else "a block of zeros")
 
     def put_before(self, line: str) -> None:
         """The next line that is pulled is this one, which is not of the file."""

@@ -17,7 +17,7 @@ from fusiond.files.tables import ImuTable
 from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import magnitudes, squares
 from fusiond.navigator.imu_unit_check import CourseTurns, force_unit, rms_unit
-from fusiond.offline.aid_files import Arrival
+from fusiond.offline.measurement_files import Arrival
 
 _TIMES = {"time_backwards", "time_ahead"}
 
@@ -25,13 +25,13 @@ _TIMES = {"time_backwards", "time_ahead"}
 @immutable()
 class FileRead:
     """A file's rows as they were read: s of its own time from the first to the last that is used
-    (None: none is), how many are, and those that are not. Frames of a bus are no aid by
+    (None: none is), how many are, and those that are not. Frames of a bus are no measurement by
     themselves."""
 
     span_s: tuple[float, float] | None
     used: int
     rejected: Sequence[Rejection]
-    is_aid: bool = True
+    is_measurement: bool = True
 
     @property
     def refused(self) -> int:
@@ -87,11 +87,13 @@ def nothing_navigated(
     for name, file in files.items():
         if file.refused > file.used:
             return _refused_rows(name, file)
-    imu_name, imu, aids = _aids(files)
-    if not aids:
+    imu_name, imu, measurements = _measurements(files)
+    if not measurements:
         return f"No measurements: give --aid KIND=FILE ({reason})"
-    others = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
-    if len(others) == len(aids):
+    others = [
+        f"{name} from {_span(file)}" for name, file in measurements if not _overlap(imu, file)
+    ]
+    if len(others) == len(measurements):
         ranges = " and ".join(others)
         return f"No time in common: {imu_name} from {_span(imu)}, {ranges}"
     empty = [source for source, outcomes in refused.items() if set(outcomes) == {"too_few"}]
@@ -104,24 +106,25 @@ def nothing_navigated(
     return f"{reason} ({', '.join(kept)})" if kept else reason
 
 
-def apart(files: Mapping[str, FileRead]) -> list[str]:
-    """A line for each aid whose times have nothing in common with the IMU's, which come first."""
+def without_overlap(files: Mapping[str, FileRead]) -> list[str]:
+    """A line for each measurement whose times have nothing in common with the IMU's, which come
+    first."""
     if not files:
         return []
-    imu_name, imu, aids = _aids(files)
+    imu_name, imu, measurements = _measurements(files)
     return [
         f"{name} from {_span(file)}: no time in common with {imu_name}, from {_span(imu)}"
-        for name, file in aids
+        for name, file in measurements
         if not _overlap(imu, file)
     ]
 
 
-def _aids(
+def _measurements(
     files: Mapping[str, FileRead],
 ) -> tuple[str, FileRead, list[tuple[str, FileRead]]]:
-    """The IMU's file, which comes first, and those of aids."""
+    """The IMU's file, which comes first, and those of measurements."""
     (imu_name, imu), *others = files.items()
-    return imu_name, imu, [(name, file) for name, file in others if file.is_aid]
+    return imu_name, imu, [(name, file) for name, file in others if file.is_measurement]
 
 
 def _refused_rows(name: str, file: FileRead) -> str:

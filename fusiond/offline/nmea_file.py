@@ -65,7 +65,7 @@ class Receiver(NamedTuple):
     compass_decoding: CompassDecoding | None = None
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """A measurement, when it was valid, on the IMU's times and in UTC (ns)."""
 
     t_ns: int
@@ -95,7 +95,7 @@ def receiver_of(source: str, config: Config) -> Receiver:
 
 def read_nmea(
     path: Path, imu_s: tuple[float, float] | None, by: Receiver
-) -> tuple[list[Heard], list[Rejection]]:
+) -> tuple[list[Received], list[Rejection]]:
     """Measurements in the file's order; times are POSIX, as the IMU's from and to `imu_s`, or GPS
     second of week where that is None. What makes them poorer than they could be is a note.
 
@@ -138,11 +138,11 @@ def read_nmea(
     add_ns, said = rollover_of([utc_ns for utc_ns, _ in found], imu_s)
     of_week = imu_s is None
     in_order = sorted(found, key=lambda each: each[0])
-    heard = [_heard(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
+    received = [_received(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
     cautions = decoder.cautions
     cautions.pop("compass_left_out", None)  # it is heard here, or counted
     notes = [Rejection(0, *note, 0) for note in (*cautions.items(), *said)]
-    return heard, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
+    return received, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:
@@ -177,8 +177,8 @@ class _Epochs:
                 end = self.times[min(k, len(self.times) - 1)]
                 step = max(0, end - begin) // len(within)
                 for i, m in enumerate(within):
-                    late_ns = round(m.stamp.latency_s * 1e9)
-                    found.append((begin + i * step - late_ns, m))
+                    latency_ns = round(m.stamp.latency_s * 1e9)
+                    found.append((begin + i * step - latency_ns, m))
         return found
 
 
@@ -198,9 +198,9 @@ def _kind(m: Measurement) -> tuple[str, str]:
     return m.source, type(m).__name__
 
 
-def _heard(utc_ns: int, m: Any, of_week: bool) -> Heard:
+def _received(utc_ns: int, m: Any, of_week: bool) -> Received:
     t_ns = round(utc_ns_to_gps_week_seconds(utc_ns) * 1e9) if of_week else utc_ns
-    return Heard(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns)), utc_ns)
+    return Received(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns)), utc_ns)
 
 
 def _is_refusal(name: str) -> bool:

@@ -1,4 +1,5 @@
-"""Windows in which recorded aids are withheld, to see what the navigation does without them."""
+"""Windows in which recorded measurements are withheld, to see what the navigation does without
+them."""
 
 from __future__ import annotations
 

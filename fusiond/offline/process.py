@@ -1,8 +1,8 @@
 """`fusiond process`: the daemon's navigator over recorded files, causal, a solution a sample.
 
-Samples come of a table or of a recorded CAN bus, aids of that bus and of files. They are handed
-over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at each sample
-is what the daemon would have said then, before anything that arrived later.
+Samples come of a table or of a recorded CAN bus, measurements of that bus and of files. They are
+handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at each
+sample is what the daemon would have said then, before anything that arrived later.
 """
 
 from __future__ import annotations
@@ -32,8 +32,13 @@ from fusiond.navigation.imu_buffer import longest_step
 from fusiond.navigator.assembly import estimator_of
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
-from fusiond.offline.aid_files import Arrival
-from fusiond.offline.failure_reasons import FileRead, apart, nothing_navigated, wrong_units
+from fusiond.offline.failure_reasons import (
+    FileRead,
+    nothing_navigated,
+    without_overlap,
+    wrong_units,
+)
+from fusiond.offline.measurement_files import Arrival
 from fusiond.offline.outages import Outage
 from fusiond.offline.run_input import BROADCAST, Recorded, read_recorded, valid_ns
 from fusiond.offline.solution_rows import Rows, RowsWriter
@@ -41,21 +46,22 @@ from fusiond.offline.solution_rows import Rows, RowsWriter
 if TYPE_CHECKING:
     from fusiond.offline.smooth import SmoothedRows
 
-# Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
-# this spacing, and what ends the navigation is noticed at it, by which time later aids have been
-# handed over. At 100 Hz that is half a second; ten times as many take a seventh less time.
+# Samples handed over at once where no late measurement arrives in between: the solution's mode is
+# judged at this spacing, and what ends the navigation is noticed at it, by which time later
+# measurements have been handed over. At 100 Hz that is half a second; ten times as many take a
+# seventh less time.
 CHUNK = 50
 # Objects that are made before the garbage collector looks through them: some 10 MB.
 YOUNG = 50_000
 _SHOWN = 20
-_TOLD_EVERY = 2000
+_REPORT_EVERY = 2000
 """Samples between two words on the progress: some tenths of a second of work."""
 
 
 def process(
     config: Config,
     imu_path: Path | None,
-    aids: list[tuple[str, Path]],
+    measurements: list[tuple[str, Path]],
     outages: Sequence[Outage] | None = None,
     out: Path | None = None,
     systems: tuple[System, ...] | None = None,
@@ -77,7 +83,7 @@ def process(
     whose package is not installed.
     """
     with _imports_left_alone():
-        read = read_recorded(config, imu_path, aids, outages or (), systems, can_log)
+        read = read_recorded(config, imu_path, measurements, outages or (), systems, can_log)
         return _process(read, out, watch, smooth, progress)
 
 
@@ -131,7 +137,7 @@ def _process(
         "solution_modes": dict(recorder.modes),
         "solution_from_s": recorder.first_s,
         "why": why,
-        "apart": apart(read.files),
+        "apart": without_overlap(read.files),
         "aligned": None if navigator.started is None else navigator.started.how,
         "mode": str(mode),
         "reason": reason,
@@ -202,13 +208,13 @@ def _run(
     came = np.maximum.accumulate(times)
     # So many samples have come when arrival k comes.
     breaks = np.searchsorted(came, [a.t_arrival_ns for a in arrivals], side="right").tolist()
-    late = _late(arrivals, navigator.config)
+    waits = _waits(arrivals, navigator.config)
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
     tick_ns = round(1e9 / navigator.config.scheduler.rate_hz)
-    done = given = told = 0
+    done = given = reported = 0
     while done < len(times) or given < len(arrivals):
-        if done - told >= _TOLD_EVERY:
-            told = done
+        if done - reported >= _REPORT_EVERY:
+            reported = done
             progress(done, len(times))
         if navigator.started is None:
             # The daemon tries to align at each tick, with all that has come until then.
@@ -231,7 +237,7 @@ def _run(
         upto = min(len(times), done + CHUNK)
         alone = _has_gap(times[max(done - 1, 0) : upto], gap_ns)
         while ahead < len(arrivals) and breaks[ahead] <= upto:
-            if alone or late[ahead]:
+            if alone or waits[ahead]:
                 upto = breaks[ahead]
                 break
             ahead += 1
@@ -242,7 +248,7 @@ def _run(
         navigator.advance(record=True)
         recorder.take()
         given, done = ahead, upto
-        if given < len(arrivals) and breaks[given] <= done and (alone or late[given]):
+        if given < len(arrivals) and breaks[given] <= done and (alone or waits[given]):
             _give(navigator, arrivals[given])
             given += 1
             navigator.advance(record=True)
@@ -277,7 +283,7 @@ def _run_units(
             navigator.add_imu(*arrived)
         navigator.advance(record=True)
         recorder.take()
-        if taken % _TOLD_EVERY < 2:
+        if taken % _REPORT_EVERY < 2:
             progress(taken, len(units))
 
 
@@ -292,8 +298,9 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
     navigator.add(m, t_ns, arrival.sd_time_s, arrival.t_arrival_ns)
 
 
-def _late(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
-    """Of each, whether samples of its validity, or of an aid that it holds, come before it does."""
+def _waits(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
+    """Of each, whether samples of its validity, or of a measurement that it holds, come before it
+    does."""
     ahead = config.imu.time_offset_s > 0.0
     delayed = {
         source
@@ -302,14 +309,14 @@ def _late(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
         or (isinstance(section, WheelAiding) and section.latency_s > 0.0)
     }
 
-    def is_late(t_ns: int, m: Measurement | RawEvent) -> bool:
+    def is_delayed(t_ns: int, m: Measurement | RawEvent) -> bool:
         if isinstance(m, BROADCAST):
             return False
         if isinstance(m, RawGnssEpoch):
             return True  # corrected for the place where the filter has come to
         return ahead or m.source in delayed or valid_ns(m) < t_ns
 
-    return [is_late(arrival.t_arrival_ns, arrival.measurement) for arrival in arrivals]
+    return [is_delayed(arrival.t_arrival_ns, arrival.measurement) for arrival in arrivals]
 
 
 def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:

@@ -42,7 +42,7 @@ from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
-from fusiond.offline.aid_files import SECONDS_OF_WEEK, Arrival
+from fusiond.offline.measurement_files import SECONDS_OF_WEEK, Arrival
 from fusiond.offline.nmea_file import EARLIEST_DATE
 
 Read = tuple[list[Arrival], list[Rejection]]

@@ -1,4 +1,4 @@
-"""Input of a run: samples and aids of files or of a recorded bus, in order of arrival."""
+"""Input of a run: samples and measurements of files or of a recorded bus, in order of arrival."""
 
 from __future__ import annotations
 
@@ -22,8 +22,14 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counts
 from fusiond.files.tables import ImuTable, read_imu
-from fusiond.offline.aid_files import OF_A_RECEIVER, READERS, Arrival, read_nmea_by, source_of
 from fusiond.offline.failure_reasons import FileRead
+from fusiond.offline.measurement_files import (
+    OF_A_RECEIVER,
+    READERS,
+    Arrival,
+    read_nmea_by,
+    source_of,
+)
 from fusiond.offline.nmea_file import receiver_of
 from fusiond.offline.outages import Outage, named, withheld
 
@@ -45,13 +51,13 @@ class Recorded:
 def read_recorded(
     config: Config,
     imu_path: Path | None,
-    aids: list[tuple[str, Path]],
+    measurements: list[tuple[str, Path]],
     outages: Sequence[Outage],
     systems: tuple[System, ...] | None,
     can_log: Path | None,
 ) -> Recorded:
     """Read it, less what the outages withhold. Raises as `fusiond.offline.process.process` does."""
-    if any(kind == "raw" for kind, _ in aids):
+    if any(kind == "raw" for kind, _ in measurements):
         config = _with_raw(config, systems)
     events: list[dict[str, str]] = []
     arrivals: list[Arrival] = []
@@ -74,19 +80,21 @@ def read_recorded(
         assert imu_path is not None
         imu = read_imu(imu_path)
         files["imu"] = _imu_read(imu)
-    for kind, path in aids:
-        rows, rejected = _read_aid(kind, path, imu, config)
+    for kind, path in measurements:
+        rows, rejected = _read_measurement(kind, path, imu, config)
         name = kind if kind not in files else f"{kind}:{path.name}"
         files[name] = FileRead(_span_s(rows), len(rows), rejected)
         arrivals += rows
-    _check_observed(aids, arrivals)
+    _check_observed(measurements, arrivals)
     held = Counter[str]()
     if outages:
         there = {row.measurement.source for row in arrivals}
         unknown = sorted(named(outages) - there - set(config.sources))
         if unknown:
             known = ", ".join(sorted(there))
-            raise TableError(f"outage of {unknown[0]}: no aid comes from it; there are {known}")
+            raise TableError(
+                f"outage of {unknown[0]}: no measurement comes from it; there are {known}"
+            )
         kept = [row for row in arrivals if not _withheld(row.measurement, outages)]
         held += Counter(row.measurement.source for row in arrivals)
         held -= Counter(row.measurement.source for row in kept)
@@ -95,9 +103,9 @@ def read_recorded(
     return Recorded(config, imu, arrivals, files, events, held, units)
 
 
-def _check_observed(aids: list[tuple[str, Path]], arrivals: list[Arrival]) -> None:
+def _check_observed(measurements: list[tuple[str, Path]], arrivals: list[Arrival]) -> None:
     """Raise `TableError` for raw data of which nothing is an observation."""
-    raw = [path for kind, path in aids if kind == "raw"]
+    raw = [path for kind, path in measurements if kind == "raw"]
     if raw and not any(isinstance(row.measurement, RawGnssEpoch) for row in arrivals):
         names = ", ".join(map(str, raw))
         raise TableError(
@@ -106,7 +114,7 @@ def _check_observed(aids: list[tuple[str, Path]], arrivals: list[Arrival]) -> No
         )
 
 
-def _read_aid(
+def _read_measurement(
     kind: str, path: Path, imu: ImuTable, config: Config
 ) -> tuple[list[Arrival], list[Rejection]]:
     source = source_of(kind, config)

@@ -7,10 +7,10 @@ filter is smoothed by itself: what was measured before an alignment says nothing
 after it. What the filter called invalid stays so: measurements that it could not be reconciled
 with make it no better from behind.
 
-Aids at 12 instants a second make 0.3 GB of tape an hour, samples at 100 Hz 0.06 GB of solutions.
-An hour is kept in memory, where it costs least; what comes beyond that goes to a temporary file
-without a name, where TMPDIR says. Nothing is thinned out or rounded to single precision:
-P_s = P - P Lambda P is a small difference of large numbers where smoothing helps most.
+Measurements at 12 instants a second make 0.3 GB of tape an hour, samples at 100 Hz 0.06 GB of
+solutions. An hour is kept in memory, where it costs least; what comes beyond that goes to a
+temporary file without a name, where TMPDIR says. Nothing is thinned out or rounded to single
+precision: P_s = P - P Lambda P is a small difference of large numbers where smoothing helps most.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class SmoothedRows:
                 last.previous, self._kept = None, last
 
     def _finish(self, newest: Node) -> None:
-        """A start has ended: smooth it and write its rows."""
+        """Smooth the navigation since one start and write its rows."""
         nodes, _ = nodes_of(newest, self._kept, NEVER)
         # A filter whose numbers failed is given up at once: what it left last is no part of it.
         unsound = np.flatnonzero(~np.isfinite(nodes.bodies).all(axis=1))

@@ -17,7 +17,7 @@ from fusiond.outputs.topics import Topic
 
 
 class Output(Protocol):
-    """One way out. `counters` and `status` stand in `health`, under `name`.
+    """An output. `counters` and `status` stand in `health`, under `name`.
 
     `nav_rate_hz`: how often it takes `nav`. `sets_clocks`: whether who receives it may take its
     time of day for a clock; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
@@ -34,7 +34,7 @@ class Output(Protocol):
     @property
     def status(self) -> DriverStatus: ...
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """Keep a message, of which the task may send the latest; never waits, never raises."""
 
     async def run(self) -> None:

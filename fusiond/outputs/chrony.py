@@ -49,7 +49,7 @@ class ChronySocket:
         self.status = DriverStatus("silent", "UTC is not settled yet")
         around.time().on_time = self._sampled
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """Nothing to do: time does not come with the messages."""
 
     def _sampled(self, sample: TimeSample) -> None:

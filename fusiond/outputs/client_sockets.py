@@ -218,7 +218,7 @@ class ServerQueue:
 
     def serve(self) -> bool:
         """One piece to send and one to receive; False where there was neither."""
-        return self._send_one() | self._hear_one()
+        return self._send_one() | self._receive_one()
 
     def _send_one(self) -> bool:
         if not self._work:
@@ -226,7 +226,7 @@ class ServerQueue:
         self._work.popleft()()
         return True
 
-    def _hear_one(self) -> bool:
+    def _receive_one(self) -> bool:
         if not self._events and self._epoll is not None:
             for fd, events in self._epoll.poll(0, _AT_ONCE):
                 self._events.append((fd, events, self._handlers[fd]))

@@ -111,8 +111,10 @@ CARRIED_OUT: dict[str, type[Command]] = {**COMMANDS, "set_gates": SetGates}
 NAMES = {command: name for name, command in CARRIED_OUT.items()}
 
 Handler = Callable[[Command], str | Awaitable[str]]
-"""Carries a command out at once and says what was done, or raises `CommandRefusedError`; what can
-be said only when a disk has answered comes later."""
+"""Function that carries out a command.
+
+It returns what was done, or raises `CommandRefusedError`; an answer that waits for a disk comes
+later."""
 
 
 class CommandRefusedError(Exception):

@@ -50,29 +50,41 @@ class HomeAssistantDiscovery:
         )
         self._description = Description(description(node, around.vehicle, around.sources))
         self.counters: Counter[str] = Counter()
-        self._mqtt.listen(f"{section.prefix}/status", self._heard)
-        self._mqtt.take(self._topic, self._description)
+        self._mqtt.listen(f"{section.prefix}/status", self._on_status)
+        self._mqtt.publish(self._topic, self._description)
 
     @property
     def status(self) -> DriverStatus:
         return self._mqtt.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """Nothing to do: the entities read what MQTT publishes."""
 
     async def run(self) -> None:
         await asyncio.get_running_loop().create_future()
 
-    def _heard(self, payload: bytes) -> None:
+    def _on_status(self, payload: bytes) -> None:
         if payload == b"online":
             self.counters["births"] += 1
-            self._mqtt.take(self._topic, self._description)
+            self._mqtt.publish(self._topic, self._description)
 
 
 def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, Any]:
     """The entities of a vehicle: position, mode and its reason, accuracy, each device."""
     base = base_topic(vehicle)
     release = version("fusiond")
+    return {
+        "dev": {"ids": [node], "name": vehicle, "mf": "fusiond", "sw": release},
+        "o": {"name": "fusiond", "sw": release},
+        "avty_t": f"{base}/online",
+        "pl_avail": "online",
+        "pl_not_avail": "offline",
+        "cmps": dict(_entities(node, base, sources)),
+    }
+
+
+def _entities(node: str, base: str, sources: tuple[str, ...]) -> list[tuple[str, Component]]:
+    """Keys and entities."""
 
     def entity(key: str, platform: str, name: str | None, **more: Any) -> tuple[str, Component]:
         identity = {"p": platform, "uniq_id": f"{node}_{key}", "name": name}
@@ -122,11 +134,4 @@ def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, 
                 ent_cat="diagnostic",
             )
         )
-    return {
-        "dev": {"ids": [node], "name": vehicle, "mf": "fusiond", "sw": release},
-        "o": {"name": "fusiond", "sw": release},
-        "avty_t": f"{base}/online",
-        "pl_avail": "online",
-        "pl_not_avail": "offline",
-        "cmps": dict(entities),
-    }
+    return entities

@@ -1,6 +1,6 @@
 """MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
 
-`take` puts a message in its place and returns: it never waits and never raises. One task sends
+`publish` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
 the next); both belong to one connection and end with it. A broker that accepts bytes and does
 nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
@@ -30,7 +30,7 @@ from fusiond.outputs.mqtt_version import MqttVersion
 from fusiond.outputs.reconnection import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
-_PATIENCE_S = 1.0
+_TIMEOUT_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
 _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
@@ -87,7 +87,7 @@ class MqttPublisher:
         self._retained: dict[Topic, BaseModel] = {}
         self._due: dict[Topic, None] = {}
         self._events: deque[EventMessage] = deque(maxlen=MOST_KEPT)
-        self._heard: dict[str, Callable[[bytes], None]] = {}
+        self._listeners: dict[str, Callable[[bytes], None]] = {}
         self._latest_ready = asyncio.Event()
         self._confirmed_ready = asyncio.Event()
         self._flowing = asyncio.Event()
@@ -105,13 +105,17 @@ class MqttPublisher:
         self._quiet = subscriptions.quiet()
         self.status = DriverStatus()
 
+    def begin_with_3_1_1(self) -> None:
+        """Try MQTT 3.1.1 first: for a broker that is known not to reply to version 5."""
+        self._version.is_5 = False
+
     # ------------------------------------------------------------------ for the tick
 
-    def listen(self, address: str, heard: Callable[[bytes], None]) -> None:
-        """Let `heard` have what others publish at `address`; before `run`."""
-        self._heard[address] = heard
+    def listen(self, address: str, listener: Callable[[bytes], None]) -> None:
+        """Let `listener` have what others publish at `address`; before `run`."""
+        self._listeners[address] = listener
 
-    def take(self, topic: Topic, message: BaseModel) -> None:
+    def publish(self, topic: Topic, message: BaseModel) -> None:
         """Put a message into its place: with QoS 0 the latest counts, what is retained is
         confirmed and sent again after each connection, all else is queued."""
         if topic.qos == 0:
@@ -309,7 +313,7 @@ class MqttPublisher:
     ) -> None:
         """Publish with QoS 1; the QoS 0 flow stops while the confirmation is overdue."""
         loop = asyncio.get_running_loop()
-        overdue = loop.call_later(_PATIENCE_S, self._flowing.clear)
+        overdue = loop.call_later(_TIMEOUT_S, self._flowing.clear)
         try:
             await self._publish(client, address, payload, qos=1, retain=retain)
         finally:
@@ -319,8 +323,8 @@ class MqttPublisher:
     # ------------------------------------------------------------------ commands
 
     async def _listen(self, client: aiomqtt.Client) -> None:
-        """Keep subscribed to what others publish to us, but for a while after a flood."""
-        addresses = [*self._heard]
+        """Keep subscriptions; after a flood pause them for a while."""
+        addresses = [*self._listeners]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")
         coming = subscriptions.Incoming(client, self.counters, self._quiet)
@@ -344,9 +348,9 @@ class MqttPublisher:
             payload = message.payload
             if not isinstance(payload, bytes):
                 continue
-            heard = self._heard.get(message.topic.value)
-            if heard is not None:
-                heard(payload)
+            listener = self._listeners.get(message.topic.value)
+            if listener is not None:
+                listener(payload)
             elif self._commands is not None:
                 name = message.topic.value.removeprefix(prefix)
                 reply = self._commands.answer(name, payload, message.retain)

@@ -60,7 +60,7 @@ class NmeaServer:
     def status(self) -> DriverStatus:
         return self.server.port.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):
             self._nav.put(message)
 

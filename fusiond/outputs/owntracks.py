@@ -52,7 +52,7 @@ class OwnTracksLocations:
     def status(self) -> DriverStatus:
         return self._mqtt.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):
             self._nav = message
         elif topic is TRACKER and isinstance(message, TrackerMessage):
@@ -61,7 +61,7 @@ class OwnTracksLocations:
                 self.counters["undated"] += 1
                 return
             self.counters["locations"] += 1
-            self._mqtt.take(self._topic, self._location(message, message.t_ms, nav))
+            self._mqtt.publish(self._topic, self._location(message, message.t_ms, nav))
 
     async def run(self) -> None:
         await asyncio.get_running_loop().create_future()

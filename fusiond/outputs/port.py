@@ -1,4 +1,4 @@
-"""Listening port of a server: tried again while it cannot be had, and how it stands."""
+"""Listening port of a server, retried while it is taken; and its state."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class PrometheusEndpoint:
     def status(self) -> DriverStatus:
         return self.server.port.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         if isinstance(message, EventMessage):
             self._events[message.level, message.source, message.code] += 1
             return

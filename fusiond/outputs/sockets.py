@@ -30,13 +30,13 @@ async def bound(host: str, port: int) -> list[socket.socket]:
     return sockets
 
 
-def tune(sock: socket.socket, patience_s: float) -> None:
+def tune(sock: socket.socket, timeout_s: float) -> None:
     """Notice a far end that is gone without a word: after 20 s of silence it is asked, twice 5 s
-    apart; what it should have confirmed is waited for `patience_s`."""
+    apart; what it should have confirmed is waited for `timeout_s`."""
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 2)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * patience_s))
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * timeout_s))

@@ -40,9 +40,9 @@ class Incoming:
         self._counters = counters
         self._quiet = quiet
         self._flooded = asyncio.Event()
-        self._begin_anew()
+        self._restart()
         paho = client._client  # aiomqtt has no place to look at a message before it is queued
-        self._hear: Any = paho.on_message
+        self._on_message: Any = paho.on_message
         paho.on_message = self._count
 
     def _count(self, paho: Any, userdata: Any, message: Any) -> None:
@@ -53,7 +53,7 @@ class Incoming:
             self._counters["mqtt_flooded"] += 1
             self._flooded.set()
         else:
-            self._hear(paho, userdata, message)
+            self._on_message(paho, userdata, message)
 
     async def flood(self) -> float:
         """Wait for one; how long to listen to nobody, s."""
@@ -65,9 +65,9 @@ class Incoming:
     def over(self) -> None:
         """It is listened again."""
         self._flooded.clear()
-        self._begin_anew()
+        self._restart()
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self._since_s, now_ns = time.monotonic(), time.perf_counter_ns()
         self._messages, self._bytes = Bucket(MESSAGES, now_ns), Bucket(BYTES, now_ns)
 

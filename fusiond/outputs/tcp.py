@@ -38,10 +38,10 @@ REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""Idle time after which a client gives way to a new one; so does who takes nothing of an answer."""
+"""Idle time after which a client is closed for a new one; one that reads nothing counts as idle."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
-SHORT_TOLD_S = 60.0
+SHORT_LOGGED_S = 60.0
 """Between two events about that."""
 _READ_BYTES = 1024
 """One piece of work: 50 requests of gpsd's at most."""
@@ -292,10 +292,10 @@ class TcpServer:
         self._most = most
         self.counters: Counter[str] = Counter()
         self.clients: dict[Client, None] = {}
-        self._short_told_ns: int | None = None
+        self._short_logged_ns: int | None = None
 
     async def run(self) -> None:
-        """Listen until cancelled; a port that is taken is tried again."""
+        """Listen until cancelled; retry while the port is taken."""
         listener = await self.port.open(self._listening)
         for sock in listener.sockets:
             self._watch(sock)
@@ -377,9 +377,9 @@ class TcpServer:
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """No descriptor is left: said once a minute at most, and tried again later."""
         now_ns = time.perf_counter_ns()
-        told_ns = self._short_told_ns
-        if told_ns is None or now_ns - told_ns > SHORT_TOLD_S * _SECOND_NS:
-            self._short_told_ns = now_ns
+        logged_ns = self._short_logged_ns
+        if logged_ns is None or now_ns - logged_ns > SHORT_LOGGED_S * _SECOND_NS:
+            self._short_logged_ns = now_ns
             self.port.report("clients_refused", f"none for now: {error.strerror}")
         self.queue.forget(listening.fileno())
         asyncio.get_running_loop().call_later(PAUSE_S, self._watch, listening)

@@ -20,28 +20,28 @@ class Tracking:
     """Remembers what was told last. Time is the tick's."""
 
     def __init__(self) -> None:
-        self._told: TrackerMessage | None = None
-        self._told_ns = 0
+        self._sent: TrackerMessage | None = None
+        self._sent_ns = 0
 
     def due(self, t_ns: int, nav: NavMessage) -> TrackerMessage | None:
         """The message to send at `t_ns`; None if there is none to send."""
-        since_ns = t_ns - self._told_ns
-        if self._told is not None and since_ns < SHORTEST_NS:
+        since_ns = t_ns - self._sent_ns
+        if self._sent is not None and since_ns < SHORTEST_NS:
             return None
         message = tracker_message(nav)
         if message is None:
             return None
         if (
-            self._told is not None
+            self._sent is not None
             and since_ns < LONGEST_NS
-            and _apart_m(self._told, message) < MOVED_M
+            and _distance_m(self._sent, message) < MOVED_M
         ):
             return None
-        self._told, self._told_ns = message, t_ns
+        self._sent, self._sent_ns = message, t_ns
         return message
 
 
-def _apart_m(one: TrackerMessage, other: TrackerMessage) -> float:
+def _distance_m(one: TrackerMessage, other: TrackerMessage) -> float:
     north = other.latitude - one.latitude
     east = (other.longitude - one.longitude + 180.0) % 360.0 - 180.0
     return _METRES_A_DEGREE * hypot(north, east * cos(radians(one.latitude)))

@@ -43,8 +43,8 @@ class InnovationMessage:
     whitened: tuple[float, ...]
     """L^-1 nu with S = L L^T: each is N(0, 1) while filter and measurement agree."""
     raw: tuple[float, ...]
-    """Estimate minus measurement in `unit`, before the filter judged it; empty where the aid
-    measures neither position nor velocity, or was not applied. To a micrometre."""
+    """Estimate minus measurement in `unit`, before the filter judged it; empty where the
+    measurement measures neither position nor velocity, or was not applied. To a micrometre."""
     unit: Literal["m", "m/s"] | None
     axes: str
     """A letter for each of `raw`, of `ned`; empty where each is along a direction of its own."""
@@ -94,14 +94,14 @@ CHANNELS: dict[str, Channel] = {
 
 
 def innovation(entry: Entry, outcome: Outcome) -> InnovationMessage:
-    """`/innovation` of an aid that has ended so."""
+    """`/innovation` of a measurement that has ended so."""
     nis = outcome.nis if math.isfinite(outcome.nis) else None
     whitened = tuple(float(v) for v in outcome.whitened)
     raw = entry.raw
     values = () if raw is None else tuple(round(v, 6) for v in raw.values)
     return InnovationMessage(
         entry.key[0],
-        entry.aid.source,
+        entry.measurement.source,
         outcome.name,
         nis,
         outcome.degrees,

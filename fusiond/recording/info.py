@@ -13,8 +13,9 @@ from fusiond.recording.reader import Log
 from fusiond.recording.records import NO_SOURCE, Kind, Record, tick_of
 
 _STEP_NS = MILLISECOND_NS
-"""A jump of the system clock against the monotonic one beyond this is no slew (500 ppm at most)
-between two readings of a running daemon."""
+"""Least jump of the system clock against the monotonic one.
+
+A slew (500 ppm at most) stays below it between two readings of a running daemon."""
 
 
 def info(recording: Log) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One MCAP file as it is written: what describes the log first, then messages in chunks.
+"""One MCAP file in writing: its description first, then messages in chunks.
 
 Every file carries configuration, DBC files, version and host: each split can be read alone. What is
 flushed and synced outlives a power cut; a chunk that was under way then is lost, no more.

@@ -91,7 +91,7 @@ class LogWriter:
         self._queue.append(item)
 
     def close(self) -> None:
-        """Write what waits and finish the file, in its own time."""
+        """Write the queue and finish the file, in the writer's own thread."""
         self._closing.set()
 
     def wait(self) -> None:
@@ -242,7 +242,7 @@ def _size(path: Path) -> int:
 
 
 def _free_mb(folder: Path) -> float:
-    """Of the disk on which the folder lies or will lie."""
+    """Free space (MB) of the folder's disk."""
     while not folder.exists():
         folder = folder.parent
     about = os.statvfs(folder)

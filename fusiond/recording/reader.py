@@ -45,7 +45,7 @@ _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, 
 
 
 _RECORD = struct.Struct("<BQ")
-"""MCAP: opcode and length of a record."""
+"""Opcode and length of an MCAP record."""
 _MESSAGE = struct.Struct("<HIQ8x")
 """MCAP: channel, sequence and log time of a message, before its data."""
 _CHANNEL = struct.Struct("<HHI")
@@ -228,7 +228,7 @@ def _opened(
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """A chunk's bytes, of which it has said truly how many they are. Raises one of `_DAMAGED`.
+    """Decompressed bytes of a chunk, checked against the stated length. Raises one of `_DAMAGED`.
 
     Neither that number nor what a frame says of itself is believed before it is looked at: no more
     is decompressed than a chunk may have.

@@ -44,7 +44,7 @@ from fusiond.recording.records import (
     reading,
     tick_payload,
 )
-from fusiond.recording.retry import Again
+from fusiond.recording.retry import Retry
 
 MESSAGE_BYTES = 64 * 1024
 """Inputs that come without a tick (it is late, or none is left) make a message of their own."""
@@ -82,7 +82,7 @@ class Recorder:
         """`waiting`: the last seconds are kept in memory until an event comes."""
         self._writer: LogWriter | None = None
         self._closing: list[LogWriter] = []
-        self._again = Again()
+        self._again = Retry()
         self._ring: deque[Item] = deque()
         self._until_ns: int | None = None
         self._started: Record | None = None
@@ -207,7 +207,7 @@ class Recorder:
         detail = self.recording.file or self.state
         return DriverStatus("failed" if self.state == "failed" else "running", detail)
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         """A message of a topic goes into the log; an event of `recording.events` starts it where
         that is wanted. `innovations` does not: the log has each of them by itself."""
         t_ns = self._clock.now_ns()
@@ -217,7 +217,7 @@ class Recorder:
             self._look_at(message, t_ns)
 
     async def run(self) -> None:
-        """Until cancelled; then everything is on the disk when this returns."""
+        """Record until cancelled; everything is on disk when this returns."""
         try:
             await asyncio.Event().wait()
         finally:
@@ -319,8 +319,8 @@ class Recorder:
         self._count = self._sequence = 0
         self._readings.clear()
         for name, inputs in self._inputs.items():
-            inputs.heard = partial(self.record_input, self._numbers[name])
-        self._clock.readings.heard = self._record_reading
+            inputs.on_input = partial(self.record_input, self._numbers[name])
+        self._clock.readings.on_reading = self._record_reading
         start = {
             "from_start": restored is not None,
             "system_clock": self._clock.system_state(),
@@ -331,8 +331,8 @@ class Recorder:
 
     def _detach(self) -> None:
         for inputs in self._inputs.values():
-            inputs.heard = None
-        self._clock.readings.heard = None
+            inputs.on_input = None
+        self._clock.readings.on_reading = None
         self._started = None
         self._ring.clear()
         self._message, self._message_bytes = [], 0

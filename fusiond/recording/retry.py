@@ -18,7 +18,7 @@ LONGEST_S = 60.0
 """Also how long it has to write until a failure is a new one."""
 
 
-class Again:
+class Retry:
     """The attempts of one recorder; time is the tick's."""
 
     def __init__(self) -> None:

@@ -47,7 +47,7 @@ class RecordedReadings(Readings):
         return bool(self._readings)
 
     def give(self, readings: Sequence[Reading]) -> None:
-        """These belong to the record that is about to be handled."""
+        """Store the clock readings of the record that is handled next."""
         self._readings = deque(readings)
 
     def realtime(self) -> tuple[int, int]:

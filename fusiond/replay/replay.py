@@ -148,14 +148,14 @@ class Replay:
         self.chain.sources.on_arrival = self._on_arrival
         of_drivers = self.chain.sources.inputs
         for name, inputs in of_drivers.items():
-            inputs.heard = self._listener(name)
+            inputs.on_input = self._listener(name)
         self._driver_inputs = [of_drivers.get(name) for name in self._sources]
         self.exact = self._same and from_start and self._log.first_part and not self._afresh
         self._finish()
         return after_ns
 
     def _on_the_way(self, start: dict[str, Any]) -> tuple[RestoredState, int]:
-        """The first state that the log holds, and its instant."""
+        """First state in the log, and its instant."""
         for message in self._log.messages(STATE):
             try:
                 kept = KEPT_STATE.validate_json(message.data)

@@ -18,7 +18,7 @@ import numpy as np
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.live.publishing import Publishing
-from fusiond.live.scheduler import SECOND_NS, LatenessHistogram
+from fusiond.live.scheduler import SECOND_NS, LatencyHistogram
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.event import EventMessage
@@ -31,13 +31,13 @@ from fusiond.replay.replay_config import config_of
 
 SOLUTION, EVENTS = "solution.csv", "events.csv"
 ROWS = 4096
-"""Solutions that wait to be written together."""
+"""Most solutions that wait to be written together."""
 FAREWELL_S = 1.0
 """Given to the last messages of a published replay."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class ReplayOptions:
     """Options of a replay: another configuration, single settings, files, the speed at which it is
     published (None: not at all, as fast as it goes)."""
 
@@ -47,8 +47,8 @@ class Wish:
     speed: float | None = None
 
 
-def replay(paths: Sequence[Path], wish: Wish) -> dict[str, Any]:
-    """Run; the summary. `times_real_time` is by CPU time.
+def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
+    """Replay a recording; the summary. `times_real_time` is by CPU time.
 
     `identical` is None where there is nothing to compare with. Raises `LogError`, `ConfigError`,
     OSError.
@@ -123,7 +123,7 @@ class _Run:
         self._modes: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._lateness = LatenessHistogram()
+        self._lateness = LatencyHistogram()
         self._overruns = 0
 
     def add(self, tick: ReplayedTick) -> None:
@@ -143,7 +143,7 @@ class _Run:
             listener(message)
 
     def scheduler(self) -> SchedulerStatus:
-        """The daemon's scheduler then."""
+        """State of the recorded daemon's scheduler."""
         return SchedulerStatus(
             ticks=self.replay.comparison.ticks,
             overruns=self._overruns,
@@ -187,7 +187,7 @@ class _Run:
 async def _publish(run: _Run, config: Config, speed: float) -> None:
     """At `speed` times real time, what the daemon would publish."""
     mqtt = MqttPublisher(config.mqtt, config.vehicle, on_event=lambda code, text: None)
-    run.listeners.append(partial(mqtt.take, EVENT))
+    run.listeners.append(partial(mqtt.publish, EVENT))
     sending = asyncio.create_task(mqtt.run())
     loop = asyncio.get_running_loop()
     publishing: Publishing | None = None

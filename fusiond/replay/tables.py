@@ -51,7 +51,7 @@ def arrivals(
     config: Config,
     on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None],
 ) -> None:
-    """Tell every measurement of the log with its instant; no filter runs."""
+    """Report every measurement of the log with its instant; no filter runs."""
     replay = Replay(recording, config, navigate=False, on_arrival=on_arrival)
     for _ in replay.ticks():
         pass
@@ -120,7 +120,7 @@ def _gnss(m: PositionFix) -> Row:
 
 
 def _seconds(t_ns: int) -> str:
-    """To the nanosecond, which a double of seconds since 1970 does not hold."""
+    """Seconds as text, to the nanosecond: a double of seconds since 1970 has no room for them."""
     return f"{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
 
 

@@ -25,7 +25,7 @@ _NUMBERS = TypeAdapter(tuple[float, ...])
 
 class Biases:
     """Takes `/fusiond/state`. An axis' bias is the sum of the model's terms of it: turn-on, Markov.
-    The blocks that aids add come behind them in the state."""
+    The blocks that measurements add come behind them in the state."""
 
     def __init__(self, config: bytes | None) -> None:
         self._slots = _bias_slots(config)

@@ -55,8 +55,8 @@ class _Ended(NamedTuple):
 
 
 class InnovationLists:
-    """`/innovation`: a late measurement rewinds the filter and brings later aids again; the last
-    word on each counts, and the first says when it came."""
+    """`/innovation`: a late measurement rewinds the filter and brings later measurements again; the
+    last word on each counts, and the first says when it came."""
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns

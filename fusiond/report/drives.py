@@ -147,10 +147,10 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
     rest is one."""
     keys = [tuple(str(row.get(name, "")) for name in GROUPED) for row in rows]
     distinct = list(dict.fromkeys(keys))
-    differing = [k for k in range(len(GROUPED)) if len({key[k] for key in distinct}) > 1]
+    changed_settings = [k for k in range(len(GROUPED)) if len({key[k] for key in distinct}) > 1]
     found = []
     for key in distinct[:MOST_GROUPS]:
-        label = " ".join(key[k] for k in differing if key[k]) or "drives"
+        label = " ".join(key[k] for k in changed_settings if key[k]) or "drives"
         found.append(Group(label, [r for r, of in zip(rows, keys, strict=True) if of == key]))
     others = set(distinct[MOST_GROUPS:])
     if others:

@@ -27,9 +27,9 @@ from fusiond.report.channels import (
     VerdictLists,
     number,
 )
-from fusiond.report.input_look import InputLook
+from fusiond.report.input_statistics import InputStatistics
 from fusiond.report.run import Event, LogParts, Problem, Run
-from fusiond.report.settings import differing
+from fusiond.report.settings import changed_settings
 
 _POSITION = ("lat_deg", "lon_deg", "height_m")
 _VELOCITY = ("v_n_m_s", "v_e_m_s", "v_d_m_s")
@@ -69,7 +69,7 @@ def run_from_log(paths: Sequence[Path]) -> Run:
     reader = _Channels(log)
     log.on_message = reader.read
     with TemporaryDirectory(prefix="fusiond-report-") as folder:
-        look = InputLook(log.about, Path(folder))
+        look = InputStatistics(log.about, Path(folder))
         log.on_record = look.read
         known = info(log)  # reads all messages, then all records
     problems = [Problem("error", text) for text in known["problems"]]
@@ -80,7 +80,7 @@ def run_from_log(paths: Sequence[Path]) -> Run:
     run.events = reader.events
     run.truth_offset_s = reader.utc_ahead_s()
     run.facts = _facts(log, known)
-    run.differs = differing(log.about.attachments.get(CONFIG))
+    run.differs = changed_settings(log.about.attachments.get(CONFIG))
     if reader.unreadable:
         problems.append(Problem("error", f"{reader.unreadable} messages are no JSON objects"))
     if reader.dropped:

@@ -65,7 +65,7 @@ def track(run: Run, truth: TrajectoryTable | None) -> Section:
         sd_e=s.sd_position[chosen, 1],
         mode=np.array([places.get(status[k], -1.0) for k in chosen]),
         good="Good: one smooth line without jumps; the ellipses (2 sigma, axes north and east) are"
-        " small beside the road, grow where aids are missing and shrink when they return"
+        " small beside the road, grow where measurements are missing and shrink when they return"
         + ("; the truth (grey) runs inside them." if beside is not None else "."),
         truth=beside,
     )
@@ -94,9 +94,7 @@ def _modes(run: Run) -> Item:
         [mode, f"{100.0 * s / total:.1f} %", f"{s:.1f} s", str(times[mode])]
         for mode, s in sorted(lengths.items(), key=lambda pair: -pair[1])
     ]
-    good = (
-        "Good: `navigating` from the alignment to the end; `coasting` only where aids are missing."
-    )
+    good = "Good: `navigating` from the alignment to the end; `coasting` only without measurements."
     return Table("Modes", ("mode", "share", "time", "times entered"), rows, good)
 
 

@@ -162,7 +162,7 @@ Item = Plot | Table | Grid | Track | Sentence
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Items under one heading; what has the same `key` in two runs stands side by side."""
+    """Items under one heading; items of one `key` in two runs stand side by side."""
 
     title: str
     items: Sequence[tuple[str, Item]] = field(default_factory=tuple)

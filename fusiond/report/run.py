@@ -41,7 +41,7 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Innovations:
-    """The aids of one source, a row each, by instant of validity.
+    """The measurements of one source, a row each, by instant of validity.
 
     `delay_s` is from validity until the filter first met it. `whitened` (n, k) is NaN where there
     was no innovation. `raw` (n, j) in `unit`, estimate minus measurement, along `axes` (of
@@ -99,7 +99,7 @@ class Sky:
 
 
 @dataclass(frozen=True, slots=True)
-class ImuLook:
+class ImuStatistics:
     """Statistics of inertial samples before the filter, in the stretches looked at.
 
     Intervals (ms) between samples by their own stamps and by their arrival; the amplitude spectrum
@@ -119,8 +119,8 @@ class ImuLook:
 
 @dataclass(slots=True)
 class Fault:
-    """One that the daemon has identified: when it began and was last told, the size that was told
-    last, on the axis where it is largest."""
+    """Fault that the daemon identified: its begin, its last report, and its last size on the
+    largest axis."""
 
     source: str
     kind: str
@@ -151,7 +151,7 @@ class LogParts:
     tick_delay_ms: tuple[Floats, Floats] | None = None
     usage: tuple[Floats, Floats, Floats] | None = None
     """Times, CPU in percent of a core, resident memory in MB."""
-    imu: ImuLook | None = None
+    imu: ImuStatistics | None = None
     sources: Sequence[str] = ()
 
 

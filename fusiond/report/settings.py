@@ -17,7 +17,7 @@ from fusiond.report.run import Difference
 _AIDING: TypeAdapter[AnyAiding] = TypeAdapter(AnyAiding)
 
 
-def differing(config: bytes | None) -> list[Difference] | None:
+def changed_settings(config: bytes | None) -> list[Difference] | None:
     """The values that are not the default, dotted, in the file's order; None where the log holds no
     configuration. An inertial unit's defaults are those of its `sensor_class`."""
     try:
@@ -59,7 +59,7 @@ def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _aiding(section: object) -> dict[str, Any]:
-    """Defaults of an aid's kind; the kind itself is always told."""
+    """Defaults of a measurement's kind; the kind itself is always told."""
     kind = section.get("kind") if isinstance(section, dict) else None
     try:
         default = _AIDING.validate_python({"kind": kind}).model_dump(mode="json")
@@ -70,8 +70,8 @@ def _aiding(section: object) -> dict[str, Any]:
 
 
 def _options(section: object) -> dict[str, Any]:
-    """Defaults of a driver's options; which driver it is, and what must be given, is always
-    told."""
+    """Defaults of a driver's options; the driver's name and its required options are always
+    shown."""
     driver = section.get("driver") if isinstance(section, dict) else None
     point = driver_entry_points().get(str(driver))
     if point is None:

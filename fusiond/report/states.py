@@ -26,7 +26,7 @@ def states(run: Run) -> Section:
         good = "Good: continuous; standing, all three are still."
         up = ("north", "east", "up")
         items.append(_plot("position", "Position from its beginning", "m", s.t_s, metres, up, good))
-    good = "Good: about as small as the best aid between its fixes, and growing only without one."
+    good = "Good: about as small as the best source's between its fixes, growing only without one."
     sds = ("sigma north", "sigma east", "sigma down")
     items.append(_plot("sd_p", "Sigma of position", "m", s.t_s, s.sd_position, sds, good, log=True))
     speeds = np.column_stack([s.v, np.hypot(s.v[:, 0], s.v[:, 1])])
@@ -74,7 +74,7 @@ def _plot(
 
 
 def errors(run: Run, truth: TrajectoryTable) -> Section:
-    """Against a truth whose times are on the solution's axis already."""
+    """Errors against a truth on the solution's time axis."""
     title = "Errors against the truth"
     try:
         found = errors_of(run.solution, truth)
@@ -175,7 +175,7 @@ def difference(first: Run, second: Run) -> Section | None:
         "m",
         found.t_s,
         [Series("horizontal", horizontal), Series("down", np.abs(found.position[:, 2]))],
-        "Good: far below sigma where both had the same aids.",
+        "Good: far below sigma where both had the same measurements.",
         log=True,
     )
     items: list[tuple[str, Item]] = [("apart", metres)]

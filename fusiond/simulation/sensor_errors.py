@@ -1,4 +1,4 @@
-r"""Errors of inertial sensors and aids, as the configuration's error model states them.
+r"""Errors of inertial sensors and measurements, as the configuration's error model states them.
 
     y = (1 + s) x + b + c + n + m
     n   white, sigma = N / sqrt(dt)                            N angle or velocity random walk

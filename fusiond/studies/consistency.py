@@ -160,11 +160,14 @@ def _noticed(verdicts: Ints, k: int) -> dict[str, Any]:
     epochs = np.where(after.any(axis=1), after.argmax(axis=1) + 1, np.iinfo(np.int64).max)
     share = float(after.any(axis=1).mean())
     wanted = np.sort(epochs)[math.ceil(NOTICED * len(epochs)) - 1]
-    late = np.bincount(verdicts[:, first + k :].ravel(), minlength=len(VERDICTS))
+    after_onset = np.bincount(verdicts[:, first + k :].ravel(), minlength=len(VERDICTS))
     return {
         "epochs": int(wanted) if share >= NOTICED else None,
         "share": share,
-        "windows": {name: float(n / late.sum()) for name, n in zip(VERDICTS, late, strict=True)},
+        "windows": {
+            name: float(n / after_onset.sum())
+            for name, n in zip(VERDICTS, after_onset, strict=True)
+        },
     }
 
 
@@ -184,7 +187,9 @@ def _quiet(
     return rows
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """Study with `runs` windows for each false-alarm rate and a fortieth (at least 50) of them
     as runs of 1,800 epochs for each power. The same arguments give the same result.
     """
@@ -211,16 +216,16 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
                 average, rho = window_statistics(nu, k)
                 verdicts = window_verdicts(average, rho, 2, k, options.alpha)
                 by_window[str(k)] = _noticed(verdicts, k)
-                late = rho[:, SETTLED::k]  # one window behind the other, all after the onset
+                after_onset = rho[:, SETTLED::k]  # one window behind the other, all after the onset
                 given = judge(k, 2 * k, 1.0, [0.0] * LAGS, alpha=options.alpha)
-                q = _portmanteau(late, k, 2)
+                q = _portmanteau(after_onset, k, 2)
                 tests.append(
                     {
                         "source": source.name,
                         "fault": fault.name,
                         "k": k,
                         "portmanteau": float((q > given.portmanteau_limit).mean()),
-                        "largest_lag": float((_largest_lag_p(late, k, 2) < level).mean()),
+                        "largest_lag": float((_largest_lag_p(after_onset, k, 2) < level).mean()),
                     }
                 )
             power.append({"source": source.name, "fault": fault.name, "by_window": by_window})

@@ -103,7 +103,7 @@ def _true(truth: Truth, t_s: Floats) -> TrajectoryTable:
     )
 
 
-def run(
+def run_study(
     runs: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,

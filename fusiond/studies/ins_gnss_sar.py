@@ -60,7 +60,7 @@ STD = ("attitude_std_arcsec", "velocity_std_m_s")
 FINE_RATE_HZ = 100.0
 
 
-def run(
+def run_study(
     runs: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,

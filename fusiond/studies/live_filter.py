@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG
 from fusiond.estimators.kalman import KalmanEstimator
@@ -50,8 +50,8 @@ class LiveFilter:
     """An estimator on the IMU samples (n, 6) of a run, through the daemon's timeline.
 
     `gap_s` is the longest pause of the IMU that is none. The filter starts at 0 at the navigation
-    state `nav` (10,) with one sigma `sd` (states,). `entries` are the aids in the order in which
-    they were applied, with their outcomes.
+    state `nav` (10,) with one sigma `sd` (states,). `entries` are the measurements in the order in
+    which they were applied, with their outcomes.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class LiveFilter:
         estimator.initialise(0, 0, nav.copy(), np.zeros(estimator.model.size), np.diag(sd**2))
         self._timeline.start()
 
-    def advance(self, t_s: float, measurements: Iterable[Aid] = ()) -> None:
+    def advance(self, t_s: float, measurements: Iterable[AidingMeasurement] = ()) -> None:
         """IMU samples up to `t_s` and then `measurements` arrive."""
         end = round(t_s * RATE_HZ)
         if end > self._given:
@@ -76,4 +76,4 @@ class LiveFilter:
             self._given = end
         for measurement in measurements:
             self._timeline.insert(measurement)
-        self._timeline.run()
+        self._timeline.advance()

@@ -176,7 +176,9 @@ def drive(case: Case, watched: bool, seed: int) -> dict[str, Array]:
     }
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` drives a case. All but `cost_ratio` repeats exactly.
 
     ValueError for fewer than 1 run."""
@@ -231,8 +233,10 @@ def _figures(case: Case, drives: list[dict[str, Array]]) -> dict[str, Any]:
 
 
 def correlation_s(ratio: Array) -> float:
-    """Integrated autocorrelation time 1 + 2 sum rho (s) of a series of seconds (k, m), the sum up
-    to the first rho that is not positive (Geyer, Statistical Science 7 (1992), section 3.3)."""
+    """Integrated autocorrelation time 1 + 2 sum rho (s) of a series of seconds (k, m).
+
+    The sum goes up to the first rho that is not positive (Geyer, Statistical Science 7 (1992),
+    section 3.3)."""
     x = ratio - ratio.mean(axis=0)
     power = float((x * x).sum())
     total = 1.0

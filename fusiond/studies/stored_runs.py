@@ -48,7 +48,7 @@ _PLAIN = {
 
 
 class KeptRuns:
-    """The runs of `study` with `seed` that are in `file`, and those that are added."""
+    """Stored and added runs of `study` with `seed` in `file`."""
 
     def __init__(self, file: RowFile, study: str, seed: int) -> None:
         self._file = file

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.integrity.diagnosis import Correction, Diagnosis
 from fusiond.integrity.service import Series
@@ -11,16 +11,16 @@ from fusiond.integrity.service import Series
 class Trusting(Diagnosis):
     """Leaves all to the filter: its gate, and what detects faults in a federated one."""
 
-    def plain(self, aid: Aid) -> Series | None:
+    def plain(self, measurement: AidingMeasurement) -> Series | None:
         """Each measurement is handed over by itself."""
         return None
 
-    def comes(self, aid: Aid, estimator: Estimator) -> Series:
+    def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
         """All is in service."""
-        return self.own(aid)
+        return self.own(measurement)
 
     def judge(
-        self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
+        self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
         """Nobody is ever suspected."""
         return None

@@ -90,7 +90,7 @@ class Forked:
 
 
 class _Child:
-    """One that works, and the job that it has."""
+    """A child process and its job."""
 
     def __init__(self, jobs: Sequence[Job], share: int) -> None:
         self.connection, theirs = socket.socketpair()
@@ -122,7 +122,7 @@ class _Jobs:
         self._alone: deque[int] = deque()
 
     def work(self, prepare: Job) -> None:
-        """Have all of them done."""
+        """Run all jobs."""
         prepare()
         gc.freeze()  # a collection in a child would copy what they share
         most = 1 if _available_bytes() < FOR_TWO else MOST_CHILDREN
@@ -169,7 +169,7 @@ def _available_bytes() -> float:
 
 
 def _own_bytes() -> int:
-    """Memory that is this process's alone (proc(5), smaps_rollup); 0 where the kernel hides it."""
+    """Private memory of this process (proc(5), smaps_rollup); 0 where the kernel hides it."""
     try:
         lines = Path("/proc/self/smaps_rollup").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -178,7 +178,7 @@ def _own_bytes() -> int:
 
 
 def _fork(work: Callable[[], None]) -> int:
-    """A child that does `work` and ends; the pid. It ends with its parent, too."""
+    """Fork a child that does `work`; its pid. It ends with its parent, too."""
     sys.stdout.flush()
     sys.stderr.flush()
     parent = os.getpid()

@@ -102,7 +102,7 @@ def _least_s(busy: Sequence[_Worker]) -> float | None:
 
 
 class _Worker:
-    """One process; `todo` are the items that it has not answered."""
+    """One process; `todo`: items without a reply so far."""
 
     def __init__(self, timeout_s: float | None) -> None:
         ours, theirs = socket.socketpair()

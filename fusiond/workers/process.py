@@ -1,4 +1,4 @@
-"""A worker's process: takes chunks of items from its socket, answers item by item.
+"""Worker process: takes chunks of items from its socket and replies item by item.
 
 What comes is the pickle of (work, [(index, item), ...]). What goes is pickled, too: `STARTED` when
 `work` has been loaded, then for each item (index, ended, reason, result).

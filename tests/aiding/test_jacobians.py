@@ -1,4 +1,4 @@
-"""Every aid's Jacobian, numerically, for full, planar and scale-factor models."""
+"""Every measurement's Jacobian, numerically, for full, planar and scale-factor models."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.aiding.base import Linearised, NotApplicable
-from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
-from fusiond.aiding.compass import CompassAid, deviation, disturbance
-from fusiond.aiding.height import BarometerAid, HeightAid
-from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.body_velocity import NonHolonomicConstraint, WheelSpeedMeasurement
+from fusiond.aiding.compass import CompassMeasurement, deviation, disturbance
+from fusiond.aiding.height import BarometerMeasurement, HeightMeasurement
+from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.catalogue import make_model
@@ -33,21 +33,21 @@ from fusiond.models.vehicle import (
     barometer_scale,
 )
 from tests import runs
-from tests.aiding.aid_bench import (
+from tests.aiding.measurement_bench import (
     AIR,
     ESTIMATED,
     FIX_BIAS,
-    FIX_WANDER,
+    FIX_MARKOV,
     KM_H,
     LEVER,
     RPY,
     SOURCE,
     VELOCITY,
     Array,
-    aid_model,
     innovation_of,
-    position_aid,
-    rdss_aid,
+    measurement_model,
+    position_measurement,
+    rdss_measurement,
     state_of,
     vehicle_model,
 )
@@ -68,7 +68,7 @@ def _check_jacobian(
     Parameters in error by +d are estimates short by d. `tolerance` covers the curvature over the
     step of the central difference and latitude's rounding.
     """
-    model = model or aid_model(name)
+    model = model or measurement_model(name)
     v = (*VELOCITY[:2], 0.0) if model.hold_height else VELOCITY
     nav = runs.level_nav(rpy, v)
     xi = np.zeros(model.size)
@@ -76,8 +76,8 @@ def _check_jacobian(
         xi[model.parameters(9 + axis)[0]] = 1e-3 * (axis + 1)
     if estimated:
         xi[-len(estimated) :] = estimated
-    aid = make(nav)
-    z, h, r = innovation_of(aid, state_of(model, nav, xi))
+    measurement = make(nav)
+    z, h, r = innovation_of(measurement, state_of(model, nav, xi))
     assert h.shape == (len(z), model.size)
     assert r.shape == z.shape
     assert (r > 0.0).all()
@@ -94,57 +94,65 @@ def _check_jacobian(
             error[k] = sign * size
             off = runs.with_error(nav, error[:9])
             ends.append(
-                innovation_of(aid, state_of(model, off, xi - np.r_[np.zeros(9), error[9:]])).z
+                innovation_of(
+                    measurement, state_of(model, off, xi - np.r_[np.zeros(9), error[9:]])
+                ).z
             )
         numeric = (ends[0] - ends[1]) / (2.0 * size)
         assert numeric == pytest.approx(h[:, k], abs=tolerance), (k, numeric, h[:, k])
 
 
-AIDS: dict[str, Callable[[Array], Linearised]] = {
-    "position": position_aid,
-    "horizontal position": lambda nav: position_aid(nav, False),
-    "position with a shared error": lambda nav: replace(position_aid(nav), bias=FIX_BIAS),
-    "horizontal, shared error": lambda nav: replace(position_aid(nav, False), bias=FIX_BIAS),
+MEASUREMENTS: dict[str, Callable[[Array], Linearised]] = {
+    "position": position_measurement,
+    "horizontal position": lambda nav: position_measurement(nav, False),
+    "position with a shared error": lambda nav: replace(position_measurement(nav), bias=FIX_BIAS),
+    "horizontal, shared error": lambda nav: replace(
+        position_measurement(nav, False), bias=FIX_BIAS
+    ),
     "position with a part of it": lambda nav: replace(
-        position_aid(nav), bias=FIX_BIAS, bias_share=(0.3, 0.7, 0.2)
+        position_measurement(nav), bias=FIX_BIAS, bias_share=(0.3, 0.7, 0.2)
     ),
     "position that wanders": lambda nav: replace(
-        position_aid(nav), bias=FIX_BIAS, wander=FIX_WANDER, wander_m=2.3
+        position_measurement(nav), bias=FIX_BIAS, markov=FIX_MARKOV, markov_m=2.3
     ),
-    "rdss": rdss_aid,
-    "rdss, moved by the delay": lambda nav: rdss_aid(nav, 1.5),
-    "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
-    "horizontal velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2), (0.1, 0.1), LEVER),
-    "heading": lambda nav: HeadingAid(*SOURCE, 2.25, 0.01),
-    "non-holonomic": lambda nav: NonHolonomicAid(*SOURCE, 0.1, 0.2, 2.0, LEVER),
-    "wheel speed": lambda nav: WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
-    "zero velocity": lambda nav: ZeroVelocityAid(*SOURCE, 0.05, runs.rest(100.0)),
-    "zero rate": lambda nav: ZeroRateAid(*SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, runs.rest(100.0)),
+    "rdss": rdss_measurement,
+    "rdss, moved by the delay": lambda nav: rdss_measurement(nav, 1.5),
+    "velocity": lambda nav: VelocityMeasurement(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
+    "horizontal velocity": lambda nav: VelocityMeasurement(
+        *SOURCE, (12.3, -7.2), (0.1, 0.1), LEVER
+    ),
+    "heading": lambda nav: HeadingMeasurement(*SOURCE, 2.25, 0.01),
+    "non-holonomic": lambda nav: NonHolonomicConstraint(*SOURCE, 0.1, 0.2, 2.0, LEVER),
+    "wheel speed": lambda nav: WheelSpeedMeasurement(*SOURCE, 14.0, 0.1, LEVER),
+    "zero velocity": lambda nav: ZeroVelocityUpdate(*SOURCE, 0.05, runs.rest(100.0)),
+    "zero rate": lambda nav: ZeroAngularRateUpdate(
+        *SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, runs.rest(100.0)
+    ),
 }
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("kind", sorted(AIDS))
+@pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
 def test_jacobian(kind: str, model: str) -> None:
     # Position: a metre north turns east's scale by cos' / R; zero rate: the Earth's own rate in H.
     tolerance = {"zero rate": 1e-4, "heading": 2e-6}.get(kind, 2e-6)
-    _check_jacobian(AIDS[kind], model, tolerance=tolerance)
+    _check_jacobian(MEASUREMENTS[kind], model, tolerance=tolerance)
 
 
 IN_TIME: dict[str, Callable[[Array], Linearised]] = {
-    "no slip": AIDS["non-holonomic"],
+    "no slip": MEASUREMENTS["non-holonomic"],
     "wheel": lambda nav: replace(
-        WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
+        WheelSpeedMeasurement(*SOURCE, 14.0, 0.1, LEVER),
         drift=WHEEL_DRIFT,
         scale=WHEEL_SCALE,
         latency=WHEEL_LATENCY,
         rounding=WHEEL_ROUNDING,
         shared_step_m_s=KM_H,
     ),
-    "position": lambda nav: replace(position_aid(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
-    "horizontal position": lambda nav: replace(position_aid(nav, False), time=FIX_TIME),
+    "position": lambda nav: replace(position_measurement(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
+    "horizontal position": lambda nav: replace(position_measurement(nav, False), time=FIX_TIME),
     "velocity": lambda nav: replace(
-        VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
+        VelocityMeasurement(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
         time=VELOCITY_TIME,
         rest=ANTENNA_LEVER,
     ),
@@ -161,17 +169,19 @@ def test_jacobian_of_what_an_owner_cannot_measure(kind: str) -> None:
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.5, 1.1, -3.0), (-2.0, -0.9, 1.0)])
 def test_jacobian_at_steep_attitudes(rpy: tuple[float, float, float]) -> None:
-    _check_jacobian(lambda nav: HeadingAid(*SOURCE, rpy[2], 0.01), "ins15", rpy, 1e-5)
-    _check_jacobian(lambda nav: AttitudeAid(*SOURCE, rpy, (0.01, 0.02, 0.03)), "ins15", rpy)
-    _check_jacobian(AIDS["velocity"], "ins15", rpy, 2e-6)
+    _check_jacobian(lambda nav: HeadingMeasurement(*SOURCE, rpy[2], 0.01), "ins15", rpy, 1e-5)
+    _check_jacobian(lambda nav: AttitudeMeasurement(*SOURCE, rpy, (0.01, 0.02, 0.03)), "ins15", rpy)
+    _check_jacobian(MEASUREMENTS["velocity"], "ins15", rpy, 2e-6)
 
 
 def test_height_jacobian_and_planar() -> None:
-    _check_jacobian(lambda nav: HeightAid(*SOURCE, 41.0, 5.0), "ins15")
-    model = aid_model("planar15")
+    _check_jacobian(lambda nav: HeightMeasurement(*SOURCE, 41.0, 5.0), "ins15")
+    model = measurement_model("planar15")
     state = state_of(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
-    assert HeightAid(*SOURCE, 41.0, 5.0).innovation(state) == NotApplicable("height_held")
-    assert BarometerAid(*SOURCE, 41.0, 5.0, *AIR).innovation(state) == NotApplicable("height_held")
+    assert HeightMeasurement(*SOURCE, 41.0, 5.0).innovation(state) == NotApplicable("height_held")
+    assert BarometerMeasurement(*SOURCE, 41.0, 5.0, *AIR).innovation(state) == NotApplicable(
+        "height_held"
+    )
 
 
 def test_barometer_jacobian_and_what_explains_it() -> None:
@@ -181,24 +191,24 @@ def test_barometer_jacobian_and_what_explains_it() -> None:
         barometer_airflow(AIR[2], 0.1),
     )
     model = make_model("ins15", imu_noise(Imu()), *blocks)
-    aid = BarometerAid(*SOURCE, 120.0, 5.0, *AIR)
-    _check_jacobian(lambda nav: aid, "", model=model, estimated=(70.0, 0.05, 0.2))
+    measurement = BarometerMeasurement(*SOURCE, 120.0, 5.0, *AIR)
+    _check_jacobian(lambda nav: measurement, "", model=model, estimated=(70.0, 0.05, 0.2))
     nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
     xi[-3:] = 70.0, 0.05, 0.2
     lift_m = 0.2 * math.hypot(*VELOCITY[:2]) ** 2 / (2.0 * 9.80665)
-    sensed = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
+    sensed = replace(measurement, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
     assert innovation_of(sensed, state_of(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
 
 
 def test_scale_factors_are_left_out_of_lever_arms() -> None:
     """What a scale factor does over a lever arm: 2000 ppm of 0.5 rad/s over 2 m is 2 mm/s."""
-    model = aid_model("ins21")
+    model = measurement_model("ins21")
     nav = runs.level_nav(RPY, VELOCITY)
-    aid = AIDS["velocity"](nav)
+    measurement = MEASUREMENTS["velocity"](nav)
     xi = np.zeros(model.size)
-    base = innovation_of(aid, state_of(model, nav, xi)).z
+    base = innovation_of(measurement, state_of(model, nav, xi)).z
     xi[model.parameters(17)] = 2e-3
-    assert np.abs(innovation_of(aid, state_of(model, nav, xi)).z - base).max() < 2e-3
+    assert np.abs(innovation_of(measurement, state_of(model, nav, xi)).z - base).max() < 2e-3
 
 
 def test_compass() -> None:
@@ -206,7 +216,7 @@ def test_compass() -> None:
     names = "deviation", "disturbance"
     blocks = deviation(names[0], 0.1), disturbance(names[1], 0.05, 20.0)
     _check_jacobian(
-        lambda nav: CompassAid(*SOURCE, 0.66, 0.01, *names, 0.1),
+        lambda nav: CompassMeasurement(*SOURCE, 0.66, 0.01, *names, 0.1),
         "ins15",
         model=make_model("ins15", imu_noise(Imu()), *blocks),
         estimated=(0.05, -0.04, 0.03, 0.02),

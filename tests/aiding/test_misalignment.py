@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
+from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
+from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.gnss.ecef import to_ecef
@@ -48,18 +48,18 @@ def _state(model: Model, nav: Array, xi: Array) -> State:
     return State(nav, xi, step, model)
 
 
-def _innovation(aid: Linearised, state: State) -> Innovation:
-    found = aid.innovation(state)
+def _innovation(measurement: Linearised, state: State) -> Innovation:
+    found = measurement.innovation(state)
     assert isinstance(found, Innovation)
     return found
 
 
-def _check_jacobian(aid: Linearised, model: Model, nav: Array, tolerance: float) -> None:
+def _check_jacobian(measurement: Linearised, model: Model, nav: Array, tolerance: float) -> None:
     """H against the change of z with one state at a time; a parameter in error by +d is an estimate
     short by d. First order in the misalignment itself: `tolerance` covers it."""
     xi = np.zeros(model.size)
     xi[-3:] = MISALIGNED
-    h = _innovation(aid, _state(model, nav, xi)).h
+    h = _innovation(measurement, _state(model, nav, xi)).h
     unit = np.abs(h).max(axis=1)
     for k in range(model.size):
         if not model.active[k]:
@@ -71,7 +71,9 @@ def _check_jacobian(aid: Linearised, model: Model, nav: Array, tolerance: float)
             error = np.zeros(model.size)
             error[k] = sign * size
             off = runs.with_error(nav, error[:9])
-            ends.append(_innovation(aid, _state(model, off, xi - np.r_[np.zeros(9), error[9:]])).z)
+            ends.append(
+                _innovation(measurement, _state(model, off, xi - np.r_[np.zeros(9), error[9:]])).z
+            )
         numeric = (ends[0] - ends[1]) / (2.0 * size)
         # Metres act by 1 / distance: what is compared is relative to the largest of their kind.
         scale = np.abs(h[:, 6:9]).max(axis=1) if 6 <= k < 9 else unit
@@ -83,10 +85,12 @@ def _check_jacobian(aid: Linearised, model: Model, nav: Array, tolerance: float)
 def test_jacobian_of_a_star_tracker(name: str, rpy: tuple[float, float, float]) -> None:
     model, nav = _model(name, STAR_BLOCK), runs.level_nav(rpy, VELOCITY)
     turned = dcm_from_quaternion(nav[6:]) @ Rotation.from_rotvec(MISALIGNED).as_matrix()
-    aid = AttitudeAid(*SOURCE, rpy_from_dcm(turned), (0.001, 0.002, 0.003), block=STAR_BLOCK)
+    measurement = AttitudeMeasurement(
+        *SOURCE, rpy_from_dcm(turned), (0.001, 0.002, 0.003), block=STAR_BLOCK
+    )
     # 5e-4 of misalignment turns its own Jacobian by half of that.
-    _check_jacobian(aid, model, nav, 4e-4)
-    h = _innovation(aid, _state(model, nav, np.zeros(model.size))).h
+    _check_jacobian(measurement, model, nav, 4e-4)
+    h = _innovation(measurement, _state(model, nav, np.zeros(model.size))).h
     assert np.abs(h[:, -3:]).max() > 0.5
 
 
@@ -98,8 +102,10 @@ def test_jacobian_of_a_bearing(
 ) -> None:
     v = (*VELOCITY[:2], 0.0) if name == "planar15" else VELOCITY
     model, nav = _model(name, SAR_BLOCK), runs.level_nav(rpy, v)
-    aid = BearingAid(*SOURCE, 0.3, 0.1, (1e-3, 1e-3), point, LEVER, 500.0, block=SAR_BLOCK)
-    _check_jacobian(aid, model, nav, 1e-3)
+    measurement = BearingMeasurement(
+        *SOURCE, 0.3, 0.1, (1e-3, 1e-3), point, LEVER, 500.0, block=SAR_BLOCK
+    )
+    _check_jacobian(measurement, model, nav, 1e-3)
 
 
 def _seen(nav: Array, point: tuple[float, float, float], turn: Rotation) -> tuple[float, float]:
@@ -119,8 +125,10 @@ def test_a_true_bearing_has_no_innovation(rpy: tuple[float, float, float]) -> No
     xi = np.zeros(model.size)
     xi[-3:] = 0.02, -0.03, 0.01
     azimuth, elevation = _seen(nav, NEAR, Rotation.from_rotvec(xi[-3:]))
-    aid = BearingAid(*SOURCE, azimuth, elevation, (1e-3, 1e-3), NEAR, LEVER, 0.0, block=SAR_BLOCK)
-    z = _innovation(aid, _state(model, nav, xi)).z
+    measurement = BearingMeasurement(
+        *SOURCE, azimuth, elevation, (1e-3, 1e-3), NEAR, LEVER, 0.0, block=SAR_BLOCK
+    )
+    z = _innovation(measurement, _state(model, nav, xi)).z
     assert z == pytest.approx([0.0, 0.0], abs=1e-11)
     # Azimuth runs from x to y, elevation against z: a level vehicle that heads north.
     level = runs.level_nav((0.0, 0.0, 0.0), VELOCITY)
@@ -134,11 +142,13 @@ def test_a_true_star_tracker_has_no_innovation() -> None:
     xi = np.zeros(model.size)
     xi[-3:] = 0.02, -0.03, 0.01
     turned = dcm_from_quaternion(nav[6:]) @ Rotation.from_rotvec(xi[-3:]).as_matrix()
-    aid = AttitudeAid(*SOURCE, rpy_from_dcm(turned), (1e-3,) * 3, block=STAR_BLOCK)
-    assert _innovation(aid, _state(model, nav, xi)).z == pytest.approx(np.zeros(3), abs=1e-12)
+    measurement = AttitudeMeasurement(*SOURCE, rpy_from_dcm(turned), (1e-3,) * 3, block=STAR_BLOCK)
+    assert _innovation(measurement, _state(model, nav, xi)).z == pytest.approx(
+        np.zeros(3), abs=1e-12
+    )
     # A model without the block takes the attitude as the body's.
     plain = make_model("ins15", imu_noise(Imu()))
-    z, h, _ = _innovation(aid, _state(plain, nav, np.zeros(plain.size)))
+    z, h, _ = _innovation(measurement, _state(plain, nav, np.zeros(plain.size)))
     assert np.abs(z).max() > 0.01
     assert h.shape == (3, plain.size)
 
@@ -155,26 +165,28 @@ def _moved(nav: Array, seconds: float) -> Array:
 @pytest.mark.parametrize(
     ("block", "make"),
     [
-        (STAR_BLOCK, lambda: AttitudeAid(*SOURCE, ATTITUDES[0], (1e-4,) * 3)),
-        (SAR_BLOCK, lambda: BearingAid(*SOURCE, 0.0, 0.0, (1e-4,) * 2, NEAR, LEVER, 0.0)),
+        (STAR_BLOCK, lambda: AttitudeMeasurement(*SOURCE, ATTITUDES[0], (1e-4,) * 3)),
+        (SAR_BLOCK, lambda: BearingMeasurement(*SOURCE, 0.0, 0.0, (1e-4,) * 2, NEAR, LEVER, 0.0)),
     ],
 )
 def test_timing_error_adds_what_turns_and_moves_in_it(
-    block: str, make: Callable[[], AttitudeAid | BearingAid]
+    block: str, make: Callable[[], AttitudeMeasurement | BearingMeasurement]
 ) -> None:
     model, nav = _model("ins15", block), runs.level_nav(ATTITUDES[0], VELOCITY)
-    aid, xi = make(), np.zeros(model.size)
-    before = _innovation(aid, _state(model, nav, xi))
-    rate = (_innovation(aid, _state(model, _moved(nav, 1e-3), xi)).z - before.z) / 1e-3
-    added = _innovation(replace(aid, sd_time_s=0.02), _state(model, nav, xi)).r - before.r
+    measurement, xi = make(), np.zeros(model.size)
+    before = _innovation(measurement, _state(model, nav, xi))
+    rate = (_innovation(measurement, _state(model, _moved(nav, 1e-3), xi)).z - before.z) / 1e-3
+    added = _innovation(replace(measurement, sd_time_s=0.02), _state(model, nav, xi)).r - before.r
     assert np.sqrt(added) == pytest.approx(0.02 * np.abs(rate), rel=2e-3)
 
 
 def test_bearings_that_do_not_hold_say_why() -> None:
     model = _model("ins15", SAR_BLOCK)
-    aid = BearingAid(*SOURCE, 0.3, 0.1, (1e-3, 1e-3), NEAR, LEVER, 30_000.0, block=SAR_BLOCK)
+    measurement = BearingMeasurement(
+        *SOURCE, 0.3, 0.1, (1e-3, 1e-3), NEAR, LEVER, 30_000.0, block=SAR_BLOCK
+    )
     state = _state(model, runs.level_nav((0.0, 0.0, 0.0), VELOCITY), np.zeros(model.size))
-    assert aid.innovation(state) == NotApplicable("too_close")
-    assert isinstance(replace(aid, least_range_m=15_000.0).innovation(state), Innovation)
-    below = replace(aid, point=(*runs.ORIGIN[:2], -9000.0), least_range_m=0.0)
+    assert measurement.innovation(state) == NotApplicable("too_close")
+    assert isinstance(replace(measurement, least_range_m=15_000.0).innovation(state), Innovation)
+    below = replace(measurement, point=(*runs.ORIGIN[:2], -9000.0), least_range_m=0.0)
     assert below.innovation(state) == NotApplicable("too_steep")

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
-from fusiond.aiding.compass import CompassAid, deviation, disturbance
+from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.body_velocity import NonHolonomicConstraint, WheelSpeedMeasurement
+from fusiond.aiding.compass import CompassMeasurement, deviation, disturbance
+from fusiond.aiding.heading_history import HOLDS_NS, HeadingHistory, KnownHeading
 from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeed
-from fusiond.aiding.way_faced import HOLDS_NS, Faced, WayFaced
 from fusiond.models.constant_velocity import constant_velocity
 from fusiond.models.vehicle import (
     WHEEL_DRIFT,
@@ -41,7 +41,7 @@ BLOCKS = (
     disturbance("bridges", 0.03, 20.0),
 )
 MODEL = constant_velocity((0.75, 0.1, 3.0), BLOCKS)
-WHEEL = WheelSpeedAid(
+WHEEL = WheelSpeedMeasurement(
     *("wheel", 5 * SECOND, 0.99, 4.0, 0.1, (0.0, 0.0, 0.0)),
     drift=WHEEL_DRIFT,
     scale=WHEEL_SCALE,
@@ -59,38 +59,38 @@ def state(forward_m_s: float, sd_m_s: float = SD_M_S, xi: np.ndarray | None = No
     return State(nav, estimated, np.zeros(STEP_SIZE), MODEL, covariance)
 
 
-def way(*headings: Faced) -> WayFaced:
-    found = WayFaced(0.2)
+def way(*headings: KnownHeading) -> HeadingHistory:
+    found = HeadingHistory(0.2)
     for heading in headings:
         found.add(heading)
     return found
 
 
-def level(aid: Aid, of: WayFaced) -> Aid:
-    found = aid.unturned(of)
+def level(measurement: AidingMeasurement, of: HeadingHistory) -> AidingMeasurement:
+    found = measurement.without_attitude(of)
     assert found is not None
     return found
 
 
-def rows(aid: Aid, at: State) -> Innovation:
-    found = aid.innovation(at)
+def rows(measurement: AidingMeasurement, at: State) -> Innovation:
+    found = measurement.innovation(at)
     assert isinstance(found, Innovation), found
     return found
 
 
-def refused(aid: Aid, at: State) -> str:
-    found = aid.innovation(at)
+def refused(measurement: AidingMeasurement, at: State) -> str:
+    found = measurement.innovation(at)
     assert isinstance(found, NotApplicable)
     return found.outcome
 
 
-HEADING = HeadingAid("heading", 5 * SECOND, 0.99, YAW_RAD, 0.02)
-COMPASS = CompassAid("compass", 5 * SECOND, 0.99, YAW_RAD, 0.02, "iron", "bridges", 0.06)
-FACED = Faced(5 * SECOND, YAW_RAD, 0.02)
+HEADING = HeadingMeasurement("heading", 5 * SECOND, 0.99, YAW_RAD, 0.02)
+COMPASS = CompassMeasurement("compass", 5 * SECOND, 0.99, YAW_RAD, 0.02, "iron", "bridges", 0.06)
+FACED = KnownHeading(5 * SECOND, YAW_RAD, 0.02)
 
 
 @pytest.mark.parametrize(
-    ("aid", "tolerance"),
+    ("measurement", "tolerance"),
     [
         (level(WHEEL, way()), 1e-6),
         (level(WHEEL, way(FACED)), 1e-6),
@@ -98,13 +98,13 @@ FACED = Faced(5 * SECOND, YAW_RAD, 0.02)
         (level(COMPASS, way()), 1e-6),
     ],
 )
-def test_slopes(aid: Aid, tolerance: float) -> None:
+def test_slopes(measurement: AidingMeasurement, tolerance: float) -> None:
     """H against the change of z where the computed state is off; an estimate is short by d."""
     estimated = np.zeros(MODEL.size)
     estimated[MODEL.slots_of("iron")] = 0.02, -0.01, 0.03
     estimated[MODEL.slots_of(WHEEL_SCALE)] = 0.01
     at = state(5.0, xi=estimated)
-    h, d = rows(aid, at).h.copy(), 1e-5
+    h, d = rows(measurement, at).h.copy(), 1e-5
     for k in (3, 4, 5, *range(9, MODEL.size)):
         z = []
         for sign in (1.0, -1.0):
@@ -113,20 +113,20 @@ def test_slopes(aid: Aid, tolerance: float) -> None:
                 nav[k] += sign * d
             else:
                 xi[k] -= sign * d
-            z.append(rows(aid, at._replace(nav=nav, xi=xi)).z.copy())
+            z.append(rows(measurement, at._replace(nav=nav, xi=xi)).z.copy())
         slope = (z[0] - z[1]) / (2.0 * d)
         assert h[:, k] == pytest.approx(slope, abs=tolerance), MODEL.column_of[k]
 
 
 def test_a_wheel_says_the_speed_along_the_velocity_or_the_heading() -> None:
-    fast, turned = replace(WHEEL, speed_m_s=5.0), Faced(5 * SECOND, YAW_RAD + math.pi, 0.02)
+    fast, turned = replace(WHEEL, speed_m_s=5.0), KnownHeading(5 * SECOND, YAW_RAD + math.pi, 0.02)
     assert rows(level(fast, way()), state(5.5)).z[0] == pytest.approx(0.5)
     # By a heading the sign is told: it reverses.
     back = replace(fast, speed_m_s=-5.0)
     assert rows(level(back, way(turned)), state(5.5)).z[0] == pytest.approx(-0.5)
     assert rows(level(back, way()), state(5.5)).z[0] == pytest.approx(-0.5)
     # Across the heading nothing of the velocity is a wheel's.
-    across = Faced(5 * SECOND, YAW_RAD + 0.5 * math.pi, 0.02)
+    across = KnownHeading(5 * SECOND, YAW_RAD + 0.5 * math.pi, 0.02)
     assert rows(level(fast, way(across)), state(5.5)).z[0] == pytest.approx(-5.0)
 
 
@@ -151,11 +151,11 @@ def test_a_wheel_that_says_nothing_stops_a_vehicle_that_may_face_anywhere() -> N
 
 
 def test_a_heading_counts_for_a_second_and_never_one_of_later() -> None:
-    late = Faced(5 * SECOND + 1, 2.0, 0.02)
-    known = way(late, Faced(5 * SECOND - HOLDS_NS, YAW_RAD, 0.02))
-    assert known.at(5 * SECOND) == Faced(5 * SECOND - HOLDS_NS, YAW_RAD, 0.02)
+    late = KnownHeading(5 * SECOND + 1, 2.0, 0.02)
+    known = way(late, KnownHeading(5 * SECOND - HOLDS_NS, YAW_RAD, 0.02))
+    assert known.at(5 * SECOND) == KnownHeading(5 * SECOND - HOLDS_NS, YAW_RAD, 0.02)
     assert known.at(5 * SECOND + 1) == late
-    assert way(Faced(5 * SECOND - HOLDS_NS - 1, YAW_RAD, 0.02)).at(5 * SECOND) is None
+    assert way(KnownHeading(5 * SECOND - HOLDS_NS - 1, YAW_RAD, 0.02)).at(5 * SECOND) is None
     # In whatever order they come.
     wheel = level(WHEEL, way(late, FACED))
     assert isinstance(wheel, GroundSpeed)
@@ -172,13 +172,19 @@ def test_a_heading_says_which_way_the_vehicle_goes_or_backs() -> None:
 
 
 def test_who_may_slide_has_no_course_and_an_attitude_alone_none_without_a_yaw() -> None:
-    free = WayFaced()
+    free = HeadingHistory()
     free.add(FACED)
-    assert HEADING.unturned(free) is None
-    assert COMPASS.unturned(free) is None
+    assert HEADING.without_attitude(free) is None
+    assert COMPASS.without_attitude(free) is None
     assert free.at(5 * SECOND) is None
     own = "attitude", 5 * SECOND, 0.99
-    assert AttitudeAid(*own, (0.0, 0.0, YAW_RAD), (0.1, 0.1, 0.1)).unturned(way()) is not None
-    assert AttitudeAid(*own, (0.0, 0.0, math.nan), (0.1, 0.1, 0.1)).unturned(way()) is None
-    slides = NonHolonomicAid("non_holonomic", 0, 0.99, 0.2, 0.5, 2.0, (0.0, 0.0, 0.0))
-    assert slides.unturned(way()) is None
+    assert (
+        AttitudeMeasurement(*own, (0.0, 0.0, YAW_RAD), (0.1, 0.1, 0.1)).without_attitude(way())
+        is not None
+    )
+    assert (
+        AttitudeMeasurement(*own, (0.0, 0.0, math.nan), (0.1, 0.1, 0.1)).without_attitude(way())
+        is None
+    )
+    slides = NonHolonomicConstraint("non_holonomic", 0, 0.99, 0.2, 0.5, 2.0, (0.0, 0.0, 0.0))
+    assert slides.without_attitude(way()) is None

@@ -1,4 +1,4 @@
-"""Pseudorange aid: geometry by hand, Jacobian numerically, clock slots, refusals."""
+"""Pseudorange measurement: geometry by hand, Jacobian numerically, clock slots, refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fusiond.aiding.pseudorange import (
     CARRIER_CLOCK,
     NO_CLOCK,
     RANGE_SHARED,
-    PseudorangeAid,
+    PseudorangeMeasurement,
     epoch_values,
     nothing_left,
 )
@@ -78,11 +78,13 @@ def _satellites(nav: Array) -> tuple[Array, Array]:
     return p + 2.5e7 * unit @ axes.T, rng.normal(0.0, 2000.0, (len(unit), 3))
 
 
-def _aid(nav: Array, clock: object = (0, 0, 1, 1, 0), off: float = 0.0) -> PseudorangeAid:
+def _measurement(
+    nav: Array, clock: object = (0, 0, 1, 1, 0), off: float = 0.0
+) -> PseudorangeMeasurement:
     s, s_dot = _satellites(nav)
     ranges, rates = _truth(nav, RATE_SENSED, s, s_dot)
     names = ("C19", "C20", "G01", "G02", "C59")
-    return PseudorangeAid(
+    return PseudorangeMeasurement(
         "raw",
         0,
         0.999,
@@ -100,8 +102,8 @@ def _aid(nav: Array, clock: object = (0, 0, 1, 1, 0), off: float = 0.0) -> Pseud
     )
 
 
-def _innovation(aid: PseudorangeAid, state: State) -> Innovation:
-    found = aid.innovation(state)
+def _innovation(measurement: PseudorangeMeasurement, state: State) -> Innovation:
+    found = measurement.innovation(state)
     assert isinstance(found, Innovation)
     return found
 
@@ -109,8 +111,8 @@ def _innovation(aid: PseudorangeAid, state: State) -> Innovation:
 def test_predicts_what_vectors_in_ecef_axes_say() -> None:
     model = _model("ins15")
     nav = runs.level_nav(RPY, VELOCITY)
-    aid = _aid(nav, off=-2.5)
-    z, _, r = _innovation(aid, _state(model, nav, np.zeros(model.size)))
+    measurement = _measurement(nav, off=-2.5)
+    z, _, r = _innovation(measurement, _state(model, nav, np.zeros(model.size)))
     assert z == pytest.approx(2.5, abs=3e-8)  # a unit in the last place of 2.5e7 m is 4e-9
     assert r.tolist() == [1, 2, 3, 4, 5, 0.01, 0.02, 0.03, 0.04, 0.05]
 
@@ -121,9 +123,9 @@ def test_jacobian(name: str) -> None:
     leaves 4e-6, curvature of the lever arm 4e-7; 3e-7 m/m from the curve of the Earth."""
     model = _model(name)
     nav = runs.level_nav(RPY, (*VELOCITY[:2], 0.0) if model.hold_height else VELOCITY)
-    aid = _aid(nav)
+    measurement = _measurement(nav)
     xi = np.zeros(model.size)
-    h = _innovation(aid, _state(model, nav, xi)).h
+    h = _innovation(measurement, _state(model, nav, xi)).h
     for k in np.flatnonzero(model.active):
         size = 10.0 if 6 <= k < 9 else 1e-3
         ends = []
@@ -131,7 +133,9 @@ def test_jacobian(name: str) -> None:
             error = np.zeros(model.size)
             error[k] = sign * size
             off = runs.with_error(nav, error[:9])
-            ends.append(_innovation(aid, _state(model, off, np.r_[np.zeros(9), -error[9:]])).z)
+            ends.append(
+                _innovation(measurement, _state(model, off, np.r_[np.zeros(9), -error[9:]])).z
+            )
         numeric = (ends[0] - ends[1]) / (2.0 * size)
         assert numeric[:5] == pytest.approx(h[:5, k], abs=1e-5), k
         # A rate changes by 1e-4 (m/s)/m with the place: a sixth digit of that, and 1e-8 (m/s)/m
@@ -146,7 +150,7 @@ def test_each_range_has_its_system_s_offset() -> None:
     xi = np.zeros(model.size)
     offsets, (drift,) = model.slots_of("clock_offset"), model.slots_of("clock_drift")
     xi[offsets], xi[drift] = [100.0, 200.0], 3.0
-    z, h, _ = _innovation(_aid(nav), _state(model, nav, xi))
+    z, h, _ = _innovation(_measurement(nav), _state(model, nav, xi))
     assert z == pytest.approx([100, 100, 200, 200, 100, *[3.0] * 5], abs=1e-4)
     assert h[:5, offsets].tolist() == [[-1, 0], [-1, 0], [0, -1], [0, -1], [-1, 0]]
     assert h[5:, drift].tolist() == [-1.0] * 5
@@ -155,7 +159,9 @@ def test_each_range_has_its_system_s_offset() -> None:
 def test_without_a_clock_a_range_is_a_range() -> None:
     model = make_model("ins15", imu_noise(Imu()))
     nav = runs.level_nav(RPY, VELOCITY)
-    z, h, _ = _innovation(_aid(nav, [NO_CLOCK] * 5), _state(model, nav, np.zeros(model.size)))
+    z, h, _ = _innovation(
+        _measurement(nav, [NO_CLOCK] * 5), _state(model, nav, np.zeros(model.size))
+    )
     assert np.abs(z).max() < 1e-6
     assert not h[:5, 9:].any()
 
@@ -163,11 +169,11 @@ def test_without_a_clock_a_range_is_a_range() -> None:
 def test_what_is_not_measured_has_no_row() -> None:
     model = _model("ins15")
     nav = runs.level_nav(RPY, VELOCITY)
-    whole = _aid(nav)
+    whole = _measurement(nav)
     state = _state(model, nav, np.zeros(model.size))
     ranges, rates = whole.ranges.copy(), whole.rates.copy()
     ranges[1], rates[[0, 1]] = math.nan, math.nan
-    part = PseudorangeAid(
+    part = PseudorangeMeasurement(
         "raw",
         0,
         0.999,
@@ -196,17 +202,17 @@ def test_what_is_not_measured_has_no_row() -> None:
 def test_refusals() -> None:
     nav = runs.level_nav(RPY, VELOCITY)
     bare = make_model("ins15", imu_noise(Imu()))
-    assert _aid(nav).innovation(_state(bare, nav, np.zeros(bare.size))) == NotApplicable(
+    assert _measurement(nav).innovation(_state(bare, nav, np.zeros(bare.size))) == NotApplicable(
         "no_clock_state"
     )
     one = _model("ins15", ("C",))
-    assert _aid(nav).innovation(_state(one, nav, np.zeros(one.size))) == NotApplicable(
+    assert _measurement(nav).innovation(_state(one, nav, np.zeros(one.size))) == NotApplicable(
         "no_clock_state"
     )
     with pytest.raises(ValueError, match="with and without"):
-        _aid(nav, [0, NO_CLOCK, 0, 0, 0])
+        _measurement(nav, [0, NO_CLOCK, 0, 0, 0])
     with pytest.raises(ValueError, match="shape"):
-        _aid(nav, [0, 0])
+        _measurement(nav, [0, 0])
 
 
 # ---------------------------------------------------------------------- carriers, shared errors
@@ -254,9 +260,9 @@ def _by_carrier(
     if dopplers is not None:
         values[7] = dopplers
     clock, names = np.zeros(n, np.int64), tuple(f"G{k:02d}" for k in range(n))
-    first = PseudorangeAid("raw", 0, 0.999, names, values, clock, LEVER)
+    first = PseudorangeMeasurement("raw", 0, 0.999, names, values, clock, LEVER)
     first.innovation(State(nav_0, np.zeros(model.size), step_0, model))
-    then = PseudorangeAid(
+    then = PseudorangeMeasurement(
         "raw", 0, 0.999, names, values, clock, LEVER, before=first.left, left=nothing_left()
     )
     if turned is not None:
@@ -280,8 +286,8 @@ def test_a_turned_heading_turns_what_the_carriers_go_by(psi: float) -> None:
     assert found.z == pytest.approx(expected.z, abs=1e-3)  # Coriolis of the other way
     assert found.h == pytest.approx(expected.h, abs=1e-3)
     # Half a second of 0.7 m/s^2, and a lever arm of 1.4 m, are otherwise metres a second off.
-    unturned = _by_carrier(model, ends, rates, s, s_dot, None, (0.0, other[2]))
-    assert np.abs(unturned.z - expected.z).max() > 0.5 * abs(math.sin(psi))
+    without_attitude = _by_carrier(model, ends, rates, s, s_dot, None, (0.0, other[2]))
+    assert np.abs(without_attitude.z - expected.z).max() > 0.5 * abs(math.sin(psi))
 
 
 def test_rate_of_a_carrier_is_the_way_between_the_epochs() -> None:
@@ -362,27 +368,27 @@ def test_a_carrier_without_the_epoch_before_says_nothing() -> None:
     z, _, r = _by_carrier(model, (nav_0, step_0, nav_1, step_1), np.zeros(len(s)), s, s_dot)
     assert (z == 0.0).all()
     assert (r == UNUSED_VARIANCE).all()
-    aid = _aid(nav_1)
-    aid.values[13], aid.values[14], aid.values[15] = SPAN_S, 7.0, 1e-4
-    assert _innovation(aid, _state(model, nav_1, np.zeros(model.size))).r[5:].tolist() == [
+    measurement = _measurement(nav_1)
+    measurement.values[13], measurement.values[14], measurement.values[15] = SPAN_S, 7.0, 1e-4
+    assert _innovation(measurement, _state(model, nav_1, np.zeros(model.size))).r[5:].tolist() == [
         0.01, 0.02, 0.03, 0.04, 0.05
     ]  # fmt: skip
-    assert [what for _, what in aid.labels][5:] == ["carrier"] * 5
+    assert [what for _, what in measurement.labels][5:] == ["carrier"] * 5
 
 
 def test_what_ranges_share_is_a_state_or_noise() -> None:
     nav = runs.level_nav(RPY, VELOCITY)
-    aid = _aid(nav)
-    aid.values[10:13] = [[2.0] * 5, [0.0, 0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 0.0, 0.0, 5.0]]
+    measurement = _measurement(nav)
+    measurement.values[10:13] = [[2.0] * 5, [0.0, 0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 0.0, 0.0, 5.0]]
     model = _model_with_carriers()
     xi = np.zeros(model.size)
     slots = model.slots_of_all(RANGE_SHARED)
     xi[slots] = [0.5, -1.0, 2.0]
-    z, h, r = _innovation(aid, _state(model, nav, xi))
+    z, h, r = _innovation(measurement, _state(model, nav, xi))
     assert z[:5] == pytest.approx([1.0, 0.9, 0.8, 0.7, 10.6], abs=1e-6)
-    assert np.array_equal(h[:5, slots], -aid.values[10:13].T)
+    assert np.array_equal(h[:5, slots], -measurement.values[10:13].T)
     assert r[:5].tolist() == [1, 2, 3, 4, 5]
     plain = _model("ins15")
-    r = _innovation(aid, _state(plain, nav, np.zeros(plain.size))).r
-    assert r[:5] == pytest.approx(aid.total_variance)
-    assert aid.total_variance[4] == pytest.approx(5.0 + 4.0 + 0.16 + 25.0)
+    r = _innovation(measurement, _state(plain, nav, np.zeros(plain.size))).r
+    assert r[:5] == pytest.approx(measurement.total_variance)
+    assert measurement.total_variance[4] == pytest.approx(5.0 + 4.0 + 0.16 + 25.0)

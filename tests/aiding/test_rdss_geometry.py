@@ -332,11 +332,13 @@ def test_floor_where_class_decides_and_where_geometry_does() -> None:
 
 def test_study_result() -> None:
     seen: list[tuple[int, int]] = []
-    result = rdss_map.run(500, seed=3, progress=lambda done, total: seen.append((done, total)))
+    result = rdss_map.run_study(
+        500, seed=3, progress=lambda done, total: seen.append((done, total))
+    )
     assert seen == [(i + 1, len(seen)) for i in range(len(seen))]
     assert json.loads(json.dumps(result, allow_nan=False)) == result
-    assert rdss_map.run(500, seed=3) == result
-    assert rdss_map.run(500, seed=4)["places"] != result["places"]
+    assert rdss_map.run_study(500, seed=3) == result
+    assert rdss_map.run_study(500, seed=4)["places"] != result["places"]
 
     shape = (len(result["latitudes_deg"]), len(result["longitudes_deg"]))
     row, column = result["latitudes_deg"].index(25.0), result["longitudes_deg"].index(130.0)
@@ -356,7 +358,7 @@ def test_study_result() -> None:
 
 
 def test_study_against_the_paper() -> None:
-    result = rdss_map.run(2)
+    result = rdss_map.run_study(2)
     places = {p["place"]: p for p in result["places"]}
     # "about 30 m in all": the horizontal (radial) figure where the authors worked, not an axis
     assert places["Yantai"]["radial"] == pytest.approx(30.0, rel=0.05)
@@ -370,7 +372,7 @@ def test_study_against_the_paper() -> None:
 
 
 def test_study_table_names_every_place_and_gap() -> None:
-    result = rdss_map.run(2)
+    result = rdss_map.run_study(2)
     text = rdss_map.table(result)
     lines = text.splitlines()
     assert all(any(line.startswith(name) for line in lines) for name in rdss_map.PLACES)
@@ -379,4 +381,4 @@ def test_study_table_names_every_place_and_gap() -> None:
     north, east = at(55.0, 110.0).total[0, 0] ** 0.5, at(55.0, 110.0).total[1, 1] ** 0.5
     assert f"{north:.1f} / {east:.1f}" in last
     with pytest.raises(ValueError, match="runs"):
-        rdss_map.run(1)
+        rdss_map.run_study(1)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.aiding.rest_evidence import SMOOTH_WINDOWS, RestEvidence
-from fusiond.aiding.standstill import ZeroRateAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.standstill import ZeroAngularRateUpdate
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.catalogue import make_model
@@ -39,8 +39,10 @@ def _fixes(speed_m_s: float, count: int, sd_m_s: float = 0.1) -> RestEvidence:
         t_ns = round((END_S - 0.9 * k / count) * 1e9)
         north, east = (float(e) for e in sd_m_s * rng.standard_normal(2))
         v = (speed_m_s + north, east, 0.0)
-        aid = VelocityAid("gnss_velocity", t_ns, 0.999, v, (sd_m_s,) * 3, (0.0, 0.0, 0.0))
-        rest_evidence.hear([aid])
+        measurement = VelocityMeasurement(
+            "gnss_velocity", t_ns, 0.999, v, (sd_m_s,) * 3, (0.0, 0.0, 0.0)
+        )
+        rest_evidence.receive([measurement])
     return rest_evidence
 
 
@@ -68,8 +70,10 @@ def test_a_fix_before_the_quiet_windows_says_nothing() -> None:
     rest_evidence = RestEvidence()
     before_ns = round((END_S - 1.5) * 1e9)
     sd = (0.1, 0.1, 0.1)
-    aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
-    rest_evidence.hear([aid])
+    measurement = VelocityMeasurement(
+        "gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0)
+    )
+    rest_evidence.receive([measurement])
     assert runs.rest(rest_evidence=rest_evidence).doubt(_state(0.0, 0.02)) is None
     assert runs.rest(rest_evidence=rest_evidence, run=2).doubt(_state(0.0, 0.02)) == "moving"
 
@@ -78,8 +82,10 @@ def test_windows_of_half_a_second_look_at_their_own() -> None:
     """What was measured 0.75 s before the end was measured before the window."""
     rest_evidence, sd = RestEvidence(), (0.1, 0.1, 0.1)
     before_ns = round((END_S - 0.75) * 1e9)
-    aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
-    rest_evidence.hear([aid])
+    measurement = VelocityMeasurement(
+        "gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0)
+    )
+    rest_evidence.receive([measurement])
     rest = replace(runs.rest(rest_evidence=rest_evidence), window_s=0.5)
     assert rest.doubt(_state(0.0, 0.02)) is None
     assert replace(rest, window_s=1.0).doubt(_state(0.0, 0.02)) == "moving"
@@ -93,7 +99,9 @@ def test_a_vehicle_that_turns_back_is_not_at_rest() -> None:
     for ago_s, north in ((2.9, -0.35), (1.9, -0.05), (0.9, 0.25)):
         t_ns = round((END_S - ago_s) * 1e9)
         v = (north, 0.0, 0.0)
-        rest_evidence.hear([VelocityAid("gnss_velocity", t_ns, 0.999, v, sd, (0.0, 0.0, 0.0))])
+        rest_evidence.receive(
+            [VelocityMeasurement("gnss_velocity", t_ns, 0.999, v, sd, (0.0, 0.0, 0.0))]
+        )
     span = round((END_S - 3.0) * 1e9), round(END_S * 1e9)
     assert not rest_evidence.measured(*span).contradicts
     assert runs.rest(rest_evidence=rest_evidence, run=3).doubt(_state(0.4, 0.15)) == "moving"
@@ -102,7 +110,7 @@ def test_a_vehicle_that_turns_back_is_not_at_rest() -> None:
 def test_a_wheel_that_turns_is_no_rest() -> None:
     rest_evidence = RestEvidence()
     t_ns = round((END_S - 0.5) * 1e9)
-    rest_evidence.hear([WheelSpeedAid("wheel", t_ns, 0.999, 0.4, 0.1, (0.0, 0.0, 0.0))])
+    rest_evidence.receive([WheelSpeedMeasurement("wheel", t_ns, 0.999, 0.4, 0.1, (0.0, 0.0, 0.0))])
     assert runs.rest(rest_evidence=rest_evidence).doubt(_state(0.0, 0.02)) == "moving"
 
 
@@ -124,8 +132,10 @@ def test_a_turn_is_the_gyros_where_the_speed_is_known_to_be_zero() -> None:
         rest = runs.rest(mean_rate=mean_rate, rest_evidence=rest_evidence)
         state = _state(0.0, sd_m_s)
         assert rest.doubt(state) is None
-        aid = ZeroRateAid("rate", rest.window.end_ns, 0.9999, mean_rate, 0.1 * DEG, rest)
-        found = aid.innovation(state)
+        measurement = ZeroAngularRateUpdate(
+            "rate", rest.window.end_ns, 0.9999, mean_rate, 0.1 * DEG, rest
+        )
+        found = measurement.innovation(state)
         assert isinstance(found, Innovation)
         assert abs(found.z[2]) == pytest.approx(1.0 * DEG, rel=0.01)
 
@@ -136,8 +146,10 @@ def test_what_a_creep_may_turn_is_bounded_by_what_is_known_of_the_speed() -> Non
     assert runs.rest().creeps(_state(0.0, 0.2)) == pytest.approx([0.0, 0.0, turns], rel=1e-3)
     measured = runs.rest(rest_evidence=_fixes(0.0, 4)).creeps(_state(0.0, 0.2))
     assert measured == pytest.approx([0.0, 0.0, (0.05 / 5.0) ** 2], rel=1e-3)
-    aid = ZeroRateAid("zero_rate", round(END_S * 1e9), 0.9999, (0.0,) * 3, 1e-3, runs.rest())
-    innovation = aid.innovation(_state(0.0, 0.2))
+    measurement = ZeroAngularRateUpdate(
+        "zero_rate", round(END_S * 1e9), 0.9999, (0.0,) * 3, 1e-3, runs.rest()
+    )
+    innovation = measurement.innovation(_state(0.0, 0.2))
     assert isinstance(innovation, Innovation)
     assert innovation.r == pytest.approx([1e-6, 1e-6, 1e-6 + turns], rel=1e-3)
 
@@ -173,8 +185,8 @@ def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
         )
     assert runs.rest(rest_evidence=rest_evidence).doubt(doubtful) == "quiet_at_speed"
     assert runs.rest(rest_evidence=rest_evidence).doubt(sure) is None
-    rest_evidence.hear(
-        [WheelSpeedAid("wheel", round(END_S * 1e9), 0.9, 0.0, 0.03, (0.0, 0.0, 0.0))]
+    rest_evidence.receive(
+        [WheelSpeedMeasurement("wheel", round(END_S * 1e9), 0.9, 0.0, 0.03, (0.0, 0.0, 0.0))]
     )
     assert runs.rest(rest_evidence=rest_evidence).doubt(doubtful) is None
 

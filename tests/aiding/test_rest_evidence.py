@@ -16,7 +16,7 @@ from fusiond.simulation.markov import gauss_markov
 SECOND_NS = 1_000_000_000
 
 
-def _aid(source: str, t_ns: int, v: float, sd: float) -> Any:
+def _measurement(source: str, t_ns: int, v: float, sd: float) -> Any:
     return _of(source, VelocityCandidate(t_ns, (v, -v, 0.0), (sd, sd, sd)))
 
 
@@ -28,7 +28,7 @@ def _of(source: str, candidate: VelocityCandidate | SpeedCandidate) -> Any:
 
 def _at_once(heard: list[Any], begin_ns: int, end_ns: int) -> Measured:
     rest_evidence = RestEvidence()
-    rest_evidence.hear(sorted(heard, key=lambda aid: aid.candidates()[0].t_ns))
+    rest_evidence.receive(sorted(heard, key=lambda measurement: measurement.candidates()[0].t_ns))
     return rest_evidence.measured(begin_ns, end_ns)
 
 
@@ -40,16 +40,18 @@ def test_sums_that_grow_have_the_bits_of_those_made_at_once() -> None:
     for _ in range(120):
         t_ns += rng.choice((1, 1, 1, 2)) * SECOND_NS
         late_ns = rng.choice((0,) * 9 + (5,)) * SECOND_NS
-        aid = _aid(rng.choice("ab"), t_ns - late_ns, rng.gauss(0.1, 0.1), rng.uniform(0.05, 0.2))
-        heard.append(aid)
-        rest_evidence.hear([aid])
+        measurement = _measurement(
+            rng.choice("ab"), t_ns - late_ns, rng.gauss(0.1, 0.1), rng.uniform(0.05, 0.2)
+        )
+        heard.append(measurement)
+        rest_evidence.receive([measurement])
         for begin_ns in (0, 20 * SECOND_NS, t_ns - 3 * SECOND_NS):
             for end_ns in (t_ns, t_ns + SECOND_NS, t_ns - SECOND_NS):
                 found = rest_evidence.measured(begin_ns, end_ns)
                 assert found == _at_once(heard, begin_ns, end_ns)
                 contradicted += found.contradicts
     assert contradicted  # and not for nothing
-    rest_evidence.hear([_aid("a", t_ns + 3 * KEEP_NS, 0.0, 0.1)])
+    rest_evidence.receive([_measurement("a", t_ns + 3 * KEEP_NS, 0.0, 0.1)])
     assert rest_evidence.measured(0, t_ns + 4 * KEEP_NS).sd < 0.1
 
 
@@ -60,13 +62,13 @@ def test_what_was_said_of_spans_holds_until_a_speed_comes_into_one() -> None:
     windows = [(k * SECOND_NS, (k + 1) * SECOND_NS) for k in range(20)]
     for begin_ns, _ in windows:
         for t_ns in (begin_ns + SECOND_NS // 4, begin_ns + 3 * SECOND_NS // 4):
-            heard.append(_aid("a", t_ns, rng.gauss(0.0, 0.1), 0.1))
-            rest_evidence.hear(heard[-1:])
+            heard.append(_measurement("a", t_ns, rng.gauss(0.0, 0.1), 0.1))
+            rest_evidence.receive(heard[-1:])
         for span in windows:
             assert rest_evidence.measured(*span) == _at_once(heard, *span)
-    late = _aid("b", windows[3][0], 5.0, 0.1)
+    late = _measurement("b", windows[3][0], 5.0, 0.1)
     before = [rest_evidence.measured(*span) for span in windows]
-    rest_evidence.hear([late])
+    rest_evidence.receive([late])
     after = [rest_evidence.measured(*span) for span in windows]
     assert after == [_at_once([*heard, late], *span) for span in windows]
     changed = [k for k in range(len(windows)) if after[k] != before[k]]
@@ -87,7 +89,7 @@ def test_wheels_that_drift_as_they_may_are_no_motion(windows: int) -> None:
         rest_evidence = RestEvidence()
         for k, v in enumerate(speeds[:, run].tolist()):
             candidate = SpeedCandidate(k * SECOND_NS // each, v, 0.1, 0.0, drifts)
-            rest_evidence.hear([_of("wheel", candidate)])
+            rest_evidence.receive([_of("wheel", candidate)])
         _, sd, surely = rest_evidence.measured(0, windows * SECOND_NS)
         refuted += surely
     # Chi-square of 2000 variances: 1 +- 3.3 sqrt(2 / 2000); more than 8 of Poisson's 2 once in
@@ -101,7 +103,7 @@ def test_a_wheel_that_creeps_is_motion_whatever_may_drift() -> None:
     rest_evidence = RestEvidence()
     for k in range(100):
         candidate = SpeedCandidate(k * SECOND_NS // 10, 0.3, 0.1, 0.0, (0.1, 1.0))
-        rest_evidence.hear([_of("wheel", candidate)])
+        rest_evidence.receive([_of("wheel", candidate)])
     assert rest_evidence.measured(0, 10 * SECOND_NS).surely
     _, sd, surely = rest_evidence.measured(0, 0)
     assert not surely

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from drivers.measurements import Heading, Height, MonotonicStamp, PositionFix, WheelSpeed
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.body_velocity import SIGN_SIGMAS, WheelSpeedAid
-from fusiond.aiding.height import BarometerAid
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.body_velocity import SIGN_SIGMAS, WheelSpeedMeasurement
+from fusiond.aiding.height import BarometerMeasurement
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rest_evidence import RestEvidence
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.aiding import BarometerAiding, HeightAiding, WheelAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
@@ -43,8 +43,8 @@ def state(forward_m_s: float, sd_m_s: float | None) -> State:
 
 def found(speed_m_s: float, at: State, signed: bool = False) -> float | str:
     """The innovation, or the name of why there is none."""
-    aid = WheelSpeedAid("wheel", 0, 0.99, speed_m_s, 0.1, (0.0, 0.0, 0.0), signed)
-    innovation = aid.innovation(at)
+    measurement = WheelSpeedMeasurement("wheel", 0, 0.99, speed_m_s, 0.1, (0.0, 0.0, 0.0), signed)
+    innovation = measurement.innovation(at)
     if isinstance(innovation, NotApplicable):
         return innovation.outcome
     assert isinstance(innovation, Innovation)
@@ -70,14 +70,16 @@ def test_a_speed_that_reads_zero_long_is_no_rest_below_its_step() -> None:
     rounded, fine = RestEvidence(), RestEvidence()
     sd = KM_H / math.sqrt(3.0)
     for k in range(40):
-        reading = WheelSpeedAid("wheel", k * SECOND // 4, 0.99, 0.0, sd, (0.0, 0.0, 0.0))
-        fine.hear([reading])
-        rounded.hear([replace(reading, rounding_sd_m_s=sd)])
+        reading = WheelSpeedMeasurement("wheel", k * SECOND // 4, 0.99, 0.0, sd, (0.0, 0.0, 0.0))
+        fine.receive([reading])
+        rounded.receive([replace(reading, rounding_sd_m_s=sd)])
     assert rounded.measured(0, 10 * SECOND) == (False, pytest.approx(sd), False)
     assert fine.measured(0, 10 * SECOND).sd == pytest.approx(sd / math.sqrt(40.0))
     # Two km/h contradict rest all the same, even one reading of them.
     moving = RestEvidence()
-    moving.hear([WheelSpeedAid("wheel", 0, 0.99, 2.0 * KM_H, 0.1, (0.0,) * 3, False, 0.08)])
+    moving.receive(
+        [WheelSpeedMeasurement("wheel", 0, 0.99, 2.0 * KM_H, 0.1, (0.0,) * 3, False, 0.08)]
+    )
     assert moving.measured(0, SECOND).contradicts
 
 
@@ -85,41 +87,43 @@ STAMP = MonotonicStamp(SECOND)
 WHEEL = WheelSpeed("wheel", SECOND, STAMP, 10.0, 0.3, 0.4, signed=False)
 
 
-def aids(m: WheelSpeed | PositionFix | Heading | Height) -> list[Aid]:
-    result = Intake({}).aids(m, SECOND, 0.0)
+def measurements(m: WheelSpeed | PositionFix | Heading | Height) -> list[AidingMeasurement]:
+    result = Intake({}).measurements_of(m, SECOND, 0.0)
     assert not isinstance(result, str)
     return list(result)
 
 
 def test_rounding_enters_the_noise_of_every_kind() -> None:
-    (wheel,) = aids(WHEEL)
-    assert isinstance(wheel, WheelSpeedAid)
+    (wheel,) = measurements(WHEEL)
+    assert isinstance(wheel, WheelSpeedMeasurement)
     assert (wheel.sd_m_s, wheel.signed, wheel.rounding_sd_m_s) == (pytest.approx(0.5), False, 0.4)
     assert wheel.candidates()[0].drifts == (WheelAiding().drift_sd_m_s, WheelAiding().drift_s)
     fix = PositionFix("gnss", SECOND, STAMP, 0.9, 0.2, 50.0, sd_ned_m=(3.0, 3.0, 6.0))
     fix = replace(fix, v_ned_m_s=(5.0, 0.0, None), sd_v_ned_m_s=(0.3, 0.3, None))
     coarse = replace(fix, rounding_sd_ned_m=(4.0, 0.0, 8.0), rounding_sd_v_m_s=0.4)
-    position, velocity = aids(coarse)
-    assert isinstance(position, PositionAid)
-    assert isinstance(velocity, VelocityAid)
+    position, velocity = measurements(coarse)
+    assert isinstance(position, PositionMeasurement)
+    assert isinstance(velocity, VelocityMeasurement)
     assert position.sd == pytest.approx((5.0, 3.0, 10.0))
     assert velocity.sd == pytest.approx((0.5, 0.5))
-    (heading,) = aids(Heading("heading", SECOND, STAMP, 1.0, 0.03, 0.04))
-    (height,) = aids(Height("height", SECOND, STAMP, 100.0, 3.0, 4.0))
+    (heading,) = measurements(Heading("heading", SECOND, STAMP, 1.0, 0.03, 0.04))
+    (height,) = measurements(Height("height", SECOND, STAMP, 100.0, 3.0, 4.0))
     assert getattr(heading, "sd_rad", None) == pytest.approx(0.05)
     assert getattr(height, "sd_m", None) == pytest.approx(5.0)
 
 
 def test_a_barometer_is_refused_by_name_where_no_state_knows_the_weather() -> None:
     height = Height("baro", SECOND, STAMP, 100.0, 3.0, 4.0, barometric=True)
-    assert Intake({}).aids(height, SECOND, 0.0) == "weather_unknown"
-    assert Intake({"baro": HeightAiding()}).aids(height, SECOND, 0.0) == "weather_unknown"
+    assert Intake({}).measurements_of(height, SECOND, 0.0) == "weather_unknown"
+    assert (
+        Intake({"baro": HeightAiding()}).measurements_of(height, SECOND, 0.0) == "weather_unknown"
+    )
     for name in ("baro", "barometer"):
         intake = Intake({name: BarometerAiding()})
-        (aid,) = intake.aids(height, SECOND, 0.0)
-        assert isinstance(aid, BarometerAid)
-        assert aid.sd_m == pytest.approx(5.0)
-        assert not aid.candidates()
+        (measurement,) = intake.measurements_of(height, SECOND, 0.0)
+        assert isinstance(measurement, BarometerMeasurement)
+        assert measurement.sd_m == pytest.approx(5.0)
+        assert not measurement.candidates()
         blocks = [block.name for block in intake.extra_blocks()]
-        assert blocks == [aid.offset, aid.scale, aid.airflow]
-        assert aid.offset == "barometer_offset" + ("_baro" if name == "baro" else "")
+        assert blocks == [measurement.offset, measurement.scale, measurement.airflow]
+        assert measurement.offset == "barometer_offset" + ("_baro" if name == "baro" else "")

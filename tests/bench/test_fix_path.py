@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from functools import cache
 
-from fusiond.bench.fix_path import Way, ordinary_fix
+from fusiond.bench.fix_path import FixPath, ordinary_fix
 
 FUNCTIONS, MODULES = 56, 24
 """As they are; less is asked (docs/benchmarks.md)."""
 
 
 @cache
-def way() -> Way:
+def way() -> FixPath:
     return ordinary_fix()
 
 

@@ -76,8 +76,8 @@ def test_check(monkeypatch: pytest.MonkeyPatch) -> None:
     assert done.stdout.splitlines() == [
         "config/vehicle.toml: ok, vehicle vehicle",
         "  imu: driver can_imu",
-        "  gnss: driver nmea, aids as gnss",
-        "  rdss: driver rdss, aids as rdss",
+        "  gnss: driver nmea, used as gnss",
+        "  rdss: driver rdss, used as rdss",
     ]
 
 
@@ -179,7 +179,7 @@ def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("raw_format", ["ubx", "rtcm3"])
 def test_a_simulated_raw_stream_is_processed(tmp_path: Path, raw_format: str) -> None:
     """Tightly coupled from the bytes of the simulated receiver, through 20 s with three satellites,
-    without any other aid."""
+    without any other measurement."""
     done = in_this_process(
         *("simulate", "drive", "--out", tmp_path, "--seed", "2", "--duration", "150"),
         *("--gnss-raw", raw_format, "--gnss-mask", "canyon3:110:20"),
@@ -215,15 +215,15 @@ def test_process_names_what_it_rejected(tmp_path: Path) -> None:
     lines[10] = lines[9]
     lines[500] = lines[500].rpartition(",")[0] + ",nan"
     imu.write_text("\n".join(lines) + "\n")
-    aid, out = f"gnss={gnss}", tmp_path / "solution.csv"
-    done = in_this_process("process", VEHICLE, "--imu", imu, "--aid", aid, "--out", out)
+    measurement, out = f"gnss={gnss}", tmp_path / "solution.csv"
+    done = in_this_process("process", VEHICLE, "--imu", imu, "--aid", measurement, "--out", out)
     assert done.returncode == 65
     assert done.stderr.startswith("fusiond: No solution: No heading")
     assert f"imu: {len(lines) - 1} rows, 2 rejected" in done.stdout.splitlines()
     assert "  line 11: time_repeated: " in done.stdout
     assert "  line 501: not_finite: accel_z_m_s2 = nan" in done.stdout
     assert out.read_text().startswith("t_s,lat_deg,")
-    piped = in_this_process("process", VEHICLE, "--imu", imu, "--aid", aid, "--json", "-")
+    piped = in_this_process("process", VEHICLE, "--imu", imu, "--aid", measurement, "--json", "-")
     assert json.loads(piped.stdout)["files"]["imu"]["rejected"] == {
         "time_repeated": 1,
         "not_finite": 1,

@@ -119,7 +119,9 @@ def test_an_outage_of_the_receiver_leaves_the_wheels(part: Path, tmp_path: Path)
 def test_an_outage_of_a_source_that_there_is_not(part: Path) -> None:
     code, _, errors = process(CONFIG, "--can", part, "--outage", f"{OUTAGE_S}:5:gps")
     assert code == 65
-    assert errors.strip() == ("fusiond: outage of gps: no aid comes from it; there are gnss, wheel")
+    assert errors.strip() == (
+        "fusiond: outage of gps: no measurement comes from it; there are gnss, wheel"
+    )
 
 
 @pytest.mark.parametrize(

@@ -39,20 +39,20 @@ def changed(drive: Path, name: str, change: Callable[[Any, list[str]], Any], to:
     return path
 
 
-def process(imu: Path, *aids: str, out: Path) -> tuple[int, str, str, dict[str, Any]]:
+def process(imu: Path, *measurements: str, out: Path) -> tuple[int, str, str, dict[str, Any]]:
     """Exit code, standard output, standard error, JSON."""
     report = out / "report.json"
     arguments = ["process", str(REPOSITORY / "config" / "vehicle.toml"), "--imu", str(imu)]
-    for aid in aids:
-        arguments += ["--aid", aid]
+    for measurement in measurements:
+        arguments += ["--aid", measurement]
     arguments += ["--json", str(report), "--out", str(out / "solution.csv")]
     done = CliRunner().invoke(app, arguments)
     return done.exit_code, done.stdout, done.stderr, json.loads(report.read_text())
 
 
-def refused(imu: Path, *aids: str, out: Path) -> str:
+def refused(imu: Path, *measurements: str, out: Path) -> str:
     """The reason of a run that navigates nothing: the same in text and JSON."""
-    code, _, text, report = process(imu, *aids, out=out)
+    code, _, text, report = process(imu, *measurements, out=out)
     assert code == 65
     assert report["solution_rows"] == 0
     assert text.strip() == f"fusiond: No solution: {report['why']}"
@@ -62,7 +62,7 @@ def refused(imu: Path, *aids: str, out: Path) -> str:
 def test_a_good_run_says_when_it_aligned_and_how_much_it_navigated(
     drive: Path, tmp_path: Path
 ) -> None:
-    """One aid is as a spreadsheet left it, another of another day."""
+    """One measurement is as a spreadsheet left it, another of another day."""
 
     def a_day_later(rows: Any, names: list[str]) -> Any:
         for k in (k for k, n in enumerate(names) if n.startswith("t_")):
@@ -153,12 +153,12 @@ def test_times_on_another_base(drive: Path, tmp_path: Path) -> None:
     assert "gnss from 24300" in why
 
 
-def test_no_aid_at_all(drive: Path, tmp_path: Path) -> None:
+def test_no_measurement_at_all(drive: Path, tmp_path: Path) -> None:
     why = refused(drive / "imu.csv", out=tmp_path)
     assert why == "No measurements: give --aid KIND=FILE (Waiting for a first position fix)"
 
 
-def test_aids_that_are_all_refused_are_named(drive: Path, tmp_path: Path) -> None:
+def test_measurements_that_are_all_refused_are_named(drive: Path, tmp_path: Path) -> None:
     def fast(rows: Any, names: list[str]) -> Any:
         rows[:, names.index("v_n_m_s")] = 1_000.0
         return rows

@@ -32,11 +32,11 @@ async def daemon(broker: Broker, vehicle: str, **status: Any) -> AsyncIterator[N
     publisher = MqttPublisher(options, vehicle, on_event=lambda *_: None)
 
     async def speak() -> None:
-        publisher.take(EVENT, EXAMPLES["event"])
+        publisher.publish(EVENT, EXAMPLES["event"])
         while True:
-            publisher.take(STATUS, EXAMPLES["status"].model_copy(update=status))
+            publisher.publish(STATUS, EXAMPLES["status"].model_copy(update=status))
             for topic in (NAV, HEALTH, CONSISTENCY):
-                publisher.take(topic, EXAMPLES[topic.name])
+                publisher.publish(topic, EXAMPLES[topic.name])
             await asyncio.sleep(REPEAT_S)
 
     tasks = [asyncio.create_task(publisher.run()), asyncio.create_task(speak())]

@@ -69,12 +69,12 @@ def test_a_drive_is_simulated_processed_and_reported(
 ) -> None:
     drive = tmp_path / "drive"
     _fusiond(environment, "simulate", "drive", "--out", drive, "--duration", "90")
-    aids = [f"gnss={drive / 'gnss.csv'}", f"rdss={drive / 'rdss.csv'}"]
+    measurements = [f"gnss={drive / 'gnss.csv'}", f"rdss={drive / 'rdss.csv'}"]
     solution = tmp_path / "solution.csv"
     _fusiond(
         environment,
         *("process", REPOSITORY / "config" / "vehicle.toml", "--imu", drive / "imu.csv"),
-        *("--aid", aids[0], "--aid", aids[1], "--out", solution),
+        *("--aid", measurements[0], "--aid", measurements[1], "--out", solution),
     )
     assert len(solution.read_text().splitlines()) > 100
     _fusiond(environment, "report", solution, "--out", tmp_path / "report.html")

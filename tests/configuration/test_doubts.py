@@ -51,7 +51,10 @@ def test_examples_leave_no_doubt(path: Path) -> None:
             f"{SOUND}[aiding.gnss]\nkind = 'raw'\n",
             "aiding.gnss.kind = 'raw': driver nmea gives gnss",
         ),
-        (f"{SOUND}[aiding.imu]\nkind = 'wheel'\n", "aiding.imu: driver can_imu is no aid"),
+        (
+            f"{SOUND}[aiding.imu]\nkind = 'wheel'\n",
+            "aiding.imu: driver can_imu gives no measurement",
+        ),
         (
             f"{SOUND}[aiding.gnss]\nlever_arm_m = [0.0, 100.0, 0.0]\n",
             "aiding.gnss.lever_arm_m = [0.0, 100.0, 0.0]: 100 m from the IMU",
@@ -70,14 +73,14 @@ def test_examples_leave_no_doubt(path: Path) -> None:
         (
             f"{SOUND}[estimator]\nmodel = 'planar10'\n",
             "'planar10' has no accelerometer bias, and [imu] has one of 10 mg, one sigma, which is "
-            "noise to it: sigma grows by 646 m in a minute without aids, where the bias does "
-            "177 m, and the level is off by 0.57 deg; choose 'planar15' or 'ins21'",
+            "noise to it: sigma grows by 646 m in a minute without measurements, where the bias "
+            "does 177 m, and the level is off by 0.57 deg; choose 'planar15' or 'ins21'",
         ),
         (
             f"{SOUND}[imu]\nsensor_class = 'mems'\n[estimator]\nmodel = 'ins17'\n",
             "and sensor class 'mems' has one of 20 mg, one sigma, which is noise to it: sigma "
-            "grows by 1,136 m in a minute without aids, where the bias does 353 m, and the level "
-            "is off by 1.1 deg; choose 'ins23' or 'ins21'",
+            "grows by 1,136 m in a minute without measurements, where the bias does 353 m, and the "
+            "level is off by 1.1 deg; choose 'ins23' or 'ins21'",
         ),
         (
             f"{SOUND}[outputs.gpsd]\nport = 10110\n[outputs.nmea]\n",
@@ -106,7 +109,7 @@ def test_addresses_that_two_sources_name(tmp_path: Path) -> None:
 
 
 def test_no_doubt_about_what_may_well_be(tmp_path: Path) -> None:
-    """A ship's lever arm, an aid for `process` alone, a start from a known place."""
+    """A ship's lever arm, a measurement for `process` alone, a start from a known place."""
     text = 'vehicle_class = "marine"\n' + SOUND
     assert found(tmp_path, f"{text}[aiding.gnss]\nlever_arm_m = [100.0, 0.0, -20.0]\n") == []
     assert found(tmp_path, f"{SOUND}[aiding.log]\nkind = 'rdss'\n") == []

@@ -47,7 +47,8 @@ def test_an_accelerometer_without_bias_needs_no_state() -> None:
 
 
 def test_the_figures_are_those_of_the_filter() -> None:
-    """A minute at rest without aids: what 10 mg moves, and what noise alone makes of sigma."""
+    """A minute at rest without measurements: what 10 mg moves, and what noise alone makes of
+    sigma."""
     imu = Imu(rate_hz=20.0)
     model = make_model("ins15", imu_noise(imu))
     truth = Truth(static(MINUTE_S), (0.5, 2.0, 50.0), imu.rate_hz, MINUTE_S)

@@ -53,7 +53,7 @@ async def test_from_broker_to_browser_and_back_after_the_broker_was_away(tmp_pat
             await daemon.publish(f"{BASE}/status", payload("status"), qos=1, retain=True)
             hub = Hub(clock, "test")
             broker = Broker(Access("127.0.0.1", mosquitto.port), hub)
-            async with at_work(hub, broker.run) as address, browsing(address) as page:
+            async with at_work(hub, broker.listen) as address, browsing(address) as page:
                 kept = await page.until(lambda p: p.latest.get("status"))
                 assert kept["at"] is None  # nobody knows how long the broker has had it
                 await daemon.publish(f"{BASE}/of_others", b"{}", qos=1)
@@ -90,7 +90,7 @@ async def test_a_command_needs_the_token_and_gets_the_daemons_answer(tmp_path: P
             broker = Broker(Access("127.0.0.1", mosquitto.port), hub)
             hub.send_command = broker.send_command
             async with (
-                at_work(hub, broker.run, token="s3cret-token") as address,
+                at_work(hub, broker.listen, token="s3cret-token") as address,
                 browsing(address) as page,
             ):
                 await daemon.publish(f"{BASE}/status", payload("status"), qos=1, retain=True)
@@ -326,7 +326,7 @@ async def test_no_message_ends_the_page_and_it_says_what_was_refused(tmp_path: P
                 await daemon.publish(f"{BASE}/{topic}", attack, qos=1, retain=True)
             hub = Hub(asyncio.get_running_loop().time, "test")
             broker = Broker(Access("127.0.0.1", mosquitto.port), hub)
-            async with at_work(hub, broker.run) as address, browsing(address) as page:
+            async with at_work(hub, broker.listen) as address, browsing(address) as page:
                 await page.until(lambda p: p.last.get("refused", {}).get("count") == len(ATTACKS))
                 assert page.last["vehicles"] == []
                 await daemon.publish(f"{BASE}/innovations", blind, qos=1)
@@ -342,7 +342,7 @@ async def test_no_message_ends_the_page_and_it_says_what_was_refused(tmp_path: P
 async def test_a_recording_plays_through_the_same_page() -> None:
     player = Player([REPOSITORY / "tests" / "golden" / "demo.mcap"], speed=500.0)
     hub = Hub(player.now_s, player.origin, player.speed)
-    async with at_work(hub, lambda: player.run(hub)) as address, browsing(address) as page:
+    async with at_work(hub, lambda: player.play(hub)) as address, browsing(address) as page:
         await page.until(lambda p: p.last.get("link", {}).get("state") == "ended")
         assert page.hello["origin"] == "demo.mcap"
         assert page.hello["speed"] == 500.0

@@ -23,15 +23,15 @@ from fusiond.demo import broker as demo_broker
 from fusiond.demo.demo import (
     OUTAGE_START_S,
     Score,
-    demo_play,
+    demo_setup,
     ned_error,
     wrapped,
 )
+from fusiond.demo.outage_report import outage_report
 from fusiond.demo.papers import REST_S
-from fusiond.demo.story import story
 from fusiond.demo.view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.patience import PATIENCE_S
 
 KEYS = [
@@ -96,7 +96,7 @@ def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
     assert "Traceback" not in err
     with pytest.raises(URLError):
         urlopen(page, timeout=PATIENCE_S)
-    again = replay(list(tmp_path.glob("*.mcap")), Wish())
+    again = replay(list(tmp_path.glob("*.mcap")), ReplayOptions())
     assert again["identical"] is True, again["first_difference"]
     assert again["compared"] == summary["ticks"]
     assert again["problems"] == again["driver_faults"] == []
@@ -128,7 +128,7 @@ def test_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_car_rests_moves_and_has_the_configured_sensors(tmp_path: Path) -> None:
-    config, scenario = demo_play().served(1883, tmp_path), demo_play().scenario
+    config, scenario = demo_setup().served(1883, tmp_path), demo_setup().scenario
     assert scenario.imu == config.imu
     truth = scenario.truth(30.0)
     speed = np.linalg.norm(truth.at(np.array([REST_S - 0.5, OUTAGE_START_S])).v_ned, axis=1)
@@ -138,7 +138,7 @@ def test_car_rests_moves_and_has_the_configured_sensors(tmp_path: Path) -> None:
 
 def test_score_against_the_truth(tmp_path: Path) -> None:
     """Solutions 3 m north and 4 m east of the truth; P with a correlation of 0.5."""
-    vehicle = demo_play().vehicle(20.0, tmp_path)
+    vehicle = demo_setup().vehicle(20.0, tmp_path)
     covariance = np.zeros((21, 21))
     covariance[6:8, 6:8] = [[4.0, 3.0], [3.0, 9.0]]
     score = Score()
@@ -172,14 +172,16 @@ def test_score_against_the_truth(tmp_path: Path) -> None:
 def test_story_tells_the_outages_that_were_lived_through() -> None:
     t_s = np.arange(10.05, 60.0, 0.1)
     error_m = np.where((t_s > 18.0) & (t_s < 30.0), 0.5 + (t_s - 18.0) * 0.25, 0.5)
-    angles_deg = list(story(t_s, error_m, np.full_like(t_s, 1.0), [(2.0, 5.0), (18.0, 30.0)]))
+    angles_deg = list(
+        outage_report(t_s, error_m, np.full_like(t_s, 1.0), [(2.0, 5.0), (18.0, 30.0)])
+    )
     assert angles_deg == [
         "12 s without GNSS: the error grew from 0.50 to 3.49 m at most, and sigma said "
         "1.00 m there",
         "the car was within two sigma for 88 % of the 50 s that it was navigated",
     ]
     none = np.zeros(0)
-    assert list(story(none, none, none, [(1.0, 2.0)])) == [
+    assert list(outage_report(none, none, none, [(1.0, 2.0)])) == [
         "No solution: the car had not driven off yet"
     ]
 

@@ -17,8 +17,8 @@ import pytest
 
 from fusiond.configuration.load import load_config
 from fusiond.demo.demo import ned_error
-from fusiond.demo.papers import PAPERS, paper_play, settings
-from fusiond.demo.play import Pulled
+from fusiond.demo.papers import PAPERS, paper_setup, settings
+from fusiond.demo.setup import Unplugged
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth
@@ -27,7 +27,7 @@ from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "papers.md").read_text(encoding="utf-8")
-AIDS = {
+MEASUREMENTS = {
     "000": ("rdss",),
     "001": ("gnss", "gnss_velocity", "star_tracker"),
     "002": ("gnss", "star_tracker", "sar"),
@@ -40,7 +40,7 @@ class Run:
     """A paper's daemon and vehicle in this process, and what the daemon says."""
 
     def __init__(self, number: str, folder: Path) -> None:
-        play = paper_play(number)
+        play = paper_setup(number)
         # A host that stands still for a second is not what is looked at.
         slow = play.config.imu.model_copy(update={"rate_hz": 50.0, "gap_s": 2.0})
         config = play.config.model_copy(update={"imu": slow})
@@ -87,7 +87,7 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
     estimator = PAPERS[number].lines["estimator"]
     assert run.daemon.navigator.model.name == estimator["model"]
     async with running(run.daemon, run.vehicle):
-        await until(lambda: all(run.fused(name) >= 5 for name in AIDS[number]))
+        await until(lambda: all(run.fused(name) >= 5 for name in MEASUREMENTS[number]))
         await until(lambda: run.usable)
         run.judge()
         if number == "003":
@@ -95,7 +95,7 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
             assert {name[0] for name in run.used} == {"C"}
         health = run.health
     assert set(PAPERS[number].devices) <= set(health)
-    for name in AIDS[number]:
+    for name in MEASUREMENTS[number]:
         assert health[name].rejected.get("isolated", 0) == 0, (name, health[name])
     if number == "000":  # fed back at the instants of arrival
         assert health["rdss_feedback"].rejected["fed_back"] >= 5
@@ -109,11 +109,13 @@ async def test_two_receivers_navigate_until_the_inertial_unit_comes(tmp_path: Pa
     async with running(run.daemon, run.vehicle):
         await asyncio.sleep(0)  # the vehicle plugs all in with its first step
         run.vehicle.unplug("imu")
-        await until(lambda: run.usable and all(run.fused(name) >= 3 for name in AIDS["004"]))
+        await until(
+            lambda: run.usable and all(run.fused(name) >= 3 for name in MEASUREMENTS["004"])
+        )
         s = run.seen[-1]
         assert "no inertial unit" in s.reason
         assert math.isnan(s.rpy_rad[2])
-        assert run.daemon.navigator.serving.isolates
+        assert run.daemon.navigator.active_filter.isolates
         run.judge()
         run.vehicle.plug("imu")
         await until(lambda: run.usable and not math.isnan(run.seen[-1].rpy_rad[2]))
@@ -140,13 +142,13 @@ def test_a_papers_configuration_is_the_shipped_one_with_its_lines() -> None:
         path = REPOSITORY / "config" / paper.config
         assert made["imu"] == tomllib.loads(path.read_text(encoding="utf-8"))["imu"], number
         assert paper.lines["estimator"].items() <= made["estimator"].items()
-        assert load_config(path).imu.rate_hz == paper_play(number).scenario.imu.rate_hz
+        assert load_config(path).imu.rate_hz == paper_setup(number).scenario.imu.rate_hz
 
 
 def test_plugs_are_pulled_once_or_over_and_over() -> None:
-    assert list(Pulled("imu", 0.0, 25.0).times(60.0)) == [(0.0, 25.0)]
-    assert list(Pulled("gnss", 18.0, 12.0, 60.0).times(100.0)) == [(18.0, 30.0), (78.0, 90.0)]
-    assert list(Pulled("gnss", 18.0, 12.0).times(10.0)) == []
+    assert list(Unplugged("imu", 0.0, 25.0).times(60.0)) == [(0.0, 25.0)]
+    assert list(Unplugged("gnss", 18.0, 12.0, 60.0).times(100.0)) == [(18.0, 30.0), (78.0, 90.0)]
+    assert list(Unplugged("gnss", 18.0, 12.0).times(10.0)) == []
 
 
 def test_the_command_runs_a_paper_and_names_those_that_there_are() -> None:

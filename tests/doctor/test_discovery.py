@@ -21,7 +21,13 @@ from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.doctor.discovery import Device as Found
-from fusiond.doctor.discovery import SilentPort, down_axis, on_bus, on_port, round_rate
+from fusiond.doctor.discovery import (
+    SilentPort,
+    device_on_bus,
+    device_on_port,
+    down_axis,
+    round_rate,
+)
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
@@ -156,7 +162,7 @@ async def test_what_speaks_on_a_port(
 
     sending = asyncio.create_task(send())
     listen_s = 0.1 if driver is None else PATIENCE_S
-    found = await on_port(str(tmp_path / "port"), ask_terminal=False, listen_s=listen_s)
+    found = await device_on_port(str(tmp_path / "port"), ask_terminal=False, listen_s=listen_s)
     sending.cancel()
     device.unplug()
     assert (None if isinstance(found, SilentPort) else found.driver) == driver
@@ -167,12 +173,12 @@ async def test_a_silent_port_is_told_with_what_may_be_wrong(tmp_path: Path) -> N
     device = Device(tmp_path / "port")
     device.plug()
     port = str(tmp_path / "port")
-    quiet = await on_port(port, ask_terminal=False, listen_s=0.1)
+    quiet = await device_on_port(port, ask_terminal=False, listen_s=0.1)
     device.unplug()
     assert isinstance(quiet, SilentPort)
     for words in (f"{port}: silent", "powered", "--ask-terminal"):
         assert words in quiet.text
-    gone = await on_port(str(tmp_path / "none"), ask_terminal=False, listen_s=0.1)
+    gone = await device_on_port(str(tmp_path / "none"), ask_terminal=False, listen_s=0.1)
     assert isinstance(gone, SilentPort)
     assert "cannot be opened" in gone.text
 
@@ -246,7 +252,7 @@ async def test_a_device_is_told_from_the_others(tmp_path: Path, title: str) -> N
     channel = str(tmp_path)
     options = CanImuOptions(**known.options, interface="virtual", channel=channel)
     imu = CanImu(options)
-    looking = asyncio.create_task(on_bus("virtual", channel, 0.5))
+    looking = asyncio.create_task(device_on_bus("virtual", channel, 0.5))
     with can.Bus(interface="virtual", channel=channel) as bus:
         number = 0
         while not looking.done():

@@ -40,7 +40,7 @@ def test_time_stands_at_the_input_while_it_is_handled() -> None:
 def test_who_listens_hears_each_before_it_is_handled() -> None:
     bench = Bench()
     heard: list[tuple[str, int, Any]] = []
-    bench.inputs.heard = lambda kind, t_ns, payload: heard.append((kind, t_ns, payload))
+    bench.inputs.on_input = lambda kind, t_ns, payload: heard.append((kind, t_ns, payload))
     bench.inputs.take("read", b"a", 50)
     with pytest.raises(RuntimeError):
         bench.inputs.take("read", b"defect", 60)

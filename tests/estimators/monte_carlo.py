@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.simulation.imu_truth import Truth
 from tests import runs
@@ -51,14 +51,14 @@ MATCHED = {
 }
 
 
-def drawn_aids(
+def drawn_measurements(
     name: str, truth: Truth, t_s: Array, rng: np.random.Generator
 ) -> list[list[Linearised]]:
     """GNSS position and velocity; horizontal 20 m fixes for the planar models."""
     states = truth.at(t_s, LEVER)
     planar = name.startswith("planar")
     sd, sd_v = (20.0, 20.0, 20.0) if planar else (1.5, 1.5, 3.0), (0.05, 0.05, 0.1)
-    aids: list[list[Linearised]] = []
+    measurements: list[list[Linearised]] = []
     for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
         lat, lon, height = (
             float(x)
@@ -66,16 +66,18 @@ def drawn_aids(
         )
         t_ns = round(t * 1e9)
         if planar:
-            aids.append([PositionAid("rdss", t_ns, 1 - 1e-9, lat, lon, None, sd, LEVER)])
+            measurements.append(
+                [PositionMeasurement("rdss", t_ns, 1 - 1e-9, lat, lon, None, sd, LEVER)]
+            )
             continue
         n, e, d = (float(x) for x in v + rng.standard_normal(3) * sd_v)
-        aids.append(
+        measurements.append(
             [
-                PositionAid("gnss", t_ns, 1 - 1e-9, lat, lon, height, sd, LEVER),
-                VelocityAid("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), sd_v, LEVER),
+                PositionMeasurement("gnss", t_ns, 1 - 1e-9, lat, lon, height, sd, LEVER),
+                VelocityMeasurement("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), sd_v, LEVER),
             ]
         )
-    return aids
+    return measurements
 
 
 def interval(degrees: int, probability: float) -> tuple[float, float]:

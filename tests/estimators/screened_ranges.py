@@ -1,4 +1,4 @@
-"""The axes of fixes as ranges with a receiver clock in them: an aid judged row by row."""
+"""The axes of fixes as ranges with a receiver clock in them: a measurement judged row by row."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.base import AidingMeasurement, Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.models.blocks import CLOCK_OFFSET
 
 
 @immutable()
-class Ranges(Aid):
+class Ranges(AidingMeasurement):
     """A fix's axes, twice, each with the receiver's clock in it (m); `wrong` is added to one."""
 
     screened: ClassVar[bool] = True
 
-    fix: PositionAid
+    fix: PositionMeasurement
     clock_m: float
     wrong: float = 0.0
     left_out: bool = False
@@ -36,12 +36,15 @@ class Ranges(Aid):
 
 
 def ranges(
-    aids: list[list[Linearised]], jump_at: int = 99, wrong_at: int = 99, left_out: bool = False
+    measurements: list[list[Linearised]],
+    jump_at: int = 99,
+    wrong_at: int = 99,
+    left_out: bool = False,
 ) -> list[list[Linearised]]:
     """The fixes of a drive as ranges: the clock at 5 m, then 3 km; one bad row at an epoch."""
     found: list[list[Linearised]] = []
-    for k, (fix, velocity) in enumerate(aids):
-        assert isinstance(fix, PositionAid)
+    for k, (fix, velocity) in enumerate(measurements):
+        assert isinstance(fix, PositionMeasurement)
         clock = 3000.0 if k >= jump_at else 5.0
         wrong = 300.0 if k == wrong_at else 0.0
         skip = left_out and k == wrong_at

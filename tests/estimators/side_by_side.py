@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import ErrorStateFilter
@@ -55,11 +55,11 @@ def compare(a: ErrorStateFilter, b: ErrorStateFilter, sigmas: float, relative: f
     assert np.abs(ratio).max() < relative, ratio
 
 
-def linear_aids(height: bool) -> list[Linearised]:
+def linear_measurements(height: bool) -> list[Linearised]:
     lat, lon, up = runs.ORIGIN
     sd, v = (1.5, 2.0, 3.0), (12.1, -7.2, 0.9)
     place = (lat + 2e-7, lon - 1e-7, up + 1.0 if height else None)
     return [
-        PositionAid("gnss", 0, GATE, *place, sd, NO_LEVER),
-        VelocityAid("velocity", 0, GATE, v, (0.1, 0.1, 0.2), NO_LEVER),
+        PositionMeasurement("gnss", 0, GATE, *place, sd, NO_LEVER),
+        VelocityMeasurement("velocity", 0, GATE, v, (0.1, 0.1, 0.2), NO_LEVER),
     ]

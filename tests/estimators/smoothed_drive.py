@@ -1,8 +1,8 @@
 """A drive with GNSS that fails for a while, late RDSS fixes, a wheel and no slip, as one tape.
 
-Errors of the aids are drawn from the filter's own model: whatever an aid says of itself at the true
-state, with the true parameters, is taken off its innovation, and noise of its own sigma added. So
-the parameters of every block may be drawn from their priors.
+Errors of the measurements are drawn from the filter's own model: whatever a measurement says of
+itself at the true state, with the true parameters, is taken off its innovation, and noise of its
+own sigma added. So the parameters of every block may be drawn from their priors.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.rdss_position import BIAS_BLOCK, FeedBackAid, RdssPositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.body_velocity import NonHolonomicConstraint, WheelSpeedMeasurement
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.rdss_position import BIAS_BLOCK, HeldFeedback, RdssPositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.smoothing.backward import Smoothed, Smoother
@@ -57,24 +57,24 @@ UNKNOWN: tuple[Block, ...] = (
     vehicle.wheel_scale(vehicle.WHEEL_SCALE, 0.02),
     position_bias(BIAS_BLOCK, 15.0, 600.0),
 )
-"""What an owner cannot measure; without it the aids have white errors alone."""
+"""What an owner cannot measure; without it the measurements have white errors alone."""
 
 
 class Late(NamedTuple):
-    """An aid and when it comes."""
+    """A measurement and when it comes."""
 
     arrival_s: float
-    aid: Aid
+    measurement: AidingMeasurement
 
 
 class Drawn:
-    """An aid with drawn errors: `offset` (m,) comes off its innovation."""
+    """A measurement with drawn errors: `offset` (m,) comes off its innovation."""
 
-    def __init__(self, aid: Aid, offset: Array) -> None:
-        self._aid, self._offset = aid, offset
+    def __init__(self, measurement: AidingMeasurement, offset: Array) -> None:
+        self._measurement, self._offset = measurement, offset
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._aid, name)
+        return getattr(self._measurement, name)
 
     def at(self, nav: Array) -> Drawn:
         return self
@@ -84,7 +84,7 @@ class Drawn:
         return ()
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        rows = self._aid.innovation(state)
+        rows = self._measurement.innovation(state)
         if isinstance(rows, NotApplicable):
             return rows
         return Innovation(rows.z - self._offset, rows.h, rows.r)
@@ -102,46 +102,52 @@ def model(unknown: bool) -> Model:
 
 
 @lru_cache(maxsize=4)
-def nominal_aids(holding: bool = False) -> tuple[Late, ...]:
-    """All that is measured, by nominal values: what an aid says apart from its place matters to its
-    Jacobian alone."""
+def nominal_measurements(holding: bool = False) -> tuple[Late, ...]:
+    """All that is measured, by nominal values: what a measurement says apart from its place matters
+    to its Jacobian alone."""
     lat, lon, height = runs.ORIGIN
     found: list[Late] = []
     for t in np.arange(0.303, SECONDS - 1.0, 1.0):
         if OUTAGE_S[0] <= t < OUTAGE_S[1]:
             continue
         t_ns = round(t * 1e9)
-        fix = PositionAid(*("gnss", t_ns, GATE, lat, lon, height, SD, LEVER), time=vehicle.FIX_TIME)
-        v = VelocityAid(
+        fix = PositionMeasurement(
+            *("gnss", t_ns, GATE, lat, lon, height, SD, LEVER), time=vehicle.FIX_TIME
+        )
+        v = VelocityMeasurement(
             *("gnss_velocity", t_ns, GATE, (0.0, 0.0, 0.0), SD_V, LEVER, vehicle.VELOCITY_TIME)
         )
         found += [Late(t, fix), Late(t, v)]
     for t in np.arange(3.111, SECONDS - 1.0, 5.0):
         place = ("rdss", round(t * 1e9), GATE, lat, lon, (400.0, 60.0, 300.0), (0.0, 0.0, 0.0))
-        found.append(Late(t + RDSS_DELAY_S, RdssPositionAid(*place, holds=holding)))
+        found.append(Late(t + RDSS_DELAY_S, RdssPositionMeasurement(*place, holds=holding)))
     for t in np.arange(0.652, SECONDS - 1.0, 0.5):
         names = vehicle.WHEEL_DRIFT, vehicle.WHEEL_SCALE, ""
-        wheel = WheelSpeedAid("wheel", round(t * 1e9), GATE, 0.0, 0.1, WHEEL, True, 0.0, *names)
+        wheel = WheelSpeedMeasurement(
+            "wheel", round(t * 1e9), GATE, 0.0, 0.1, WHEEL, True, 0.0, *names
+        )
         found.append(Late(t, wheel))
     for t in np.arange(1.0, SECONDS - 1.0, 1.0):
-        found.append(Late(t, NonHolonomicAid("slip", round(t * 1e9), GATE, 0.1, 0.2, 2.0, AXLE)))
+        found.append(
+            Late(t, NonHolonomicConstraint("slip", round(t * 1e9), GATE, 0.1, 0.2, 2.0, AXLE))
+        )
     return tuple(sorted(found, key=lambda late: late.arrival_s))
 
 
 @lru_cache(maxsize=2)
 def _true_states(unknown: bool, holding: bool) -> tuple[tuple[Array, Array], ...]:
-    """True navigation state (10,) and last step (27,) at each aid of `nominal_aids`."""
+    """True navigation state (10,) and last step (27,) at each measurement of `nominal_aids`."""
     without_errors = TapedKalman(model(unknown), IMU.gap_s)
     times = runs.sample_times(truth())
     buffer = runs.filled_buffer(IMU, times, np.hstack([truth().gyro, truth().accel]))
-    aids = nominal_aids(holding)
-    at_s = np.array([late.aid.t_ns for late in aids]) * 1e-9
+    measurements = nominal_measurements(holding)
+    at_s = np.array([late.measurement.t_ns for late in measurements]) * 1e-9
     navs, n = runs.true_nav(truth(), at_s), without_errors.model.size
     start = runs.true_nav(truth(), np.array([0.0]))[0]
     without_errors.initialise(0, 0, start, np.zeros(n), np.zeros((n, n)))
-    steps = np.zeros((len(aids), STEP_SIZE))
+    steps = np.zeros((len(measurements), STEP_SIZE))
     for row in np.argsort(at_s, kind="stable"):
-        without_errors.propagate(buffer, aids[row].aid.t_ns)
+        without_errors.propagate(buffer, measurements[row].measurement.t_ns)
         steps[row] = without_errors.step
     return tuple(zip(navs, steps, strict=True))
 
@@ -188,22 +194,22 @@ def run(
 ) -> Tape:
     """One drive; `in_order`: nothing is late."""
     m, rng = model(unknown), np.random.default_rng([seed, 5])
-    late = nominal_aids(holding)
-    order = np.argsort([x.aid.t_ns for x in late], kind="stable")
-    at_s = np.array([late[row].aid.t_ns for row in order]) * 1e-9
+    late = nominal_measurements(holding)
+    order = np.argsort([x.measurement.t_ns for x in late], kind="stable")
+    at_s = np.array([late[row].measurement.t_ns for row in order]) * 1e-9
     parameters = dict(zip(order.tolist(), _parameters(m, at_s, rng), strict=True))
-    aids: list[tuple[float, Aid]] = []
-    for row, (arrival_s, aid) in enumerate(late):
+    measurements: list[tuple[float, AidingMeasurement]] = []
+    for row, (arrival_s, measurement) in enumerate(late):
         nav, step = _true_states(unknown, holding)[row]
-        rows = aid.innovation(State(nav, parameters[row], step, m))
+        rows = measurement.innovation(State(nav, parameters[row], step, m))
         if isinstance(rows, Innovation):
             noise = np.sqrt(rows.r) * rng.standard_normal(len(rows.r))
-            drawn = cast("Aid", Drawn(aid, rows.z + noise))
-            aids.append((aid.t_ns * 1e-9 if in_order else arrival_s, drawn))
-        if aid.feedback == "hold":
-            due = FeedBackAid("rdss_feedback", round(arrival_s * 1e9), GATE)
-            aids.append((arrival_s, due))
-    aids.sort(key=lambda pair: pair[0])
+            drawn = cast("AidingMeasurement", Drawn(measurement, rows.z + noise))
+            measurements.append((measurement.t_ns * 1e-9 if in_order else arrival_s, drawn))
+        if measurement.feedback == "hold":
+            due = HeldFeedback("rdss_feedback", round(arrival_s * 1e9), GATE)
+            measurements.append((arrival_s, due))
+    measurements.sort(key=lambda pair: pair[0])
     sd = runs.initial_sd(m, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
     start = runs.with_error(
         runs.true_nav(truth(), np.array([0.0]))[0], sd[:9] * rng.standard_normal(9)
@@ -219,10 +225,10 @@ def run(
     for second in range(int(SECONDS)):
         rows_now = slice(round(second * IMU.rate_hz), round((second + 1) * IMU.rate_hz))
         buffer.append(times[rows_now], samples[rows_now])
-        while given < len(aids) and aids[given][0] <= second + 1.0:
-            timeline.insert(aids[given][1])
+        while given < len(measurements) and measurements[given][0] <= second + 1.0:
+            timeline.insert(measurements[given][1])
             given += 1
-        timeline.run()
+        timeline.advance()
     outcomes = timeline.counters.outcomes
     unused = ("gated", "isolated", "too_old")
     assert not any(counts[name] for counts in outcomes.values() for name in unused), outcomes

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
@@ -52,9 +52,9 @@ def _model() -> Model:
     return make_model("ins21", imu_noise(IMU), lever, time_offset(FIX_TIME, LATE_SD_S))
 
 
-def _fix(t_ns: int, place: Array) -> PositionAid:
+def _fix(t_ns: int, place: Array) -> PositionMeasurement:
     lat, lon, height = (float(x) for x in place)
-    return PositionAid(
+    return PositionMeasurement(
         "fix", t_ns, 1.0, lat, lon, height, FIX_SD_M, ARM, time=FIX_TIME, rest=ANTENNA_LEVER
     )
 
@@ -90,12 +90,12 @@ def _nees(kind: type[KalmanEstimator], number: int) -> tuple[float, float]:
         to_metres = metres(float(seen.position[k, 0]), float(seen.position[k, 2]))
         north, east, down = moving.v_ned[k] + rng.standard_normal(3) * VELOCITY_SD_M_S
         sd_v = (VELOCITY_SD_M_S,) * 3
-        velocity = VelocityAid(
+        velocity = VelocityMeasurement(
             "velocity", t_ns, 1.0, (north, east, down), sd_v, ARM, rest=ANTENNA_LEVER
         )
         filter_.update(velocity)
         filter_.update(_fix(t_ns, seen.position[k] + rng.standard_normal(3) * FIX_SD_M / to_metres))
-        filter_.update(NonHolonomicAid("slip", t_ns, 1.0, 0.05, 0.05, 1.0, ARM))
+        filter_.update(NonHolonomicConstraint("slip", t_ns, 1.0, 0.05, 0.05, 1.0, ARM))
     end_s = SECONDS - 0.5
     filter_.propagate(imu, round(end_s * 1e9))
     left = nav_error(filter_.nav, true_nav(truth, np.array([end_s]))[0])[DR:]
@@ -155,9 +155,9 @@ def test_the_place_of_the_antenna_stays_known(lever: tuple[float, float, float])
     assert known.max() < 0.1
     for off_deg in (2.0, -3.0, 1.0):
         yaw = 0.7 + math.radians(off_deg)
-        turn = HeadingAid("compass", 0, 1.0, yaw, math.radians(0.5))
+        turn = HeadingMeasurement("compass", 0, 1.0, yaw, math.radians(0.5))
         assert filter_.update(turn).name == "fused"
-        level = AttitudeAid("attitude", 0, 1.0, (0.0, 0.01, math.nan), (0.01, 0.01, 1.0))
+        level = AttitudeMeasurement("attitude", 0, 1.0, (0.0, 0.01, math.nan), (0.01, 0.01, 1.0))
         assert filter_.update(level).name == "fused"
         assert _known_m(filter_) == pytest.approx(known, rel=0.02)
         told = np.sqrt(np.diag(filter_.covariance)[slots])

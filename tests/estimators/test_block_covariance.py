@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import ErrorStateFilter
@@ -44,43 +44,47 @@ def drive(shaken: bool = False) -> tuple[Model, ImuBuffer, list[Linearised], Arr
     model = make_model("ins21", imu_noise(IMU))
     t_s = np.arange(0.303, SECONDS, 1.0)
     at = truth.at(t_s, LEVER)
-    aids: list[Linearised] = []
+    measurements: list[Linearised] = []
     for t, p, v in zip(t_s, at.position, at.v_ned, strict=True):
         lat, lon, height = (float(x) for x in p)
         n, e, d = (float(x) for x in v + rng.standard_normal(3) * SD_V)
         t_ns = round(t * 1e9)
-        aids.append(PositionAid("gnss", t_ns, 1 - 1e-9, lat, lon, height, SD, LEVER))
-        aids.append(VelocityAid("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), SD_V, LEVER))
+        measurements.append(
+            PositionMeasurement("gnss", t_ns, 1 - 1e-9, lat, lon, height, SD, LEVER)
+        )
+        measurements.append(
+            VelocityMeasurement("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), SD_V, LEVER)
+        )
     sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
     start = runs.with_error(runs.true_nav(truth, np.array([0.0]))[0], 0.5 * sd[:9])
-    return model, buffer, aids, start, sd
+    return model, buffer, measurements, start, sd
 
 
 def begun(
     kind: Callable[[Model, float], ErrorStateFilter], shaken: bool = False
 ) -> tuple[ErrorStateFilter, ImuBuffer, list[Linearised]]:
-    model, buffer, aids, start, sd = drive(shaken)
+    model, buffer, measurements, start, sd = drive(shaken)
     estimator = kind(model, IMU.gap_s)
     estimator.initialise(0, 0, start, np.zeros(len(sd)), np.diag(sd**2))
-    return estimator, buffer, aids
+    return estimator, buffer, measurements
 
 
 @pytest.mark.parametrize("shaken", [False, True])
 def test_sigmas_are_those_of_every_sample(shaken: bool) -> None:
-    whole, buffer, aids = begun(KalmanEstimator, shaken)
+    whole, buffer, measurements = begun(KalmanEstimator, shaken)
     each, _, _ = begun(KalmanEstimator, shaken)
     largest, apart, row = 0.0, 0.0, 0
-    for aid in aids:
-        whole.propagate(buffer, aid.t_ns)
-        while buffer.times[row] < aid.t_ns:  # folded in at each sample
+    for measurement in measurements:
+        whole.propagate(buffer, measurement.t_ns)
+        while buffer.times[row] < measurement.t_ns:  # folded in at each sample
             each.propagate(buffer, int(buffer.times[row]))
             row += 1
-        each.propagate(buffer, aid.t_ns)
+        each.propagate(buffer, measurement.t_ns)
         sd = np.sqrt(np.diag(each.covariance))
         largest = max(largest, np.abs(np.sqrt(np.diag(whole.covariance)) / sd - 1.0).max())
         moved = (whole.nav[3:6] - each.nav[3:6]) / sd[3:6]
         apart = max(apart, float(np.abs(moved).max()))
-        assert whole.update(aid).name == each.update(aid).name == "fused"
+        assert whole.update(measurement).name == each.update(measurement).name == "fused"
     assert largest < 1e-5
     assert apart < 1e-5
 
@@ -89,13 +93,13 @@ def test_sigmas_are_those_of_every_sample(shaken: bool) -> None:
 def test_who_asks_in_passing_leaves_no_trace(
     kind: Callable[[Model, float], ErrorStateFilter],
 ) -> None:
-    """At ends of samples, and at the instant of an aid before it is folded in."""
-    alone, buffer, aids = begun(kind)
+    """At ends of samples, and at the instant of a measurement before it is folded in."""
+    alone, buffer, measurements = begun(kind)
     asked, _, _ = begun(kind)
     rng = np.random.default_rng(2)
-    for aid in aids:
-        alone.propagate(buffer, aid.t_ns)
-        upto = int(np.searchsorted(buffer.times, aid.t_ns))
+    for measurement in measurements:
+        alone.propagate(buffer, measurement.t_ns)
+        upto = int(np.searchsorted(buffer.times, measurement.t_ns))
         first = int(np.searchsorted(buffer.times, asked.t_ns, side="right"))
         rows = rng.integers(first, upto, 9) if first < upto else np.empty(0, dtype=np.int64)
         for row in np.unique(rows):
@@ -103,14 +107,14 @@ def test_who_asks_in_passing_leaves_no_trace(
             if row % 3 == 0:
                 asked.restore(asked.snapshot())
         if rng.random() < 0.5:
-            asked.propagate(buffer, aid.t_ns, passing=True)
-        asked.propagate(buffer, aid.t_ns)
+            asked.propagate(buffer, measurement.t_ns, passing=True)
+        asked.propagate(buffer, measurement.t_ns)
         for one, other in zip(alone.snapshot(), asked.snapshot(), strict=True):
             assert np.array_equal(np.asarray(one), np.asarray(other))
-        assert alone.update(aid) == asked.update(aid)
+        assert alone.update(measurement) == asked.update(measurement)
 
 
-def test_what_is_seen_in_passing_is_what_an_aid_would_find() -> None:
+def test_what_is_seen_in_passing_is_what_a_measurement_would_find() -> None:
     passing, buffer, _ = begun(InvariantFilter)
     found, _, _ = begun(InvariantFilter)
     t_ns = 7 * GRID_NS + 11_000_000
@@ -136,20 +140,20 @@ def test_a_start_forgets_what_was_added_up() -> None:
 
 @pytest.mark.parametrize("shaken", [False, True])
 def test_what_is_recorded_of_a_sample_is_what_is_found_there(shaken: bool) -> None:
-    recorded, buffer, aids = begun(InvariantFilter, shaken)
+    recorded, buffer, measurements = begun(InvariantFilter, shaken)
     asked, _, _ = begun(InvariantFilter, shaken)
     recorded.publish_by(Published(-1, 0.01, 0.002))  # by its own clock, and by another unit's axes
     asked.publish_by(Published(-1, 0.01, 0.002))
     row, largest = 0, 0.0
-    for aid in aids:
-        recorded.propagate(buffer, aid.t_ns, record=True)
-        while buffer.times[row] < aid.t_ns:
+    for measurement in measurements:
+        recorded.propagate(buffer, measurement.t_ns, record=True)
+        while buffer.times[row] < measurement.t_ns:
             asked.propagate(buffer, int(buffer.times[row]), passing=True)
             apart = np.abs(buffer.sigmas[row] / asked.sigmas() - 1.0).max()
             largest = max(largest, float(apart))
             row += 1
-        asked.propagate(buffer, aid.t_ns)
-        assert recorded.update(aid) == asked.update(aid)
+        asked.propagate(buffer, measurement.t_ns)
+        assert recorded.update(measurement) == asked.update(measurement)
         assert np.array_equal(recorded.covariance, asked.covariance)
     assert row > 7000
     assert 0.0 < largest < 1e-4

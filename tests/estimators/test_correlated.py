@@ -75,14 +75,14 @@ def test_each_local_filter_is_the_kalman_filter_of_its_source() -> None:
     for name in ("gnss", "rdss"):
         _, alone = runs.make_estimator("ins21", IMU)
         assert isinstance(alone, KalmanEstimator)
-        aids = drive().aids
-        own = [a for a in aids if a.source.startswith(name) or a.source == "zero_rate"]
+        measurements = drive().measurements
+        own = [a for a in measurements if a.source.startswith(name) or a.source == "zero_rate"]
         d = drive()
-        d.aids = own
+        d.measurements = own
         try:
             d.run(alone)
         finally:
-            d.aids = aids
+            d.measurements = measurements
         dx, cov = e.local(name)
         sigma = np.sqrt(np.diag(alone.covariance)[:9])
         there = runs.nav_error(e.nav, alone.nav) - dx[:9]
@@ -103,7 +103,8 @@ def test_it_is_near_the_centralised_filter_and_above_its_covariance() -> None:
 
 
 def test_one_local_filter_is_the_centralised_one() -> None:
-    """All is common to it, as no aid has its name: gains into all, with their noise in common."""
+    """All is common to it, as no measurement has its name: gains into all, with their noise in
+    common."""
     e = make(names=("nobody",))
     drive().run(e)
     apart, ratio = distance(e, centralised()[0])
@@ -127,9 +128,9 @@ def test_a_rewind_gives_the_same_bits() -> None:
     buffer = runs.filled_buffer(IMU, d.times, d.samples)
 
     def go_on() -> tuple[bytes, bytes, bytes]:
-        for aid in d.aids[12:30]:
-            e.propagate(buffer, aid.t_ns)
-            e.update(aid)
+        for measurement in d.measurements[12:30]:
+            e.propagate(buffer, measurement.t_ns)
+            e.update(measurement)
         return e.nav.tobytes(), e.covariance.tobytes(), e.local("gnss")[1].tobytes()
 
     first = go_on()

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.invariant import InvariantFilter
@@ -74,9 +74,11 @@ def nees_of_tilt_and_force(kind: type[KalmanEstimator], seed: int) -> float:
         place = true[:3] + FIX_SD_M * rng.standard_normal(3) / to_m
         v = true[3:6] + VELOCITY_SD_M_S * rng.standard_normal(3)
         lat, lon, height = place.tolist()
-        fix = PositionAid("gnss", t_ns, GATE, lat, lon, height, (FIX_SD_M,) * 3, LEVER)
+        fix = PositionMeasurement("gnss", t_ns, GATE, lat, lon, height, (FIX_SD_M,) * 3, LEVER)
         north, east, down = v.tolist()
-        speed = VelocityAid("v", t_ns, GATE, (north, east, down), (VELOCITY_SD_M_S,) * 3, LEVER)
+        speed = VelocityMeasurement(
+            "v", t_ns, GATE, (north, east, down), (VELOCITY_SD_M_S,) * 3, LEVER
+        )
         assert estimator.update(fix).name == "fused"
         assert estimator.update(speed).name == "fused"
     last = int(np.searchsorted(times, estimator.t_ns, side="right")) - 1

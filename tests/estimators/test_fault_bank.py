@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.fault_bank import (
@@ -60,9 +60,9 @@ def buffer_of(samples: Array) -> ImuBuffer:
     return runs.filled_buffer(IMU, drive()[0], samples)
 
 
-def aids(
+def measurements(
     t_ns: int, rng: np.random.Generator, fault: str, b: Array
-) -> list[PositionAid | VelocityAid]:
+) -> list[PositionMeasurement | VelocityMeasurement]:
     """A fix and its velocity, with a fault of that size from `FIRST_NS` on."""
     truth = runs.town_truth(30.0, IMU.rate_hz)
     states = truth.at(np.array([t_ns * 1e-9]))
@@ -77,8 +77,8 @@ def aids(
     v = tuple((states.v_ned[0] + speed).tolist())
     lever, gate = (0.0, 0.0, 0.0), 1.0 - 1e-12
     return [
-        PositionAid("gnss", t_ns, gate, lat, lon, up, (SD_M,) * 3, lever),
-        VelocityAid("gnss_velocity", t_ns, gate, v, (SD_M_S,) * 3, lever),
+        PositionMeasurement("gnss", t_ns, gate, lat, lon, up, (SD_M,) * 3, lever),
+        VelocityMeasurement("gnss_velocity", t_ns, gate, v, (SD_M_S,) * 3, lever),
     ]
 
 
@@ -107,8 +107,8 @@ def run(
     for second in range(1, until_ns // runs.SECOND + 1):
         t_ns = second * runs.SECOND
         made.propagate(buffer, t_ns)
-        for aid in aids(t_ns, rng, fault, size):
-            assert made.update(aid).name in ("fused", "gated")
+        for measurement in measurements(t_ns, rng, fault, size):
+            assert made.update(measurement).name in ("fused", "gated")
     return made
 
 
@@ -254,8 +254,8 @@ def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
         t_ns = second * runs.SECOND
         made.propagate(buffer, t_ns)
         fault = "position_drift" if t_ns < 24 * runs.SECOND else ""
-        for aid in aids(t_ns, rng, fault, np.array([1.5, 0.0, 0.0])):
-            made.update(aid)
+        for measurement in measurements(t_ns, rng, fault, np.array([1.5, 0.0, 0.0])):
+            made.update(measurement)
         bank.judge(t_ns)
         likely = np.where(bank.explains, bank.log_odds, -np.inf).max(axis=1)
         if t_ns < 24 * runs.SECOND:
@@ -277,7 +277,7 @@ def test_what_returns_to_service_begins_anew() -> None:
     assert bank is not None
     bank.judge(t_ns)
     unit = bank.log_odds[row_of("gyro")].copy()
-    position = aids(t_ns, np.random.default_rng(1), "", np.zeros(3))[0]
+    position = measurements(t_ns, np.random.default_rng(1), "", np.zeros(3))[0]
     bank.begin_again(position, made.nav, made.step)
     bank.judge(t_ns)
     assert np.array_equal(bank.log_odds[row_of("gyro")], unit)
@@ -306,13 +306,15 @@ def test_a_snapshot_keeps_the_bank_to_the_bit() -> None:
     rng = np.random.default_rng(7)
     made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
     made.initialise(0, 0, start.copy(), np.zeros(MODEL.size), np.diag(INITIAL**2))
-    given = {second: aids(second * runs.SECOND, rng, "", np.zeros(3)) for second in range(1, 21)}
+    given = {
+        second: measurements(second * runs.SECOND, rng, "", np.zeros(3)) for second in range(1, 21)
+    }
 
     def go(first: int, last: int) -> Array:
         for second in range(first, last + 1):
             made.propagate(buffer, second * runs.SECOND)
-            for aid in given[second]:
-                made.update(aid)
+            for measurement in given[second]:
+                made.update(measurement)
         bank = made.hypotheses
         assert bank is not None
         bank.judge(made.t_ns)
@@ -326,7 +328,7 @@ def test_a_snapshot_keeps_the_bank_to_the_bit() -> None:
 
 
 def test_a_look_in_passing_leaves_the_bank_as_it_is() -> None:
-    """What is asked between two aids changes nothing of what comes later."""
+    """What is asked between two measurements changes nothing of what comes later."""
     _, samples, start = drive()
     buffer = buffer_of(samples)
     found = []
@@ -340,8 +342,8 @@ def test_a_look_in_passing_leaves_the_bank_as_it_is() -> None:
                 made.propagate(buffer, t_ns - 340_000_000, passing=True)
                 made.sigmas()
             made.propagate(buffer, t_ns)
-            for aid in aids(t_ns, rng, "", np.zeros(3)):
-                made.update(aid)
+            for measurement in measurements(t_ns, rng, "", np.zeros(3)):
+                made.update(measurement)
         assert made.hypotheses is not None
         found.append(made.hypotheses.bank.copy())
     assert np.array_equal(*found, equal_nan=True)
@@ -393,10 +395,14 @@ def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
             v = tuple(states.v_ned[0].tolist())
             lever, gate = (0.0, 0.0, 0.0), 1.0 - 1e-12
             made.update(
-                PositionAid(*("gnss", t_ns, gate, lat, lon, up, (0.1,) * 3, lever), time=FIX_TIME)
+                PositionMeasurement(
+                    *("gnss", t_ns, gate, lat, lon, up, (0.1,) * 3, lever), time=FIX_TIME
+                )
             )
             made.update(
-                VelocityAid("gnss_velocity", t_ns, gate, v, (0.01,) * 3, lever, VELOCITY_TIME)
+                VelocityMeasurement(
+                    "gnss_velocity", t_ns, gate, v, (0.01,) * 3, lever, VELOCITY_TIME
+                )
             )
         found.append(made)
     sound, late = found

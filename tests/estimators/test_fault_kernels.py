@@ -169,7 +169,7 @@ def test_what_the_unit_has_been_found_to_have_turned_is_open() -> None:
     assert made.wider.max() == 0.0
 
 
-def test_what_lies_between_two_aids_is_multiplied_once() -> None:
+def test_what_lies_between_two_measurements_is_multiplied_once() -> None:
     """V <- Phi V: rows that mix, that decay, and that stay."""
     _, bank = faulty()
     n, width = MODEL.size, MODEL.width

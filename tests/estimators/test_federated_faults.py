@@ -113,12 +113,21 @@ def test_no_reset_keeps_a_faulty_filter_out_of_the_others() -> None:
         sd = study.initial_sd(model)
         nav = runs.true_nav(study.truth(), np.zeros(1))[0]
         e.initialise(0, 0, nav, np.zeros(model.size), np.diag(sd**2))
-        aids = study.fixes(np.random.default_rng(1), "")[:6]
+        measurements = study.fixes(np.random.default_rng(1), "")[:6]
         moved = np.array([value, 0.0, 0.0]) / runs.metres(float(nav[0]), float(nav[2]))
-        for aid in aids:
-            lat = aid.lat_rad + (float(moved[0]) if aid.source == "first" else 0.0)
-            fix = study.PositionAid(
-                *(aid.source, 0, 1.0 - 1e-15, lat, aid.lon_rad, aid.height_m, aid.sd, aid.lever)
+        for measurement in measurements:
+            lat = measurement.lat_rad + (float(moved[0]) if measurement.source == "first" else 0.0)
+            fix = study.PositionMeasurement(
+                *(
+                    measurement.source,
+                    0,
+                    1.0 - 1e-15,
+                    lat,
+                    measurement.lon_rad,
+                    measurement.height_m,
+                    measurement.sd,
+                    measurement.lever,
+                )
             )
             assert e.update(fix).name == "fused"
         assert e._isolate(0, INNOVATION)
@@ -135,7 +144,7 @@ def test_no_reset_keeps_a_faulty_filter_out_of_the_others() -> None:
 def _detection(count: int = 3) -> FaultDetection:
     faults = FaultDetection(count, 1e-6, 10, 5)
     for i in range(count):
-        faults.heard(i, 0)
+        faults.received(i, 0)
     return faults
 
 
@@ -167,7 +176,7 @@ def test_the_worst_of_three_is_named_and_of_two_nobody() -> None:
 
 def test_the_last_one_heard_is_never_isolated() -> None:
     faults = _detection(2)
-    faults.heard(0, 20 * runs.SECOND)
+    faults.received(0, 20 * runs.SECOND)
     assert faults.may_isolate(1, RECENT_NS + 20 * runs.SECOND)
     assert not faults.may_isolate(0, RECENT_NS + 20 * runs.SECOND)
     faults.isolate(1, INNOVATION)

@@ -1,4 +1,5 @@
-"""Screened aids in the federated filter: bad rows, a clock that is set, a receiver at fault."""
+"""Screened measurements in the federated filter: bad rows, a clock that is set, a receiver at
+fault."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.isolation import INNOVATION
@@ -34,14 +35,14 @@ MODEL = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))
 
 
 def through(estimator: Estimator, epochs: Sequence[Sequence[Linearised]]) -> list[Outcome]:
-    """Apply all epochs, each aid's outcome."""
+    """Apply all epochs, each measurement's outcome."""
     _, buffer, _, start, _ = drive()
     begun(estimator, start, runs.initial_sd(MODEL, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0))
     outcomes = []
-    for aids in epochs:
-        for aid in aids:
-            estimator.propagate(buffer, aid.t_ns)
-            outcomes.append(estimator.update(aid))
+    for measurements in epochs:
+        for measurement in measurements:
+            estimator.propagate(buffer, measurement.t_ns)
+            outcomes.append(estimator.update(measurement))
     return outcomes
 
 
@@ -75,7 +76,7 @@ def test_with_a_reset_it_is_the_centralised_filter(mode: Mode) -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("names", [("raw", "gnss"), ("gnss",), ("gnss", "other")])
 def test_a_bad_row_goes_alone_and_a_set_clock_is_found(mode: Mode, names: tuple[str, ...]) -> None:
-    """Of a local filter's own and of an aid common to all, one of whom has nothing else."""
+    """Of a local filter's own and of a measurement common to all, one of whom has nothing else."""
     estimator = make(mode, names)
     outcomes = through(estimator, both(jump_at=25, wrong_at=20))
     assert {o.name for o in outcomes} == {"fused"}
@@ -110,11 +111,11 @@ def sky(range_error_m: float, set_at: int = 99) -> list[list[Linearised]]:
             *(up.position_ecef_m, up.velocity_ecef_m_s, ranges_m),
             *(np.full(n, np.nan), np.full(n, 9.0), np.ones(n)),
         )
-        raw = PseudorangeAid(
+        raw = PseudorangeMeasurement(
             *("raw", fix.t_ns, 1 - 1e-9, up.satellites, values),
             *(np.zeros(n, dtype=np.int64), LEVER),
         )
-        assert isinstance(fix, PositionAid)
+        assert isinstance(fix, PositionMeasurement)
         found.append([velocity, raw, replace(fix, source="gnss")])
     return found
 
@@ -127,9 +128,9 @@ def test_a_bad_satellite_is_refused_by_name_and_nobody_learns_of_it(mode: Mode) 
     outcomes = through(bad, epochs)
     refused = [
         (k // 3, label)
-        for k, (aid, outcome) in enumerate(zip(chain(*epochs), outcomes, strict=True))
-        if isinstance(aid, PseudorangeAid)
-        for label, code in zip(aid.labels, outcome.rows, strict=True)
+        for k, (measurement, outcome) in enumerate(zip(chain(*epochs), outcomes, strict=True))
+        if isinstance(measurement, PseudorangeMeasurement)
+        for label, code in zip(measurement.labels, outcome.rows, strict=True)
         if code
     ]
     assert refused == [(BAD_AT, (BAD, "range"))]
@@ -146,7 +147,8 @@ def test_a_bad_satellite_is_refused_by_name_and_nobody_learns_of_it(mode: Mode) 
 @pytest.mark.parametrize("names", [("raw", "gnss"), ("gnss", "other")])
 @pytest.mark.parametrize("mode", ["no_reset", "rescale"])
 def test_every_filter_learns_that_a_clock_was_set(mode: Mode, names: tuple[str, ...]) -> None:
-    """Of an aid of its own source and of a common one: nobody goes on with the old offset."""
+    """Of a measurement of its own source and of a common one: nobody goes on with the old
+    offset."""
     epochs = sky(0.0, set_at=SET_AT)
     estimator = make(mode, names)
     assert isinstance(estimator, NoResetFilter)
@@ -165,10 +167,10 @@ def test_every_filter_learns_that_a_clock_was_set(mode: Mode, names: tuple[str, 
         if known:
             assert abs(offset - 5.0) < 4.0 * sigma
     _, buffer, _, _, _ = drive()
-    for aids in epochs[SET_AT:]:
-        for aid in aids:
-            estimator.propagate(buffer, aid.t_ns)
-            assert estimator.update(aid).name == "fused"
+    for measurements in epochs[SET_AT:]:
+        for measurement in measurements:
+            estimator.propagate(buffer, measurement.t_ns)
+            assert estimator.update(measurement).name == "fused"
     for (offset, sigma), known in zip(clocks(), knew, strict=True):
         assert abs(offset - 3000.0) < 4.0 * sigma
         assert (sigma < 20.0) == known
@@ -179,19 +181,19 @@ def test_a_receiver_whose_rows_all_fail_is_isolated(mode: Mode) -> None:
     """Its position is 300 m off from the tenth epoch: half of the ranges may be a clock, a position
     is not."""
     epochs = both()
-    for aids in epochs[10:]:
-        raw = aids[1]
+    for measurements in epochs[10:]:
+        raw = measurements[1]
         assert isinstance(raw, Ranges)
-        moved = PositionAid(
+        moved = PositionMeasurement(
             *(raw.fix.source, raw.t_ns, raw.gate, raw.fix.lat_rad + 5e-5, raw.fix.lon_rad - 5e-5),
             *(raw.fix.height_m, raw.fix.sd, raw.fix.lever),
         )
-        aids[1] = replace(raw, fix=moved)
+        measurements[1] = replace(raw, fix=moved)
     estimator = make(mode)
     outcomes = through(estimator, epochs)
     assert estimator.isolated == {"raw": INNOVATION}
     raw_outcomes = [o for o in outcomes if o.rows]
     assert raw_outcomes[-1].name == "isolated"
     true = drive()[2][-1][0]
-    assert isinstance(true, PositionAid)
+    assert isinstance(true, PositionMeasurement)
     assert abs(estimator.nav[0] - true.lat_rad) * 6.4e6 < 10.0

@@ -15,7 +15,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
 from tests import runs
-from tests.estimators.test_fault_bank import IMU, INITIAL, aids, buffer_of, drive
+from tests.estimators.test_fault_bank import IMU, INITIAL, buffer_of, drive, measurements
 
 EVERY_NS = runs.SECOND // 5
 WIDE = 300.0
@@ -35,8 +35,8 @@ def test_what_it_follows_is_no_delay(seed: int) -> None:
     buffer, rng = buffer_of(samples), np.random.default_rng(seed)
     for k in range(1, 150):
         made.propagate(buffer, k * EVERY_NS)
-        for aid in aids(k * EVERY_NS, rng, "", np.zeros(3)):
-            made.update(aid)
+        for measurement in measurements(k * EVERY_NS, rng, "", np.zeros(3)):
+            made.update(measurement)
     bank = made.hypotheses
     assert bank is not None
     bank.judge(made.t_ns)

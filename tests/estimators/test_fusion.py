@@ -160,7 +160,7 @@ def test_a_weight_is_a_part_of_the_information() -> None:
 
 
 def test_a_singular_covariance_is_made_less_sure_not_refused() -> None:
-    """Two states fully correlated, as after hours without an aid."""
+    """Two states fully correlated, as after hours without a measurement."""
     b = Bank()
     p = b.covs[1]
     p[:, 0] = p[:, 4] * 1e-5

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.estimators.fault_bank import NO_FAULTS, ONSET, RESTARTS
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.tilt_axes import TiltAxesFilter
@@ -37,11 +37,11 @@ def driven(
     kind: type[TiltAxesFilter] = TiltAxesFilter, faults: bool = True
 ) -> tuple[TiltAxesFilter, list[list[Linearised]], ImuBuffer]:
     """A filter after `BEFORE` epochs, of small errors, and what comes."""
-    model, buffer, aids, start, sd = town_drive.drive(noise=1e-3)
+    model, buffer, measurements, start, sd = town_drive.drive(noise=1e-3)
     estimator = kind(model, town_drive.IMU.gap_s, table_of(kinds(model)) if faults else NO_FAULTS)
     town_drive.begun(estimator, start, sd)
-    town_drive.run(estimator, buffer, aids[:BEFORE])
-    return estimator, aids[BEFORE : BEFORE + AFTER], buffer
+    town_drive.run(estimator, buffer, measurements[:BEFORE])
+    return estimator, measurements[BEFORE : BEFORE + AFTER], buffer
 
 
 def effect(estimator: KalmanEstimator, name: str, onset_ns: int) -> Array:
@@ -63,11 +63,11 @@ def apart(wrong: KalmanEstimator, right: KalmanEstimator) -> Array:
 
 def test_a_bank_changes_nothing_while_nothing_is_wrong() -> None:
     """To the bit, though beside it two hundred and more hypotheses run."""
-    (plain, aids, buffer), (watched, _, _) = driven(faults=False), driven()
+    (plain, measurements, buffer), (watched, _, _) = driven(faults=False), driven()
     assert watched.hypotheses is not None
     assert watched.hypotheses.table.groups > 100
     for estimator in (plain, watched):
-        town_drive.run(estimator, buffer, aids)
+        town_drive.run(estimator, buffer, measurements)
     assert np.array_equal(plain.nav, watched.nav)
     assert np.array_equal(plain.xi, watched.xi)
     assert np.array_equal(plain.covariance, watched.covariance)
@@ -82,14 +82,14 @@ def test_a_bank_changes_nothing_while_nothing_is_wrong() -> None:
 def test_a_sensor_that_steps_moves_the_state_as_its_hypothesis_says(
     name: str, slot: int, amount: float, axis: int
 ) -> None:
-    right, aids, buffer = driven()
+    right, measurements, buffer = driven()
     wrong, _, _ = driven()
     onset_ns = right.t_ns
     assert right.hypotheses is not None
     right.hypotheses.begin(onset_ns, right.nav, right.step)
     wrong.xi[slot + axis] -= amount  # true minus estimated is larger by it
     for estimator in (right, wrong):
-        town_drive.run(estimator, buffer, aids)
+        town_drive.run(estimator, buffer, measurements)
     expected = effect(right, name, onset_ns)[:, axis] * amount
     found = apart(wrong, right)
     for part in (slice(PHI, PHI + 3), slice(DV, DV + 3), slice(DR, DR + 3), slice(9, 15)):
@@ -102,14 +102,17 @@ def test_a_sensor_that_steps_moves_the_state_as_its_hypothesis_says(
 def test_a_receiver_that_is_off_moves_the_state_as_its_hypothesis_says(
     ramp: bool, moves: bool
 ) -> None:
-    right, aids, buffer = driven()
+    right, measurements, buffer = driven()
     wrong, _, _ = driven()
     onset_ns, north = right.t_ns, 1e-3
     assert right.hypotheses is not None
     right.hypotheses.begin(onset_ns, right.nav, right.step)
     shifted: list[list[Linearised]] = []
-    for epoch in aids:
-        position, velocity = cast("PositionAid", epoch[0]), cast("VelocityAid", epoch[1])
+    for epoch in measurements:
+        position, velocity = (
+            cast("PositionMeasurement", epoch[0]),
+            cast("VelocityMeasurement", epoch[1]),
+        )
         off = north * ((position.t_ns - onset_ns) * 1e-9 if ramp else 1.0)
         if moves:
             n, e, d = velocity.v_ned
@@ -118,7 +121,7 @@ def test_a_receiver_that_is_off_moves_the_state_as_its_hypothesis_says(
             by = off / float(runs.metres(position.lat_rad, position.height_m or 0.0)[0])
             position = replace(position, lat_rad=position.lat_rad + by)
         shifted.append([position, velocity])
-    town_drive.run(right, buffer, aids)
+    town_drive.run(right, buffer, measurements)
     town_drive.run(wrong, buffer, shifted)
     name = ("velocity" if moves else "position") + ("_drift" if ramp else "")
     expected = effect(right, name, onset_ns)[:, 0] * north

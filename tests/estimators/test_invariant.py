@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.invariant import InvariantFilter, Turning
@@ -103,8 +103,10 @@ def test_an_arc_of_headings_is_found_at_any_angle() -> None:
         turn = dcm_from_rpy(0.0, 0.0, math.radians(off_deg))
         truth[3:6] = turn @ truth[3:6]
         velocity = tuple(float(v) for v in truth[3:6])
-        aid = VelocityAid("gnss", 0, 0.9999, velocity, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
-        assert f.update(aid).name == "fused"
+        measurement = VelocityMeasurement(
+            "gnss", 0, 0.9999, velocity, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)
+        )
+        assert f.update(measurement).name == "fused"
         yaw = rpy_from_dcm(dcm_from_quaternion(f.nav[6:]))[2]
         assert wrap_angle(yaw - 2.1 - math.radians(off_deg)) == pytest.approx(0.0, abs=0.02)
         assert f.nav[3:6] == pytest.approx(truth[3:6], abs=0.3)
@@ -116,7 +118,7 @@ def test_an_arc_of_headings_is_found_at_any_angle() -> None:
     f.covariance[3:5, 2] = f.covariance[2, 3:5] = 0.01
     f.covariance[3, 3] = f.covariance[4, 4] = 0.05**2
     f.turns = True
-    still = VelocityAid("gnss", 0, 0.9999, (0.0, 0.0, 0.0), (0.05,) * 3, (0.0, 0.0, 0.0))
+    still = VelocityMeasurement("gnss", 0, 0.9999, (0.0, 0.0, 0.0), (0.05,) * 3, (0.0, 0.0, 0.0))
     for _ in range(20):
         assert f.update(still).name == "fused"
     assert math.degrees(math.sqrt(f.covariance[2, 2])) == pytest.approx(104.0, abs=1.0)

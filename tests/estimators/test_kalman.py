@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusiond.aiding.attitude import HeadingAid
+from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import Innovation, NotApplicable, State
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.base import gate_threshold
 from fusiond.estimators.block_covariance import GAP_FORCE_M_S2, GAP_RATE_RAD_S
@@ -126,7 +126,7 @@ def test_a_markov_state_settles_at_its_steady_variance() -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """A linear measurement as an aid."""
+    """A linear measurement."""
 
     z: Array
     h: Array
@@ -203,9 +203,11 @@ def test_gate_is_the_chi_square_quantile() -> None:
 def test_a_measurement_that_is_no_number_changes_nothing(bad: float) -> None:
     model, estimator, _ = started("ins15")
     before = estimator.snapshot()
-    aid = PositionAid("gnss", 0, 0.999, bad, 2.0, 40.0, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    assert estimator.update(aid).name in ("not_finite", "gated")
-    assert estimator.update(HeadingAid("h", 0, 0.999, math.nan, 0.01)).name == "not_finite"
+    measurement = PositionMeasurement(
+        "gnss", 0, 0.999, bad, 2.0, 40.0, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+    )
+    assert estimator.update(measurement).name in ("not_finite", "gated")
+    assert estimator.update(HeadingMeasurement("h", 0, 0.999, math.nan, 0.01)).name == "not_finite"
     nan_noise = Row(np.zeros(1), np.eye(1, model.size), np.array([math.nan]))
     assert estimator.update(nan_noise).name == "not_finite"
     for now, then in zip(estimator.snapshot(), before, strict=True):

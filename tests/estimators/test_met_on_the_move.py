@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.tilt_axes import TiltAxesFilter
@@ -79,8 +79,8 @@ def _tilt_nees(seed: int) -> float:
     for k, t_ns in enumerate(np.rint(t_s * 1e9).astype(np.int64).tolist()):
         filter_.propagate(imu, t_ns)
         north, east, down = v[k].tolist()
-        filter_.update(VelocityAid("v", t_ns, 1.0, (north, east, down), VELOCITY_SD, ARM))
-        filter_.update(NonHolonomicAid("slip", t_ns, 1.0, 0.1, 0.2, 2.0, ARM))
+        filter_.update(VelocityMeasurement("v", t_ns, 1.0, (north, east, down), VELOCITY_SD, ARM))
+        filter_.update(NonHolonomicConstraint("slip", t_ns, 1.0, 0.1, 0.2, 2.0, ARM))
     off = nav_error(filter_.nav, true_nav(truth, np.array([t_s[-1]]))[0])[:2]
     return float(off @ np.linalg.solve(filter_.covariance[:2, :2], off))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
@@ -29,11 +29,11 @@ Array = NDArray[np.float64]
 
 
 def test_one_scale_is_the_ordinary_filter() -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     one, ordinary = MultiscaleEstimator(model, IMU.gap_s, 1), KalmanEstimator(model, IMU.gap_s)
     for estimator in (one, ordinary):
         begun(estimator, start, sd)
-        run(estimator, buffer, aids)
+        run(estimator, buffer, measurements)
         estimator.propagate(buffer, buffer.latest_ns)
     np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(one.xi, ordinary.xi, rtol=1e-6, atol=1e-12)
@@ -43,30 +43,30 @@ def test_one_scale_is_the_ordinary_filter() -> None:
 
 @pytest.mark.parametrize("scales", [2, 3])
 def test_the_start_is_the_ordinary_filter_and_then_blocks_take_over(scales: int) -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     block = MultiscaleEstimator(model, IMU.gap_s, scales)
     ordinary = KalmanEstimator(model, IMU.gap_s)
     begun(block, start, sd)
     begun(ordinary, start, sd)
     first = 2**scales - 1
     for estimator in (block, ordinary):
-        run(estimator, buffer, aids[:first])
+        run(estimator, buffer, measurements[:first])
     np.testing.assert_allclose(block.nav, ordinary.nav, rtol=1e-12)
     np.testing.assert_allclose(block.covariance, ordinary.covariance, rtol=1e-9, atol=1e-18)
     for estimator in (block, ordinary):
-        run(estimator, buffer, aids[first : first + 2])
+        run(estimator, buffer, measurements[first : first + 2])
     ratio = np.diag(block.covariance) / np.diag(ordinary.covariance)
     assert np.abs(ratio - 1.0).max() > 1e-5
 
 
 @pytest.mark.parametrize("wavelet", ["db2", "sym4", "coif1"])
 def test_the_wavelet_changes_nothing_but_rounding(wavelet: str) -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     found = []
     for name in ("haar", wavelet):
         estimator = MultiscaleEstimator(model, IMU.gap_s, 3, name)
         begun(estimator, start, sd)
-        run(estimator, buffer, aids)
+        run(estimator, buffer, measurements)
         found.append(estimator)
     np.testing.assert_allclose(found[0].nav, found[1].nav, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-6, atol=1e-14)
@@ -75,16 +75,16 @@ def test_the_wavelet_changes_nothing_but_rounding(wavelet: str) -> None:
 @pytest.mark.parametrize("scales", [1, 2, 4])
 def test_feedback_and_carrying_give_the_same_where_all_is_linear(scales: int) -> None:
     """Errors a ten-thousandth of what the filter expects: second-order terms are out of sight."""
-    model, buffer, aids, start, sd = drive(noise=1e-4)
+    model, buffer, measurements, start, sd = drive(noise=1e-4)
     closed = MultiscaleEstimator(model, IMU.gap_s, scales)
     held = MultiscaleEstimator(model, IMU.gap_s, scales)
     turns = MultiscaleEstimator(model, IMU.gap_s, scales)
     for estimator in (closed, held, turns):
         begun(estimator, start, sd)
     held.hold()
-    run(closed, buffer, aids)
-    run(held, buffer, aids)
-    for k, epoch in enumerate(aids):  # held from time to time, released between two epochs
+    run(closed, buffer, measurements)
+    run(held, buffer, measurements)
+    for k, epoch in enumerate(measurements):  # held from time to time, released between two epochs
         if k % 3 == 1:
             turns.hold()
         run(turns, buffer, [epoch])
@@ -106,34 +106,36 @@ def test_feedback_and_carrying_give_the_same_where_all_is_linear(scales: int) ->
         np.testing.assert_allclose(other.xi, closed.xi, rtol=1e-2, atol=1e-10)
 
 
-def test_aids_of_an_instant_are_one_epoch_in_any_order() -> None:
-    model, buffer, aids, start, sd = drive()
+def test_measurements_of_an_instant_are_one_epoch_in_any_order() -> None:
+    model, buffer, measurements, start, sd = drive()
     found = []
     for order in (1, -1):
         estimator = MultiscaleEstimator(model, IMU.gap_s, 2)
         begun(estimator, start, sd)
-        run(estimator, buffer, [epoch[::order] for epoch in aids])
+        run(estimator, buffer, [epoch[::order] for epoch in measurements])
         assert estimator.epochs == 3
         found.append(estimator)
     np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-2, atol=1e-7)
     apart = runs.nav_error(found[0].nav, found[1].nav)
-    assert np.abs(apart[6:]).max() < 0.02  # the second aid is linearised at a corrected state
+    assert (
+        np.abs(apart[6:]).max() < 0.02
+    )  # the second measurement is linearised at a corrected state
 
 
 @pytest.mark.parametrize("at", [1, 4, 20])
-def test_a_gated_aid_leaves_nothing_behind(at: int) -> None:
-    model, buffer, aids, start, sd = drive()
-    t_ns = aids[at][0].t_ns
-    bad = VelocityAid("wild", t_ns, 0.999, (50.0, 0.0, 0.0), SD_V, LEVER)
-    between = VelocityAid("wild", t_ns + 300_000_000, 0.999, (50.0, 0.0, 0.0), SD_V, LEVER)
+def test_a_gated_measurement_leaves_nothing_behind(at: int) -> None:
+    model, buffer, measurements, start, sd = drive()
+    t_ns = measurements[at][0].t_ns
+    bad = VelocityMeasurement("wild", t_ns, 0.999, (50.0, 0.0, 0.0), SD_V, LEVER)
+    between = VelocityMeasurement("wild", t_ns + 300_000_000, 0.999, (50.0, 0.0, 0.0), SD_V, LEVER)
     clean, tried = (MultiscaleEstimator(model, IMU.gap_s, 2) for _ in range(2))
     for estimator in (clean, tried):
         begun(estimator, start, sd)
-        run(estimator, buffer, aids[:at])
+        run(estimator, buffer, measurements[:at])
         estimator.propagate(buffer, t_ns)
         if estimator is tried:
             assert tried.update(bad).name == "gated"
-        run(estimator, buffer, [aids[at]])
+        run(estimator, buffer, [measurements[at]])
         if estimator is tried:
             assert tried.update(bad).name == "gated"
         estimator.propagate(buffer, between.t_ns)
@@ -142,29 +144,29 @@ def test_a_gated_aid_leaves_nothing_behind(at: int) -> None:
             assert outcome.name == "gated"
             assert outcome.degrees == 3
             assert outcome.nis > 1e3
-        run(estimator, buffer, aids[at + 1 : at + 9])
+        run(estimator, buffer, measurements[at + 1 : at + 9])
     assert (clean.nav == tried.nav).all()
     assert (clean.covariance == tried.covariance).all()
 
 
 def test_an_arrival_out_of_order_is_exact() -> None:
     """Through the timeline: late fixes rewind epochs, blocks and transition, bit for bit."""
-    model, buffer, aids, start, sd = drive()
-    flat = [aid for epoch in aids for aid in epoch]
-    late = [aid for k, aid in enumerate(flat) if k % 5 != 2]
+    model, buffer, measurements, start, sd = drive()
+    flat = [measurement for epoch in measurements for measurement in epoch]
+    late = [measurement for k, measurement in enumerate(flat) if k % 5 != 2]
     found = []
     for order in (flat, late):
         estimator = MultiscaleEstimator(model, IMU.gap_s, 2)
         begun(estimator, start, sd)
         timeline = Timeline(estimator, buffer, keep_s=60.0, checkpoint_s=0.5)
         timeline.start()
-        for aid in order:
-            timeline.insert(aid)
-        timeline.run()
-        for aid in flat:
-            if aid not in order:
-                timeline.insert(aid)
-                timeline.run()
+        for measurement in order:
+            timeline.insert(measurement)
+        timeline.advance()
+        for measurement in flat:
+            if measurement not in order:
+                timeline.insert(measurement)
+                timeline.advance()
         found.append((estimator, timeline))
     (a, _), (b, rewound) = found
     assert rewound.counters.rewinds == len(flat) - len(late)
@@ -174,14 +176,14 @@ def test_an_arrival_out_of_order_is_exact() -> None:
 
 
 def test_recording_tells_sigmas_and_changes_nothing() -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     plain, recorded = (MultiscaleEstimator(model, IMU.gap_s, 2) for _ in range(2))
     for estimator in (plain, recorded):
         begun(estimator, start, sd)
-        for epoch in aids:
+        for epoch in measurements:
             estimator.propagate(buffer, epoch[0].t_ns, record=estimator is recorded)
-            for aid in epoch:
-                estimator.update(aid)
+            for measurement in epoch:
+                estimator.update(measurement)
         estimator.propagate(buffer, buffer.latest_ns, record=estimator is recorded)
     assert (plain.nav == recorded.nav).all()
     assert (plain.covariance == recorded.covariance).all()
@@ -189,10 +191,10 @@ def test_recording_tells_sigmas_and_changes_nothing() -> None:
 
 
 def test_what_is_recorded_has_all_noise_since_the_last_epoch() -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     estimator = MultiscaleEstimator(model, IMU.gap_s)
     begun(estimator, start, sd)
-    run(estimator, buffer, aids[:5])
+    run(estimator, buffer, measurements[:5])
     row = buffer.index_after(estimator.t_ns) + 40
     for k in (20, 40):  # nobody measures anything between
         estimator.propagate(buffer, int(buffer.times[row - 40 + k]), record=True)
@@ -200,10 +202,10 @@ def test_what_is_recorded_has_all_noise_since_the_last_epoch() -> None:
 
 
 def test_covariance_stays_symmetric_and_positive() -> None:
-    model, buffer, aids, start, sd = drive()
+    model, buffer, measurements, start, sd = drive()
     estimator = MultiscaleEstimator(model, IMU.gap_s, 4)
     begun(estimator, start, sd)
-    for epoch in aids:
+    for epoch in measurements:
         run(estimator, buffer, [epoch])
         p = estimator.covariance
         assert (p == p.T).all()

@@ -4,7 +4,7 @@ those with one are in tests/estimators/test_nees_clock.py.
 Each run draws its sensor errors from `fusiond.simulation.sensor_errors` with the very `Imu` that
 the filter is configured with, starts from the true state plus an error drawn from P0, and feeds
 back. With N runs the sum of NEES over the runs is chi-square with N x dof degrees of freedom at
-each instant; NIS of all aids of all runs is chi-square with the sum of their dimensions, as
+each instant; NIS of all measurements of all runs is chi-square with the sum of their dimensions, as
 innovations are white (Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2).
 """
 
@@ -23,7 +23,7 @@ from tests.estimators.monte_carlo import (
     FIRST_FIX_S,
     MATCHED,
     RATE_HZ,
-    drawn_aids,
+    drawn_measurements,
     interval,
 )
 
@@ -87,16 +87,19 @@ def monte_carlo(name: str, count: int, first_seed: int = 1000) -> Figures:
         estimator.initialise(
             0, 0, runs.with_error(true_at[0], error[:9]), np.zeros(model.size), np.diag(sd**2)
         )
-        aids = drawn_aids(name, truth, fixes_s, rng)
+        measurements = drawn_measurements(name, truth, fixes_s, rng)
         following = 0
         for at, t_s in enumerate(INSTANTS_S):
             while following < len(fixes_s) and fixes_s[following] <= t_s:
-                for aid in aids[following]:
-                    estimator.propagate(buffer, aid.t_ns)
-                    outcome = estimator.update(aid)
+                for measurement in measurements[following]:
+                    estimator.propagate(buffer, measurement.t_ns)
+                    outcome = estimator.update(measurement)
                     figures.gated += outcome.name != "fused"
-                    total, degrees = figures.nis.get(aid.source, (0.0, 0))
-                    figures.nis[aid.source] = (total + outcome.nis, degrees + outcome.degrees)
+                    total, degrees = figures.nis.get(measurement.source, (0.0, 0))
+                    figures.nis[measurement.source] = (
+                        total + outcome.nis,
+                        degrees + outcome.degrees,
+                    )
                 following += 1
             estimator.propagate(buffer, round(t_s * 1e9))
             parameters = np.concatenate([run.biases[round(t_s * RATE_HZ) - 1], run.scales])

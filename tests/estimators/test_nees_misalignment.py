@@ -12,16 +12,23 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
+from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
+from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.settings import ARCSEC, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.blocks import misalignment
 from fusiond.models.catalogue import make_model
 from fusiond.simulation.aiding_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from tests import runs
-from tests.estimators.monte_carlo import FIRST_FIX_S, LEVER, MATCHED, RATE_HZ, drawn_aids, interval
+from tests.estimators.monte_carlo import (
+    FIRST_FIX_S,
+    LEVER,
+    MATCHED,
+    RATE_HZ,
+    drawn_measurements,
+    interval,
+)
 
 RUNS, SECONDS, SD = 30, 150.0, 180.0 * ARCSEC
 GATE = 1.0 - 1e-9
@@ -68,19 +75,19 @@ def test_misalignment_is_estimated_honestly(tau_s: float | None) -> None:
     for k in range(RUNS):
         rng = np.random.default_rng([77, k])
         star, sar = StarTracker(truth, star_options, rng), SarRadar(truth, sar_options, rng)
-        aids: list[Linearised] = [
-            a for fix in drawn_aids("ins15", truth, fixes_s, rng) for a in fix
+        measurements: list[Linearised] = [
+            a for fix in drawn_measurements("ins15", truth, fixes_s, rng) for a in fix
         ]
         for t, rpy in zip(star.t_s, star.rpy, strict=True):
             angles = (float(rpy[0]), float(rpy[1]), float(rpy[2]))
             sd_star = (float(star.sd_rad[0]),) * 3
-            aids.append(
-                AttitudeAid("star", round(t * 1e9), GATE, angles, sd_star, block=STAR_BLOCK)
+            measurements.append(
+                AttitudeMeasurement("star", round(t * 1e9), GATE, angles, sd_star, block=STAR_BLOCK)
             )
         for t, (azimuth, elevation), name in zip(sar.t_s, sar.angles, sar.target, strict=True):
             lat, lon, height = POINTS[name]
-            aids.append(
-                BearingAid(
+            measurements.append(
+                BearingMeasurement(
                     "sar",
                     round(t * 1e9),
                     GATE,
@@ -99,12 +106,12 @@ def test_misalignment_is_estimated_honestly(tau_s: float | None) -> None:
         estimator.initialise(
             0, 0, runs.with_error(start, error[:9]), np.zeros(model.size), np.diag(sd**2)
         )
-        for aid in sorted(aids, key=lambda a: a.t_ns):
-            estimator.propagate(buffer, aid.t_ns)
-            outcome = estimator.update(aid)
-            assert outcome.name == "fused", (aid, outcome)
-            total, degrees = nis.get(aid.source, (0.0, 0))
-            nis[aid.source] = total + outcome.nis, degrees + outcome.degrees
+        for measurement in sorted(measurements, key=lambda a: a.t_ns):
+            estimator.propagate(buffer, measurement.t_ns)
+            outcome = estimator.update(measurement)
+            assert outcome.name == "fused", (measurement, outcome)
+            total, degrees = nis.get(measurement.source, (0.0, 0))
+            nis[measurement.source] = total + outcome.nis, degrees + outcome.degrees
         estimator.propagate(buffer, round(SECONDS * 1e9))
         x = np.zeros(model.size)
         x[:9] = runs.nav_error(estimator.nav, end)

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.aiding.base import Innovation
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -34,11 +34,11 @@ def _loss(t: Array) -> Array:
     return found
 
 
-def _fix(north_m: float, east_m: float, robust: bool = True) -> PositionAid:
+def _fix(north_m: float, east_m: float, robust: bool = True) -> PositionMeasurement:
     lat, lon, height = runs.ORIGIN
     north, east, _ = runs.metres(lat, height)
     place = lat + north_m / north, lon + east_m / east, height - 2.0
-    return PositionAid("gnss", 0, 1.0 - 1e-9, *place, SD, LEVER, robust=robust)
+    return PositionMeasurement("gnss", 0, 1.0 - 1e-9, *place, SD, LEVER, robust=robust)
 
 
 @pytest.mark.parametrize("off_m", [(1.0, -1.0), (9.0, 2.0), (-6.0, 30.0)])
@@ -47,8 +47,8 @@ def test_is_the_minimum_of_its_sum(off_m: tuple[float, float]) -> None:
     estimator, _ = side_by_side.pair_of("ins21", p_scale=0.3)
     p, nav = estimator.covariance.copy(), estimator.nav.copy()
     n = estimator.model.size
-    aid = _fix(*off_m)
-    rows = aid.innovation(estimator.state)
+    measurement = _fix(*off_m)
+    rows = measurement.innovation(estimator.state)
     assert isinstance(rows, Innovation)
     z, h, r = rows
     root = np.linalg.cholesky(p)
@@ -58,7 +58,7 @@ def test_is_the_minimum_of_its_sum(off_m: tuple[float, float]) -> None:
 
     found = minimize(cost, np.zeros(n), method="BFGS", options={"gtol": 1e-9})
     x = root @ found.x
-    outcome = estimator.update(aid)
+    outcome = estimator.update(measurement)
     assert outcome.name == "fused"
     fed_back = runs.nav_error(nav, estimator.nav)
     assert np.abs((fed_back - x[:9]) / np.sqrt(np.diag(p)[:9])).max() < 1e-3
@@ -84,7 +84,7 @@ def test_a_wrong_fix_moves_the_filter_less() -> None:
 
 def test_a_clock_that_jumps_is_no_wrong_range() -> None:
     """All ranges jump by 3 km: the clock is renewed, as without weights, and the track is held."""
-    _, buffer, aids, start, _ = town_drive.drive()
+    _, buffer, measurements, start, _ = town_drive.drive()
     model = make_model("ins23", imu_noise(town_drive.IMU))
     sd = model.initial.copy()
     sd[:9] = np.r_[np.radians([0.3, 0.3, 2.0]), [0.2] * 3, [3.0] * 3]
@@ -92,7 +92,7 @@ def test_a_clock_that_jumps_is_no_wrong_range() -> None:
     for robust in (False, True):
         estimator = KalmanEstimator(model, town_drive.IMU.gap_s)
         estimator.initialise(0, 0, start, np.zeros(model.size), np.diag(sd**2))
-        epochs: list[Any] = ranges(aids, jump_at=20)
+        epochs: list[Any] = ranges(measurements, jump_at=20)
         drive = [[v, replace(raw, robust=robust)] for v, raw in epochs]
         town_drive.run(estimator, buffer, drive)
         ends.append((estimator.nav.copy(), estimator.sigmas()[:3]))
@@ -113,6 +113,6 @@ def test_a_section_says_so(source: str) -> None:
         sd_ned_m=(1.0, 1.0, 2.0),
         v_ned_m_s=(1.0, 0.0, 0.0),
     )
-    aids = intake.aids(fix, 1_000_000_000, 0.0)
-    assert not isinstance(aids, str)
-    assert [aid.robust for aid in aids] == [True, True]
+    measurements = intake.measurements_of(fix, 1_000_000_000, 0.0)
+    assert not isinstance(measurements, str)
+    assert [measurement.robust for measurement in measurements] == [True, True]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -30,11 +30,11 @@ INITIAL = runs.initial_sd(MODEL, np.radians([0.5, 0.5, 2.0]), 0.5, 5.0)
 
 def fix(
     source: str, t_ns: int, place: Array, rng: np.random.Generator, off_m: float = 0.0
-) -> PositionAid:
+) -> PositionMeasurement:
     sd = SD[source]
     noise = rng.standard_normal(3) * sd + (off_m, 0.0, 0.0)
     lat, lon, up = (float(x) for x in place + noise / runs.metres(place[0], place[2]))
-    return PositionAid(source, t_ns, 1 - 1e-9, lat, lon, up, (sd, sd, sd), (0.0, 0.0, -1.0))
+    return PositionMeasurement(source, t_ns, 1 - 1e-9, lat, lon, up, (sd, sd, sd), (0.0, 0.0, -1.0))
 
 
 def drive(
@@ -42,8 +42,8 @@ def drive(
     off_m: float = 0.0,
     off_from_s: float = math.inf,
 ) -> None:
-    """Each estimator through the same town, with the aids of the sources named; the fine device is
-    off by `off_m` north from `off_from_s`."""
+    """Each estimator through the same town, with the measurements of the sources named; the fine
+    device is off by `off_m` north from `off_from_s`."""
     truth = runs.town_truth(SECONDS, IMU.rate_hz)
     imu = runs.imu_run(IMU, truth, 5)
     buffer = runs.filled_buffer(IMU, runs.sample_times(truth), imu.samples)
@@ -56,20 +56,22 @@ def drive(
         t_ns = second * runs.SECOND
         states = truth.at(np.array([float(second)]))
         off = off_m if second >= off_from_s else 0.0
-        aids: list[PositionAid | VelocityAid] = [fix("fine", t_ns, states.position[0], rng, off)]
+        measurements: list[PositionMeasurement | VelocityMeasurement] = [
+            fix("fine", t_ns, states.position[0], rng, off)
+        ]
         n, e, d = (float(x) for x in states.v_ned[0] + 0.1 * rng.standard_normal(3))
-        aids.append(
-            VelocityAid(
+        measurements.append(
+            VelocityMeasurement(
                 "fine_velocity", t_ns, 1 - 1e-9, (n, e, d), (0.1, 0.1, 0.1), (0.0, 0.0, -1.0)
             )
         )
         if second % 5 == 0:
-            aids.append(fix("coarse", t_ns, states.position[0], rng))
+            measurements.append(fix("coarse", t_ns, states.position[0], rng))
         for estimator, sources in estimators.values():
             estimator.propagate(buffer, t_ns)
-            for aid in aids:
-                if aid.source.split("_")[0] in sources:
-                    assert estimator.update(aid).name in ("fused", "gated")
+            for measurement in measurements:
+                if measurement.source.split("_")[0] in sources:
+                    assert estimator.update(measurement).name in ("fused", "gated")
 
 
 def kalman() -> KalmanEstimator:
@@ -136,19 +138,19 @@ def test_separations_spread_as_the_covariances_say() -> None:
 def test_held_back_and_restored_it_is_the_same() -> None:
     rng = np.random.default_rng(8)
     place, sd = np.array(runs.ORIGIN), INITIAL
-    aids = [fix(source, 0, place, rng) for source in DEVICES]
+    measurements = [fix(source, 0, place, rng) for source in DEVICES]
     ends = []
     for held in (False, True):
         estimator = SeparatedEstimator(MODEL, IMU.gap_s, DEVICES)
         nav = runs.level_nav((0.0, 0.0, 0.3), (0.0, 0.0, 0.0))
         estimator.initialise(0, 0, nav, np.zeros(MODEL.size), np.diag(sd**2))
         before = estimator.snapshot()
-        estimator.update(aids[0])
+        estimator.update(measurements[0])
         estimator.restore(before)
         if held:
             estimator.hold()
-        for aid in aids:
-            estimator.update(aid)
+        for measurement in measurements:
+            estimator.update(measurement)
         estimator.release()
         ends.append((estimator.nav.copy(), estimator.separations().copy()))
     assert np.abs(runs.nav_error(ends[0][0], ends[1][0])[6:9]).max() < 1e-3

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -55,9 +55,9 @@ def _driven(turn_deg: float) -> tuple[KalmanEstimator, list[int], list[int]]:
         north, east, down = moving[k].tolist()
         v = north, east, down
         filter_.update(
-            VelocityAid("velocity", t_ns, 1.0, v, VELOCITY_SD_M_S, ARM, rest=ANTENNA_LEVER)
+            VelocityMeasurement("velocity", t_ns, 1.0, v, VELOCITY_SD_M_S, ARM, rest=ANTENNA_LEVER)
         )
-        filter_.update(NonHolonomicAid("slip", t_ns, 1.0, SLIP_SD_M_S, 0.05, 2.0, ARM))
+        filter_.update(NonHolonomicConstraint("slip", t_ns, 1.0, SLIP_SD_M_S, 0.05, 2.0, ARM))
     lever, axle = MODEL.slots_of(ANTENNA_LEVER), MODEL.slots_of(AXLE_LEVER)
     return filter_, list(lever), list(axle)
 

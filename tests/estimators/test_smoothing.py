@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Linearised
+from fusiond.aiding.base import AidingMeasurement, Linearised
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.published_state import Published
@@ -89,9 +89,9 @@ class Logging(TapedKalman):
         super()._carry_over(before)
         self.prior = self.covariance.copy()
 
-    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
+    def _fold_in(self, measurement: Linearised, noise: Array) -> Outcome:
         offsets = self.model.slots_of("clock_offset")
-        outcome = super()._fold_in(aid, noise)
+        outcome = super()._fold_in(measurement, noise)
         if offsets and self._phi[offsets[0]].any() == 0:  # the clock started anew
             self.prior = self._before[: self.model.size, : self.model.size].copy()
         return outcome
@@ -123,14 +123,23 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     """Bryson-Frazier against Rauch-Tung-Striebel, written with dense matrices."""
     jumps = kind == "clock that jumps"
     name = "ins23" if jumps else "ins21"
-    _, buffer, aids, start, _ = town_drive.drive()
+    _, buffer, measurements, start, _ = town_drive.drive()
     if jumps:
-        aids = ranges(aids, jump_at=20)
+        measurements = ranges(measurements, jump_at=20)
     if kind == "robust":
-        aids = [[replace(cast("Aid", aid), robust=True) for aid in epoch] for epoch in aids]
+        measurements = [
+            [replace(cast("AidingMeasurement", measurement), robust=True) for measurement in epoch]
+            for epoch in measurements
+        ]
     unknown = []
     if kind == "lever arm":
-        aids = [[replace(cast("Aid", aid), rest=ANTENNA_LEVER) for aid in epoch] for epoch in aids]
+        measurements = [
+            [
+                replace(cast("AidingMeasurement", measurement), rest=ANTENNA_LEVER)
+                for measurement in epoch
+            ]
+            for epoch in measurements
+        ]
         unknown = [antenna_lever(ANTENNA_LEVER, 1.0)]
     model = make_model(name, imu_noise(town_drive.IMU), *unknown)
     estimator = Logging(model, town_drive.IMU.gap_s)
@@ -138,8 +147,8 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     yaw_deg = 4.0 if kind == "poor heading" else 2.0
     sd[:9] = np.r_[np.radians([0.3, 0.3, yaw_deg]), [0.2] * 3, [3.0] * 3]
     estimator.initialise(0, 0, start, np.zeros(model.size), np.diag(sd**2))
-    town_drive.run(estimator, buffer, aids)
-    estimator.propagate(buffer, aids[-1][0].t_ns + 100_000_000)
+    town_drive.run(estimator, buffer, measurements)
+    estimator.propagate(buffer, measurements[-1][0].t_ns + 100_000_000)
     assert estimator.newest is not None
     nodes, _ = nodes_of(estimator.newest, None, NEVER)
     estimator.end()
@@ -163,12 +172,12 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
 
 def test_a_tape_changes_nothing() -> None:
     """The filter with a tape is the one without, to the bit, though it stops at more instants."""
-    model, buffer, aids, start, sd = town_drive.drive()
+    model, buffer, measurements, start, sd = town_drive.drive()
     plain = TiltAxesFilter(model, town_drive.IMU.gap_s)
     taped = TapedKalman(model, town_drive.IMU.gap_s)
     for estimator in (plain, taped):
         town_drive.begun(estimator, start, sd)
-        town_drive.run(estimator, buffer, aids)
+        town_drive.run(estimator, buffer, measurements)
     assert np.array_equal(plain.nav, taped.nav)
     assert np.array_equal(plain.xi, taped.xi)
     assert np.array_equal(plain.covariance, taped.covariance)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.invariant import InvariantFilter
@@ -74,7 +74,7 @@ def test_a_turned_heading_leaves_what_tilt_and_bias_make_together(
     for off in (1.0, -4.0 / 3.0, 5.0 / 3.0):
         f.covariance[2, 2] = sd**2
         yaw = math.radians(yaw_deg) + off * sd
-        assert f.update(HeadingAid("compass", 0, 0.9999, yaw, sd)).name == "fused"
+        assert f.update(HeadingMeasurement("compass", 0, 0.9999, yaw, sd)).name == "fused"
         known = _sensed(f) @ f.covariance @ _sensed(f).T
         assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
         assert np.sqrt(np.diag(f.covariance)[12:14]) == pytest.approx(force_sd, rel=0.01)
@@ -89,8 +89,10 @@ def test_a_corrected_tilt_leaves_what_the_biases_make_downward(turns: bool) -> N
     f = _straight_on(0.3)
     f.turns = turns
     level = math.radians(2.0)
-    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
-    assert f.update(aid).name == "fused"
+    measurement = AttitudeMeasurement(
+        "attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0)
+    )
+    assert f.update(measurement).name == "fused"
     known = _sensed(f) @ f.covariance @ _sensed(f).T
     assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
 
@@ -102,8 +104,10 @@ def test_a_corrected_tilt_does_not_move_the_vehicle_downward(turns: bool) -> Non
     f = _straight_on(0.3, math.radians(1.0), LOOSE_FORCE_M_S2)
     f.turns = turns
     level = math.radians(3.0)
-    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
-    assert f.update(aid).name == "fused"
+    measurement = AttitudeMeasurement(
+        "attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0)
+    )
+    assert f.update(measurement).name == "fused"
     attitude = dcm_from_quaternion(f.nav[6:])
     assert math.degrees(rpy_from_dcm(attitude)[0]) > 2.5
     sensed = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
@@ -117,8 +121,10 @@ def test_a_tilt_that_is_corrected_alone_leaves_the_biases(turns: bool) -> None:
     f.covariance[PHI : PHI + 2, PHI : PHI + 2] += 0.03**2 * np.eye(2)
     f.turns = turns
     level = math.radians(3.0)
-    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
-    assert f.update(aid).name == "fused"
+    measurement = AttitudeMeasurement(
+        "attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0)
+    )
+    assert f.update(measurement).name == "fused"
     assert math.degrees(rpy_from_dcm(dcm_from_quaternion(f.nav[6:]))[0]) > 2.5
     assert np.abs(f.xi[12:15]).max() < 1e-3
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.covariance import mirror
@@ -88,9 +88,11 @@ def _nees(kind: type[KalmanEstimator], number: int) -> tuple[float, float]:
         lat, lon, height = true.position[k] + rng.standard_normal(3) * FIX_SD_M / to_metres
         north, east, down = true.v_ned[k] + rng.standard_normal(3) * VELOCITY_SD_M_S
         sd_v, sd_p = (VELOCITY_SD_M_S,) * 3, (FIX_SD_M,) * 3
-        filter_.update(NonHolonomicAid("slip", t_ns, 1.0, SLIP_SD_M_S, SLIP_SD_M_S, 1.0, REST))
-        filter_.update(VelocityAid("velocity", t_ns, 1.0, (north, east, down), sd_v, REST))
-        filter_.update(PositionAid("fix", t_ns, 1.0, lat, lon, height, sd_p, REST))
+        filter_.update(
+            NonHolonomicConstraint("slip", t_ns, 1.0, SLIP_SD_M_S, SLIP_SD_M_S, 1.0, REST)
+        )
+        filter_.update(VelocityMeasurement("velocity", t_ns, 1.0, (north, east, down), sd_v, REST))
+        filter_.update(PositionMeasurement("fix", t_ns, 1.0, lat, lon, height, sd_p, REST))
     end_s = SECONDS - 0.5
     filter_.propagate(imu, round(end_s * 1e9))
     left = nav_error(filter_.nav, true_nav(truth, np.array([end_s]))[0])
@@ -213,9 +215,9 @@ def test_a_parked_vehicle_is_told_nothing_of_its_tilt(turns: bool) -> None:
     for t_s in range(1, seconds):
         rest = runs.rest(mean_rate=(still[0], still[1], still[2]), end_s=t_s)
         t_ns, gyros = t_s * runs.SECOND, (still[0], still[1], still[2])
-        timeline.insert(ZeroRateAid("rate", t_ns, 0.9999, gyros, math.radians(0.1), rest))
-        timeline.insert(ZeroVelocityAid("velocity", t_ns, 0.9999, 0.05, rest))
-    timeline.run()
+        timeline.insert(ZeroAngularRateUpdate("rate", t_ns, 0.9999, gyros, math.radians(0.1), rest))
+        timeline.insert(ZeroVelocityUpdate("velocity", t_ns, 0.9999, 0.05, rest))
+    timeline.advance()
     print(sigmas[59], sigmas[-1])
     assert (sigmas[59] > 2.0).all()
     assert (sigmas[-1] > 0.9 * sigmas[59]).all()
@@ -272,6 +274,6 @@ def test_rest_that_is_refused_ends_at_once() -> None:
     timeline.start()
     for t_s, most_m_s in ((1, 0.5), (2, -1.0)):
         rest = runs.rest(max_speed_m_s=most_m_s, end_s=t_s)
-        timeline.insert(ZeroVelocityAid("rest", t_s * runs.SECOND, 0.9999, 0.05, rest))
-    timeline.run()
+        timeline.insert(ZeroVelocityUpdate("rest", t_s * runs.SECOND, 0.9999, 0.05, rest))
+    timeline.advance()
     assert left == [1.5, 0.0]

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.attitude import HeadingMeasurement
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
@@ -26,7 +26,7 @@ from tests.estimators.side_by_side import (
     MODELS,
     NO_LEVER,
     compare,
-    linear_aids,
+    linear_measurements,
     pair_of,
 )
 
@@ -35,15 +35,15 @@ Array = NDArray[np.float64]
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("holding", [False, True])
-def test_linear_aids_as_the_extended_filter_to_rounding(name: str, holding: bool) -> None:
+def test_linear_measurements_as_the_extended_filter_to_rounding(name: str, holding: bool) -> None:
     """Position without a lever arm and velocity. What is left is the curve of the Earth over a few
     sigmas (20 m / R = 3e-6) and the resolution of a latitude (1e-9 m)."""
     extended, unscented = pair_of(name)
     if holding:
         extended.hold()
         unscented.hold()
-    for aid in linear_aids(not extended.model.hold_height):
-        a, b = extended.update(aid), unscented.update(aid)
+    for measurement in linear_measurements(not extended.model.hold_height):
+        a, b = extended.update(measurement), unscented.update(measurement)
         assert (a.name, b.name) == ("fused", "fused")
         assert b.nis == pytest.approx(a.nis, rel=1e-5)
     if holding:
@@ -54,7 +54,7 @@ def test_linear_aids_as_the_extended_filter_to_rounding(name: str, holding: bool
 
 
 @immutable()
-class _Square(Aid):
+class _Square(AidingMeasurement):
     """y = (v_n - v0)^2 + v_e + noise, at the computed v_n = v0: all that EKF sees is v_e."""
 
     v_n: float
@@ -95,10 +95,12 @@ def test_gain_and_covariance_of_the_textbook_transform(holding: bool) -> None:
     K = P_xz S^-1, P - K S K^T."""
     _, u = pair_of("ins15", p_scale=8.0)
     lat, lon, up = runs.ORIGIN
-    aid = PositionAid("gnss", 0, GATE, lat, lon, up, (0.3, 0.3, 0.3), (30.0, -10.0, -5.0))
+    measurement = PositionMeasurement(
+        "gnss", 0, GATE, lat, lon, up, (0.3, 0.3, 0.3), (30.0, -10.0, -5.0)
+    )
     if holding:
         u.hold()
-        u.update(VelocityAid("velocity", 0, GATE, (12.5, -7.2, 0.9), (1.0,) * 3, NO_LEVER))
+        u.update(VelocityMeasurement("velocity", 0, GATE, (12.5, -7.2, 0.9), (1.0,) * 3, NO_LEVER))
     dx, cov = u._dxs[0].copy(), u.covariance.copy()
     slots = np.flatnonzero(np.r_[np.ones(3), np.zeros(3), np.ones(3), np.zeros(6)])
     root = np.linalg.cholesky(cov[np.ix_(slots, slots)])
@@ -111,7 +113,7 @@ def test_gain_and_covariance_of_the_textbook_transform(holding: bool) -> None:
         error[slots] += delta
         at = u.nav.copy()
         feed_back(at, np.zeros(u.model.size), error)
-        found = aid.innovation(State(at, u.xi, u.step, u.model))
+        found = measurement.innovation(State(at, u.xi, u.step, u.model))
         assert isinstance(found, Innovation)
         explained.append(-found.z)
     g = np.array(explained)
@@ -127,7 +129,7 @@ def test_gain_and_covariance_of_the_textbook_transform(holding: bool) -> None:
     expected_dx = dx + gain @ (-mean)
     expected = cov - gain @ s @ gain.T
     nav, xi = u.nav.copy(), u.xi.copy()
-    outcome = u.update(aid)
+    outcome = u.update(measurement)
     assert outcome.name == "fused"
     assert outcome.nis == pytest.approx(mean @ np.linalg.solve(s, mean), rel=1e-6)
     if holding:
@@ -150,7 +152,7 @@ def test_a_heading_is_the_same_across_the_turn() -> None:
         for f in (u, e):
             nav = runs.level_nav((0.0, 0.0, 0.3 + off), (1.0, 0.0, 0.0))
             f.initialise(0, 0, nav, np.zeros(model.size), p)
-            heading = HeadingAid("h", 0, GATE, 0.3, 0.3)
+            heading = HeadingMeasurement("h", 0, GATE, 0.3, 0.3)
             if f.update(heading).name == "gated":
                 f.covariance[2, 2] += 3.1**2
                 assert f.update(heading).name == "fused"
@@ -187,7 +189,7 @@ def test_rows_judged_one_by_one_stay_apart_with_no_less_noise() -> None:
 
 
 @immutable()
-class _OnlyNorth(Aid):
+class _OnlyNorth(AidingMeasurement):
     """Holds only where the true velocity may be above what is computed."""
 
     v_n: float
@@ -200,7 +202,7 @@ class _OnlyNorth(Aid):
         return Innovation(np.array([state.nav[3] - 12.3]), h, np.array([0.01]))
 
 
-def test_where_an_aid_does_not_hold_at_a_point_the_jacobian_serves() -> None:
+def test_where_a_measurement_does_not_hold_at_a_point_the_jacobian_serves() -> None:
     extended, unscented = pair_of("ins15")
     for f in (extended, unscented):
         assert f.update(_OnlyNorth("north", 0, GATE, 12.0)).name == "fused"
@@ -216,6 +218,6 @@ def test_states_without_variance_take_no_part() -> None:
         p[7], p[:, 7] = 2.0 * p[8], 2.0 * p[:, 8]
         p[7, 7] = 4.0 * p[8, 8]
         f.initialise(0, 0, f.nav.copy(), f.xi.copy(), p)
-        for aid in linear_aids(True):
-            assert f.update(aid).name == "fused"
+        for measurement in linear_measurements(True):
+            assert f.update(measurement).name == "fused"
     compare(extended, unscented, 1e-4, 1e-5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -30,7 +30,7 @@ from tests.estimators.side_by_side import (
     MODELS,
     NO_LEVER,
     compare,
-    linear_aids,
+    linear_measurements,
     pair_of,
 )
 from tests.navigator import vehicle
@@ -57,7 +57,7 @@ def test_propagation_as_the_extended_filter_while_errors_are_small(
         f.initialise(0, 0, f.nav.copy(), xi, f.covariance.copy())
         if holding:
             f.hold()
-            f.update(linear_aids(not f.model.hold_height)[1])
+            f.update(linear_measurements(not f.model.hold_height)[1])
         f.propagate(runs.filled_buffer(IMU, times, samples), int(times[-1]) - 7_000_000)
         assert f.t_ns == int(times[-1]) - 7_000_000
     if holding:
@@ -170,8 +170,8 @@ def test_a_rewind_gives_the_bits_of_arrival_in_order(propagation: bool) -> None:
     times, samples = _buffer(12.0)
     truth = runs.town_truth(12.0, IMU.rate_hz)
     navs = runs.true_nav(truth, np.arange(1.0, 12.0))
-    aids = [
-        PositionAid(
+    measurements = [
+        PositionMeasurement(
             "gnss",
             k * runs.SECOND - 3_000_000,
             GATE,
@@ -192,14 +192,14 @@ def test_a_rewind_gives_the_bits_of_arrival_in_order(propagation: bool) -> None:
         u.initialise(0, 0, nav, np.zeros(model.size), np.diag(sd**2))
         timeline = Timeline(u, runs.filled_buffer(IMU, times, samples), 15.0, 0.5)
         timeline.start()
-        for aid in aids[:5] + aids[6:] if late else aids:
-            timeline.insert(aid)
-        timeline.run()
+        for measurement in measurements[:5] + measurements[6:] if late else measurements:
+            timeline.insert(measurement)
+        timeline.advance()
         if late:
-            timeline.insert(aids[5])
-            timeline.run()
+            timeline.insert(measurements[5])
+            timeline.advance()
             assert timeline.counters.rewinds == 1
-        assert timeline.counters.outcomes["gnss"]["fused"] >= len(aids)
+        assert timeline.counters.outcomes["gnss"]["fused"] >= len(measurements)
         ends.append((u.nav.copy(), u.covariance.copy(), u.xi.copy()))
     for a, b in zip(*ends, strict=True):
         assert np.array_equal(a, b)
@@ -255,9 +255,11 @@ def _nees(unscented: bool, count: int, heading_deg: float) -> float:
         for t_s, nav in zip(fixes_s, true_at[1:], strict=True):
             scale = runs.metres(float(nav[0]), float(nav[2]))
             lat, lon, up = (float(x) for x in nav[:3] + 2.0 * rng.standard_normal(3) / scale)
-            aid = PositionAid("gnss", round(t_s * 1e9), GATE, lat, lon, up, (2.0,) * 3, NO_LEVER)
-            f.propagate(buffer, aid.t_ns)
-            f.update(aid)
+            measurement = PositionMeasurement(
+                "gnss", round(t_s * 1e9), GATE, lat, lon, up, (2.0,) * 3, NO_LEVER
+            )
+            f.propagate(buffer, measurement.t_ns)
+            f.update(measurement)
         error = runs.nav_error(f.nav, true_at[-1])
         total += float(error @ np.linalg.solve(f.covariance[:9, :9], error))
     return total / count

@@ -13,7 +13,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import FIX_WANDER
+from fusiond.models.vehicle import FIX_MARKOV
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.imu_truth import Truth
@@ -91,11 +91,11 @@ def _nees(seed: int, lasts_s: float) -> tuple[float, float]:
             v_ned_m_s=(north, east, down),
             sd_v_ned_m_s=(VELOCITY_SD_M_S,) * 3,
         )
-        aids = intake.aids(fix, t_ns, 0.0)
-        assert not isinstance(aids, str)
+        measurements = intake.measurements_of(fix, t_ns, 0.0)
+        assert not isinstance(measurements, str)
         filter_.propagate(imu, t_ns)
-        for aid in aids:
-            filter_.update(aid)
+        for measurement in measurements:
+            filter_.update(measurement)
         if t > SECONDS - 60.0 and k % 50 == 0:
             off = nav_error(filter_.nav, true_nav(truth, np.array([t]))[0])
             p = filter_.covariance
@@ -105,7 +105,7 @@ def _nees(seed: int, lasts_s: float) -> tuple[float, float]:
                     for part in (slice(6, 8), slice(3, 5))
                 ]
             )
-    assert model.slots_of(FIX_WANDER)
+    assert model.slots_of(FIX_MARKOV)
     position, velocity = np.mean(found, axis=0)
     return float(position), float(velocity)
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -42,22 +42,22 @@ def drive(
     model = make_model("ins15", imu_noise(IMU))
     t_s = np.arange(0.303, SECONDS, 1.0)
     states = truth.at(t_s, LEVER)
-    aids: list[list[Linearised]] = []
+    measurements: list[list[Linearised]] = []
     for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
         off = noise * rng.standard_normal(3) * SD / runs.metres(float(p[0]), float(p[2]))
         lat, lon, height = (float(x) for x in p + off)
         n, e, d = (float(x) for x in v + noise * rng.standard_normal(3) * SD_V)
         t_ns = round(t * 1e9)
-        aids.append(
+        measurements.append(
             [
-                PositionAid("gnss", t_ns, 1 - 1e-9, lat, lon, height, SD, LEVER),
-                VelocityAid("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), SD_V, LEVER),
+                PositionMeasurement("gnss", t_ns, 1 - 1e-9, lat, lon, height, SD, LEVER),
+                VelocityMeasurement("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), SD_V, LEVER),
             ]
         )
     sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
     start = runs.true_nav(truth, np.array([0.0]))[0]
     start = runs.with_error(start, noise * sd[:9] * rng.standard_normal(9))
-    return model, buffer, aids, start, sd
+    return model, buffer, measurements, start, sd
 
 
 Either = KalmanEstimator | MultiscaleEstimator
@@ -67,8 +67,8 @@ def begun(estimator: Either, start: Array, sd: Array) -> None:
     estimator.initialise(0, 0, start, np.zeros(len(sd)), np.diag(sd**2))
 
 
-def run(estimator: Either, buffer: ImuBuffer, aids: Sequence[Sequence[Linearised]]) -> None:
-    for epoch in aids:
+def run(estimator: Either, buffer: ImuBuffer, measurements: Sequence[Sequence[Linearised]]) -> None:
+    for epoch in measurements:
         estimator.propagate(buffer, epoch[0].t_ns)
-        for aid in epoch:
-            assert estimator.update(aid).name == "fused"
+        for measurement in epoch:
+            assert estimator.update(measurement).name == "fused"

@@ -1,4 +1,5 @@
-"""What is given in the place of a receiver's log is named by every kind of aid that reads one."""
+"""What is given in the place of a receiver's log is named by every kind of measurement that reads
+one."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.file_kind import kind_of
 from fusiond.files.tables import ImuTable
-from fusiond.offline.aid_files import READERS
+from fusiond.offline.measurement_files import READERS
 from fusiond.offline.nmea_file import read_nmea, receiver_of
 from fusiond.offline.receiver_logs import read_solutions
 

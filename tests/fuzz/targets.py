@@ -196,7 +196,7 @@ def words(data: bytes) -> None:
         head = bytes((gnss, prn, sig, 0, len(made), 3, 2, 0))
         frame = Frame("ubx", _SFRBX + head + struct.pack(f"<{len(made)}I", *made) + b"\0\0")
         before = decoder.counters.total()
-        events = decoder.take(frame, 7)
+        events = decoder.decode(frame, 7)
         assert decoder.counters.total() == before + 1 + len(events)
         _check_raw(events)
 

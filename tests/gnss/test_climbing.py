@@ -13,7 +13,7 @@ from fusiond.demo.papers import PAPERS, settings
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.gnss.atmosphere import slant, zenith_delays
 from fusiond.gnss.climbing import take_off_climb
-from fusiond.gnss.range_kernel import AID_ROWS, CARRIER_RATE, TROPOSPHERE_SIGMA
+from fusiond.gnss.range_kernel import CARRIER_RATE, RANGE_VALUES, TROPOSPHERE_SIGMA
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 
@@ -28,7 +28,7 @@ def test_the_rate_of_the_delay_is_taken_off() -> None:
         sum(zenith_delays(LAT_RAD, HEIGHT_M + sign * 0.5 * CLIMB_M_S * SPAN_S))
         for sign in (-1.0, 1.0)
     )
-    values = np.zeros((AID_ROWS, 4))
+    values = np.zeros((RANGE_VALUES, 4))
     values[CARRIER_RATE] = mapping * (after - before) / SPAN_S
     values[TROPOSPHERE_SIGMA] = 0.12 * mapping
     assert values[CARRIER_RATE, 0] < -0.012
@@ -37,7 +37,7 @@ def test_the_rate_of_the_delay_is_taken_off() -> None:
 
 
 def test_a_rate_that_was_not_measured_stays_so() -> None:
-    values = np.zeros((AID_ROWS, 1))
+    values = np.zeros((RANGE_VALUES, 1))
     values[CARRIER_RATE], values[TROPOSPHERE_SIGMA] = math.nan, 0.12
     take_off_climb(values, LAT_RAD, HEIGHT_M, CLIMB_M_S)
     assert math.isnan(values[CARRIER_RATE, 0])
@@ -50,8 +50,12 @@ def test_an_aircraft_that_climbs_knows_its_vertical_velocity(tmp_path: Path) -> 
     config = Config.model_validate(found)
     scenario = paper.scenario().fitted(config)
     files = simulate(scenario, tmp_path, seed=1, duration_s=110.0, gnss_raw="ubx").files
-    aids = [("raw", files["raw"]), ("attitude", files["attitude"]), ("bearing", files["bearing"])]
-    process(config, files["imu"], aids, out=tmp_path / "nav.csv")
+    measurements = [
+        ("raw", files["raw"]),
+        ("attitude", files["attitude"]),
+        ("bearing", files["bearing"]),
+    ]
+    process(config, files["imu"], measurements, out=tmp_path / "nav.csv")
     nav, truth = read_solution(tmp_path / "nav.csv"), read_truth(files["truth"])
     later = nav.t_s > 70.0
     down = np.interp(nav.t_s, truth.t_s, truth.v[:, 2])

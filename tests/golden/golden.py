@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fusiond.recording.edit import merge
-from fusiond.replay.run import SOLUTION, Wish, replay
+from fusiond.replay.run import SOLUTION, ReplayOptions, replay
 from tests.golden.recorded import Bus, Walk
 from tests.recording.driven import Drive
 from tests.recording.rig import Rig
@@ -40,7 +40,7 @@ EVERY_S = 1.0
 def solution(logs: Sequence[Path]) -> list[dict[str, str]]:
     """The solution of a log once a second, as `solution.csv` has it."""
     with TemporaryDirectory() as folder:
-        replay(logs, Wish(settings=("mqtt.enabled=false",), out=Path(folder)))
+        replay(logs, ReplayOptions(settings=("mqtt.enabled=false",), out=Path(folder)))
         with (Path(folder) / SOLUTION).open(newline="") as file:
             rows = list(csv.DictReader(file))
     first_s = float(rows[0]["t_s"])

@@ -30,12 +30,12 @@ def check(folder: Path) -> None:
     # Not where the drive is only watched: navigation takes seconds to load there.
     from fusiond.recording.info import info  # noqa: PLC0415
     from fusiond.recording.reader import Log  # noqa: PLC0415
-    from fusiond.replay.run import Wish, replay  # noqa: PLC0415
+    from fusiond.replay.run import ReplayOptions, replay  # noqa: PLC0415
 
     parts = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
     assert len(parts) == 2, parts
     for path in parts:
-        found = replay([path], Wish())
+        found = replay([path], ReplayOptions())
         assert found["identical"] is True, found["first_difference"]
         assert found["problems"] == found["driver_faults"] == []
         ticks, speed = found["compared"], found["times_real_time"]

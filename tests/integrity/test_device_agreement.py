@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.integrity.device_agreement import Agreement
 from tests import runs
 
@@ -36,10 +36,12 @@ def after(
         sd = (SD_M,) * 3
         v_n, v_e = np.array(told or speed) + SD_M_S * rng.standard_normal(2)
         v = (float(v_n), float(v_e), 0.0)
-        found = found.with_aid(
-            VelocityAid("gnss_velocity", t_ns, 0.9999, v, (SD_M_S,) * 3, LEVER)
-        ).with_aid(
-            PositionAid("gnss", t_ns, 0.9999, lat0 + float(north), float(lon), 0.0, sd, LEVER)
+        found = found.with_measurement(
+            VelocityMeasurement("gnss_velocity", t_ns, 0.9999, v, (SD_M_S,) * 3, LEVER)
+        ).with_measurement(
+            PositionMeasurement(
+                "gnss", t_ns, 0.9999, lat0 + float(north), float(lon), 0.0, sd, LEVER
+            )
         )
     return found
 
@@ -67,5 +69,7 @@ def test_fixes_far_apart_say_nothing() -> None:
 def test_what_comes_twice_or_late_is_not_counted_again() -> None:
     once = after(10)
     assert once.position is not None
-    same = PositionAid("gnss", once.position.t_ns, 0.9999, 0.53, 2.0, 0.0, (SD_M,) * 3, LEVER)
-    assert once.with_aid(same).lasted_ns == once.lasted_ns
+    same = PositionMeasurement(
+        "gnss", once.position.t_ns, 0.9999, 0.53, 2.0, 0.0, (SD_M,) * 3, LEVER
+    )
+    assert once.with_measurement(same).lasted_ns == once.lasted_ns

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import (
@@ -28,14 +28,16 @@ def series() -> Series:
     return Series.of(position(0, 0.0))
 
 
-def position(t_s: float, north_m: float) -> PositionAid:
+def position(t_s: float, north_m: float) -> PositionMeasurement:
     lat = 0.5 + north_m / meridian_radius(0.5)
-    return PositionAid("gnss", round(t_s * S), GATE, lat, 2.0, 50.0, (1.5,) * 3, (0.0,) * 3)
+    return PositionMeasurement("gnss", round(t_s * S), GATE, lat, 2.0, 50.0, (1.5,) * 3, (0.0,) * 3)
 
 
-def velocity(t_s: float, north_m_s: float) -> VelocityAid:
+def velocity(t_s: float, north_m_s: float) -> VelocityMeasurement:
     at = round(t_s * S)
-    return VelocityAid("gnss_velocity", at, GATE, (north_m_s, 0.0, 0.0), (0.1,) * 3, (0.0,) * 3)
+    return VelocityMeasurement(
+        "gnss_velocity", at, GATE, (north_m_s, 0.0, 0.0), (0.1,) * 3, (0.0,) * 3
+    )
 
 
 def test_one_failure_is_a_suspicion_that_a_pass_ends() -> None:
@@ -95,7 +97,7 @@ def test_on_probation_one_failure_ends_service() -> None:
 def test_time_alone_readmits_nothing() -> None:
     one = series()
     one.exclude(0, "gnss position is off")
-    one.hear(3600 * S)
+    one.received(3600 * S)
     assert one.out
 
 
@@ -123,10 +125,10 @@ def test_nothing_says_endlessly_that_a_fault_is_over() -> None:
 
 def test_what_was_not_heard_of_for_long_is_judged_anew() -> None:
     one = series()
-    one.hear(S)
+    one.received(S)
     one.gated(S, explained=False)
     one.gated(2 * S, explained=False)
-    one.hear(2 * S + FORGET_NS)
+    one.received(2 * S + FORGET_NS)
     assert one.state is Service.NOMINAL
     one.gated(2 * S + FORGET_NS, explained=False)
     assert not one.out
@@ -151,15 +153,17 @@ def test_a_copy_is_its_own() -> None:
 def test_a_device_that_goes_the_way_it_says_fits_itself() -> None:
     agreement = Agreement()
     for second in range(8):
-        agreement = agreement.with_aid(position(second, 10.0 * second))
-        agreement = agreement.with_aid(velocity(second, 10.0))
+        agreement = agreement.with_measurement(position(second, 10.0 * second))
+        agreement = agreement.with_measurement(velocity(second, 10.0))
     assert agreement.lasted_ns == 7 * S
 
 
 def test_one_that_stands_and_says_that_it_moves_does_not() -> None:
     agreement = Agreement()
     for second in range(8):
-        agreement = agreement.with_aid(position(second, 0.0)).with_aid(velocity(second, 10.0))
+        agreement = agreement.with_measurement(position(second, 0.0)).with_measurement(
+            velocity(second, 10.0)
+        )
     assert agreement.lasted_ns == 0
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusiond.aiding.base import Aid
-from fusiond.aiding.height import HeightAid
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.height import HeightMeasurement
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.pseudorange import RANGE_BIAS
-from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
+from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
@@ -24,12 +24,12 @@ NO_LEVER = 0.0, 0.0, 0.0
 CAR = {"imu": {"axes": ["+x", "-y", "-z"], "rate_hz": 100.0}}
 
 
-def _fix(bias: tuple[str, ...]) -> PositionAid:
-    return PositionAid("gnss", 0, 0.9999, *HERE, SD, NO_LEVER, bias=bias)
+def _fix(bias: tuple[str, ...]) -> PositionMeasurement:
+    return PositionMeasurement("gnss", 0, 0.9999, *HERE, SD, NO_LEVER, bias=bias)
 
 
-def _rdss() -> RdssPositionAid:
-    return RdssPositionAid("rdss", 0, 0.9999, *HERE[:2], (400.0, 0.0, 400.0), NO_LEVER)
+def _rdss() -> RdssPositionMeasurement:
+    return RdssPositionMeasurement("rdss", 0, 0.9999, *HERE[:2], (400.0, 0.0, 400.0), NO_LEVER)
 
 
 def _verdicts(*blocks: str) -> tuple[Verdicts, list[tuple[str, str]]]:
@@ -42,10 +42,10 @@ def _verdicts(*blocks: str) -> tuple[Verdicts, list[tuple[str, str]]]:
     return Verdicts(50, 0.01, model, lambda source, verdict: told.append((source, verdict))), told
 
 
-def _hear(verdicts: Verdicts, aid: Aid, sd: float, rows: int = 2) -> None:
+def _hear(verdicts: Verdicts, measurement: AidingMeasurement, sd: float, rows: int = 2) -> None:
     for z in sd * np.random.default_rng(5).standard_normal((150, rows)):
-        verdicts.judge(aid, Outcome("fused", float(z @ z), rows, tuple(z.tolist())))
-    verdicts.tell()
+        verdicts.judge(measurement, Outcome("fused", float(z @ z), rows, tuple(z.tolist())))
+    verdicts.report()
 
 
 def test_small_innovations_of_fixes_that_share_an_error_tell_nothing_of_sigma() -> None:
@@ -66,7 +66,9 @@ def test_small_innovations_of_errors_that_are_white_are_pessimistic() -> None:
     assert verdicts.reports()["gnss"].verdict == "pessimistic"
 
 
-def test_an_aid_that_could_share_an_error_of_which_the_model_has_no_state_is_judged() -> None:
+def test_a_measurement_that_could_share_an_error_of_which_the_model_has_no_state_is_judged() -> (
+    None
+):
     verdicts, told = _verdicts()
     _hear(verdicts, _rdss(), 0.3)
     assert told == [("rdss", "pessimistic")]
@@ -82,8 +84,8 @@ def test_what_is_shared_does_not_excuse_innovations_that_are_too_large() -> None
 @pytest.mark.parametrize("sd", [0.2, 0.4])
 def test_a_height_that_came_with_a_fix_shares_what_the_fix_does(sd: float) -> None:
     verdicts, told = _verdicts(BIAS_BLOCK)
-    _hear(verdicts, HeightAid("rdss_height", 0, 0.9999, 40.0, 30.0, (BIAS_BLOCK,)), sd, 1)
-    _hear(verdicts, HeightAid("barometer", 0, 0.9999, 40.0, 30.0), sd, 1)
+    _hear(verdicts, HeightMeasurement("rdss_height", 0, 0.9999, 40.0, 30.0, (BIAS_BLOCK,)), sd, 1)
+    _hear(verdicts, HeightMeasurement("barometer", 0, 0.9999, 40.0, 30.0), sd, 1)
     assert told == [("rdss_height", "cannot_tell"), ("barometer", "pessimistic")]
 
 

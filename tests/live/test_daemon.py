@@ -18,7 +18,7 @@ import pytest
 from drivers.can.imu import CanImuOptions
 from drivers.nmea.driver import NmeaDriver
 from fusiond.configuration.load import load_config
-from fusiond.live.daemon import run
+from fusiond.live.daemon import run_daemon
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.saved_state import SavedState, save_state
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
@@ -275,7 +275,7 @@ def test_nothing_to_run_exits_78(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     config = tmp_path / "test.toml"
     config.write_text('vehicle = "x"\n')
     with pytest.raises(SystemExit) as ended:
-        run(load_config(config), config, lambda: load_config(config))
+        run_daemon(load_config(config), config, lambda: load_config(config))
     assert ended.value.code == 78
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]
     assert error.exc_info is None

@@ -17,7 +17,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.outputs.commands import COMMANDS
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.recording.reader import Log
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.broker import Broker, Listener, free_port, listening
 from tests.live.daemon_bench import PARKED, RDSS, Bench, driving, running
 from tests.patience import PATIENCE_S, until
@@ -100,10 +100,10 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
     assert fixes["gated"]["nis"] > 1e6 > fixes["fused"]["nis"] >= 0.0
     assert not any("zero" in one["source"] for one in told)  # constraints are not told
     first, second = sorted((tmp_path / "logs").iterdir(), key=lambda p: p.stat().st_mtime)
-    again = replay([first], Wish())  # commands and all
+    again = replay([first], ReplayOptions())  # commands and all
     assert again["identical"] is True, again["first_difference"]
     assert again["outcomes"]["operator"]["gated"] >= 1
-    assert replay([second], Wish())["identical"] is None  # it was started on the way
+    assert replay([second], ReplayOptions())["identical"] is None  # it was started on the way
     channels = {message.topic for message in Log([first]).messages()}
     assert "/innovation" in channels
     assert "/innovations" not in channels

@@ -149,6 +149,6 @@ def test_where_nothing_can_be_kept_it_compiles_before_anybody_waits_for_ticks(
     monkeypatch.setattr(daemon.asyncio, "run", served)
     config = bench.configuration("[mqtt]\nenabled = false\n")
     jobs = [partial(compiled.append, k) for k in range(3)]
-    daemon.run(config, bench.folder / "test.toml", lambda: config, jobs)
+    daemon.run_daemon(config, bench.folder / "test.toml", lambda: config, jobs)
     assert compiled == [0, 1, 2, -1]
     assert "compiling 3 kernels, at each start: NUMBA_CACHE_DIR" in caplog.text

@@ -14,10 +14,10 @@ import pytest
 
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
-from fusiond.live.daemon import run
+from fusiond.live.daemon import run_daemon
 from fusiond.live.reload import difference
 from fusiond.navigation.solution import Mode
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.broker import free_port
 from tests.live.daemon_bench import NO_MQTT, PARKED, Bench, running
 from tests.patience import PATIENCE_S, until
@@ -104,7 +104,7 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
         assert bench.events("reloaded")[-1].endswith("changed: nothing")
     assert Mode.ALIGNING not in {s.mode for s in bench.seen[navigated:]}
     (log,) = (tmp_path / "logs").iterdir()
-    again = replay([log], Wish())
+    again = replay([log], ReplayOptions())
     assert again["identical"] is True, again["first_difference"]
 
 
@@ -152,7 +152,7 @@ def test_sighup_reads_the_file_again_and_systemd_hears_of_it(
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
             manager.bind(str(tmp_path / "notify"))
             manager.setblocking(False)
-            run(load_config(path), path, lambda: load_config(path))
+            run_daemon(load_config(path), path, lambda: load_config(path))
             assert manager.recv(256).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
     finally:
         log.removeHandler(operator)

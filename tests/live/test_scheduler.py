@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.live.collector import Collector
-from fusiond.live.scheduler import LatenessHistogram, Scheduler
+from fusiond.live.scheduler import LatencyHistogram, Scheduler
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -251,7 +251,7 @@ async def test_collection_is_forced_when_there_is_never_slack() -> None:
 
 
 def test_histogram_quantiles() -> None:
-    histogram = LatenessHistogram()
+    histogram = LatencyHistogram()
     assert histogram.quantile_ms(0.5) == 0.0
     for ns in [50_000] * 980 + [3 * MS] * 19 + [10**12]:
         histogram.add(ns)

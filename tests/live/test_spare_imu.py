@@ -13,10 +13,10 @@ from drivers.measurements import ArrivalStamp, ImuSample
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.schema import Config, Imu, SpareImu
 from fusiond.configuration.settings import DEG, sensor_to_body
-from fusiond.demo.demo import demo_play
+from fusiond.demo.demo import demo_setup
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_choice import ImuChoice
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from fusiond.simulation.can.imu import CanImu
 from fusiond.simulation.vehicle import SimulatedVehicle
 from fusiond.studies.faults.runs import compared
@@ -34,7 +34,7 @@ FORCE_BIAS_M_S2 = np.array([0.05, 0.03, -0.04])
 
 def two_units(folder: Path) -> Config:
     """The demo's vehicle with a second unit on a bus of its own, turned by a quarter."""
-    config = demo_play().served(1, folder)
+    config = demo_setup().served(1, folder)
     first = config.sources["imu"]
     second = first.model_copy(update={"channel": "other"})
     return config.model_copy(
@@ -111,7 +111,7 @@ def test_the_spare_goes_on_where_the_first_got_stuck(tmp_path: Path) -> None:
     assert after.sd_rpy_rad[2] > before.sd_rpy_rad[2]
     assert min(after.sd_rpy_rad) > SPARE.mounting_sd_deg * DEG
     assert drive._warm.state(after, navigator) is None  # of a unit that does not come first
-    summary = replay(drive.close(), Wish())
+    summary = replay(drive.close(), ReplayOptions())
     assert summary["identical"], summary
     health = drive.chain.sources.health(drive.host.mono)
     assert health["imu2"].counters["took_over"] == 1

@@ -125,9 +125,9 @@ def test_bearings_that_cannot_be_true_are_rejected(tmp_path: Path) -> None:
 
 def test_process_fuses_both(tmp_path: Path) -> None:
     written = simulate(FLIGHT, tmp_path, seed=3, duration_s=420.0).files
-    aids = [("gnss", written["gnss"]), ("attitude", written["attitude"])]
-    aids.append(("bearing", written["bearing"]))
-    report = process(aircraft(), written["imu"], aids)
+    measurements = [("gnss", written["gnss"]), ("attitude", written["attitude"])]
+    measurements.append(("bearing", written["bearing"]))
+    report = process(aircraft(), written["imu"], measurements)
     assert report["aligned"] == "gyrocompass"
     star, sar = report["sources"]["star_tracker"], report["sources"]["sar"]
     assert star["fused"] > 280

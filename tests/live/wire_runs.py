@@ -1,8 +1,8 @@
 """One run of a fault of wires, clocks or the host, and the rows of its matrix.
 
-`aligning` begins at rest, before the first heading; `navigating` in town with all aids; `coasting`
-in an outage of receiver and terminal: faults of a receiver begin with its return, all others in the
-midst of it.
+`aligning` begins at rest, before the first heading; `navigating` in town with all measurements;
+`coasting` in an outage of receiver and terminal: faults of a receiver begin with its return, all
+others in the midst of it.
 """
 
 from __future__ import annotations

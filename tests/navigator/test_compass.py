@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.measurements import MagneticHeading, Measurement, MonotonicStamp, PositionFix, UtcStamp
-from fusiond.aiding.compass import CompassAid, lasting
+from fusiond.aiding.compass import CompassMeasurement, lasting
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
@@ -42,15 +42,15 @@ def heading(t_ns: int, yaw_rad: float) -> MagneticHeading:
 def test_place_and_date_come_of_the_fixes() -> None:
     intake = Intake({"compass": CompassAiding()})
     t = START_NS
-    assert intake.aids(heading(t, 0.0), t, 0.0) == "place_unknown"
+    assert intake.measurements_of(heading(t, 0.0), t, 0.0) == "place_unknown"
     place = 30.5 * DEG, 114.3 * DEG, 40.0
-    intake.aids(PositionFix("gnss", t, MonotonicStamp(t), *place), t, 0.0)
-    assert intake.aids(heading(t, 0.0), t, 0.0) == "date_unknown"
+    intake.measurements_of(PositionFix("gnss", t, MonotonicStamp(t), *place), t, 0.0)
+    assert intake.measurements_of(heading(t, 0.0), t, 0.0) == "date_unknown"
     utc_ns = round(datetime(2026, 11, 22, tzinfo=UTC).timestamp()) * runs.SECOND
-    intake.aids(PositionFix("gnss", t, UtcStamp(utc_ns), *place), t, 0.0)
-    (aid,) = intake.aids(heading(t, 0.0), t, 0.0)
-    assert isinstance(aid, CompassAid)
-    assert math.degrees(aid.yaw_rad) == pytest.approx(-4.9, abs=0.2)
+    intake.measurements_of(PositionFix("gnss", t, UtcStamp(utc_ns), *place), t, 0.0)
+    (measurement,) = intake.measurements_of(heading(t, 0.0), t, 0.0)
+    assert isinstance(measurement, CompassMeasurement)
+    assert math.degrees(measurement.yaw_rad) == pytest.approx(-4.9, abs=0.2)
 
 
 def told(start: tuple[str, ...], bent_deg: Any, seed: int) -> tuple[Navigator, list[Any]]:

@@ -48,7 +48,7 @@ def driven(
     sim, d = receiver(), drive()
     heard: list[str] = []
 
-    def hear(code: str, text: str) -> None:
+    def receive(code: str, text: str) -> None:
         if code == "protection_level":
             heard.append(text)
 
@@ -57,7 +57,7 @@ def driven(
         "aiding": {"raw": {"kind": "raw"}},
         "integrity": {"horizontal_alert_limit_m": LIMIT_M},
     }
-    navigator = Navigator(Config.model_validate(settings), on_event=hear)
+    navigator = Navigator(Config.model_validate(settings), on_event=receive)
     epochs = [(float(sim.t_s[k]), sim.epoch(k)) for k in range(len(sim))]
     known = {(s.system, s.prn) for _, e in epochs for s in e.signals}
     for message in (*sim.broadcast(0.0, known), *sim.ionosphere):

@@ -1,4 +1,5 @@
-"""What nobody thought of: an aid that raises costs itself, a filter of no numbers starts anew."""
+"""What nobody thought of: a measurement that raises costs itself, a filter of no numbers starts
+anew."""
 
 from __future__ import annotations
 
@@ -11,15 +12,15 @@ import pytest
 
 from drivers.immutable import immutable
 from drivers.measurements import Height, MonotonicStamp
-from fusiond.aiding.base import Aid, Innovation, State
+from fusiond.aiding.base import AidingMeasurement, Innovation, State
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from tests.navigator.vehicle import CONFIG, drive, feed, outcomes_of, started
 
 
 @immutable()
-class Raising(Aid):
-    """An aid of somebody else's."""
+class Raising(AidingMeasurement):
+    """A measurement of somebody else's."""
 
     error: Exception
 
@@ -34,7 +35,7 @@ def rest_of_the_drive(navigator: Navigator, row: int) -> None:
 @pytest.mark.parametrize(
     "error", [ValueError("domain"), ZeroDivisionError(), np.linalg.LinAlgError("singular")]
 )
-def test_an_aid_that_raises_costs_itself(error: Exception) -> None:
+def test_a_measurement_that_raises_costs_itself(error: Exception) -> None:
     told: list[tuple[str, str]] = []
     navigator, row = started(on_event=lambda code, text: told.append((code, text)))
     after = navigator.imu.latest_ns
@@ -43,7 +44,7 @@ def test_an_aid_that_raises_costs_itself(error: Exception) -> None:
     rest_of_the_drive(navigator, row)
     assert outcomes_of(navigator)["odd"] == {"failed": 3}
     assert outcomes_of(navigator)["gnss"]["fused"] == 34
-    assert told.count(("aid_failed", f"odd could not be used: {error!r}")) == 1
+    assert told.count(("measurement_failed", f"odd could not be used: {error!r}")) == 1
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
@@ -55,10 +56,10 @@ def test_so_does_one_whose_judgement_raises(where: str, monkeypatch: pytest.Monk
     diagnosis, count = navigator.timeline.diagnosis, iter(range(10**6))
     judged = getattr(diagnosis, where)
 
-    def raising(aid: Aid, *given: Any) -> Any:
-        if aid.source == "gnss_velocity" and next(count) % 10 == 9:
+    def raising(measurement: AidingMeasurement, *given: Any) -> Any:
+        if measurement.source == "gnss_velocity" and next(count) % 10 == 9:
             raise ValueError("too many values to unpack")
-        return judged(aid, *given)
+        return judged(measurement, *given)
 
     monkeypatch.setattr(diagnosis, where, raising)
     monkeypatch.setattr(diagnosis, "plain", lambda _: None)  # none is taken by its row
@@ -66,7 +67,7 @@ def test_so_does_one_whose_judgement_raises(where: str, monkeypatch: pytest.Monk
     found = outcomes_of(navigator)["gnss_velocity"]
     assert found["failed"] > 0
     assert found["fused"] > found["failed"]
-    assert told.count("aid_failed") == 1
+    assert told.count("measurement_failed") == 1
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
@@ -77,12 +78,12 @@ def test_a_measurement_that_raises_at_the_door_is_refused(monkeypatch: pytest.Mo
     def overflow(*_: object) -> str:
         raise OverflowError("too large")
 
-    monkeypatch.setattr(navigator._intake, "aids", overflow)
+    monkeypatch.setattr(navigator._intake, "measurements_of", overflow)
     now = navigator.imu.latest_ns
     for _ in range(2):
         assert navigator.add(Height("baro", now, MonotonicStamp(now), 40.0), now) == "failed"
     assert navigator.refused == {"baro": {"failed": 2}}
-    assert [code for code, _ in told] == ["aligned", "aid_failed"]
+    assert [code for code, _ in told] == ["aligned", "measurement_failed"]
 
 
 def lose_state(navigator: Navigator) -> None:

@@ -34,7 +34,7 @@ class _Told:
         self.events: list[str] = []
         self.modes: list[Mode] = []
         self.texts: list[str] = []
-        navigator, row = started(settings, on_event=self._hear)
+        navigator, row = started(settings, on_event=self._receive)
         self.navigator = navigator
         times, samples = d.times.copy(), d.samples.copy()
         if alter is not None:
@@ -55,7 +55,7 @@ class _Told:
             if self.modes[-1] is Mode.NAVIGATING:
                 self.worst_sigmas = max(self.worst_sigmas, self._sigmas())
 
-    def _hear(self, code: str, text: str) -> None:
+    def _receive(self, code: str, text: str) -> None:
         self.events.append(code)
 
     def _sigmas(self) -> float:

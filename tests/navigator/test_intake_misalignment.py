@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from drivers.measurements import Attitude, Bearing, MonotonicStamp, PositionFix
-from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
+from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rdss_position import BIAS_BLOCK
 from fusiond.configuration.aiding import (
     AnyAiding,
@@ -40,12 +40,14 @@ def bearing(source: str = "sar", target: str = "12", **other: object) -> Bearing
     return Bearing(source, 0, STAMP, target=target, **given)  # type: ignore[arg-type]
 
 
-def one(aiding: dict[str, AnyAiding], m: Attitude | Bearing) -> AttitudeAid | BearingAid:
-    aids = Intake(aiding).aids(m, 7, 0.001)
-    assert isinstance(aids, list)
-    (aid,) = aids
-    assert isinstance(aid, AttitudeAid | BearingAid)
-    return aid
+def one(
+    aiding: dict[str, AnyAiding], m: Attitude | Bearing
+) -> AttitudeMeasurement | BearingMeasurement:
+    measurements = Intake(aiding).measurements_of(m, 7, 0.001)
+    assert isinstance(measurements, list)
+    (measurement,) = measurements
+    assert isinstance(measurement, AttitudeMeasurement | BearingMeasurement)
+    return measurement
 
 
 def test_sigma_is_the_devices_or_the_configurations() -> None:
@@ -58,22 +60,22 @@ def test_sigma_is_the_devices_or_the_configurations() -> None:
     assert one({"sar": sar}, bearing()).sd == (50.0 * ARCSEC,) * 2
     assert one({"sar": sar}, bearing(sd_rad=(1e-3, 2e-3))).sd == (1e-3, 2e-3)
     # An attitude that is no star tracker's has no default: its device must say.
-    assert Intake({}).aids(attitude("attitude"), 7, 0.0) == "no_sigma"
-    assert Intake({"star_tracker": AttitudeAiding()}).aids(attitude("star_tracker"), 7, 0.0) == (
-        "no_sigma"
-    )
+    assert Intake({}).measurements_of(attitude("attitude"), 7, 0.0) == "no_sigma"
+    assert Intake({"star_tracker": AttitudeAiding()}).measurements_of(
+        attitude("star_tracker"), 7, 0.0
+    ) == ("no_sigma")
 
 
 def test_refusals_of_bearings() -> None:
     intake = Intake({"sar": SarAiding(targets_deg_m=POINTS)})
-    assert intake.aids(bearing(target="13"), 7, 0.0) == "unknown_target"
-    assert intake.aids(bearing(azimuth_rad=math.nan), 7, 0.0) == "not_finite"
-    assert intake.aids(bearing(sd_rad=(0.0, 1e-3)), 7, 0.0) == "no_sigma"
+    assert intake.measurements_of(bearing(target="13"), 7, 0.0) == "unknown_target"
+    assert intake.measurements_of(bearing(azimuth_rad=math.nan), 7, 0.0) == "not_finite"
+    assert intake.measurements_of(bearing(sd_rad=(0.0, 1e-3)), 7, 0.0) == "no_sigma"
     known = one({"sar": SarAiding(targets_deg_m=POINTS)}, bearing())
-    assert isinstance(known, BearingAid)
+    assert isinstance(known, BearingMeasurement)
     assert known.point == (30.6 * DEG, 114.5 * DEG, 60.0)
     told = one({}, bearing(target="13", point=(0.5, 1.9, 10.0)))
-    assert isinstance(told, BearingAid)
+    assert isinstance(told, BearingMeasurement)
     assert told.point == (0.5, 1.9, 10.0)
 
 
@@ -91,7 +93,7 @@ def test_blocks_of_the_model() -> None:
     star, port = blocks[STAR_BLOCK], blocks[f"{STAR_BLOCK}_port"]
     assert (star.initial, star.steady, star.tau_s) == (180.0 * ARCSEC, 0.0, math.inf)
     assert (port.initial, port.steady, port.tau_s) == (60.0 * ARCSEC, 60.0 * ARCSEC, 600.0)
-    # Each aid names the block that the model has for it.
+    # Each measurement names the block that the model has for it.
     for source, block in {
         "star_tracker": STAR_BLOCK,
         "port": f"{STAR_BLOCK}_port",
@@ -129,22 +131,24 @@ def test_fixes_share_an_error_of_which_those_by_phase_have_a_part() -> None:
         ("white", 1, ()),
         ("white", 4, ()),
     ):
-        (aid,) = intake.aids(replace(fix, source=source, quality=quality), 7, 0.0)
-        assert isinstance(aid, PositionAid)
-        assert aid.bias == names, (source, quality)
+        (measurement,) = intake.measurements_of(
+            replace(fix, source=source, quality=quality), 7, 0.0
+        )
+        assert isinstance(measurement, PositionMeasurement)
+        assert measurement.bias == names, (source, quality)
         by_phase = math.sqrt(0.5)
         part = (by_phase / 1.5, by_phase / 1.5, by_phase * 2.0 / 4.0)
         shares = part if names and quality >= 4 else (1.0, 1.0, 1.0)
-        assert aid.bias_share == pytest.approx(shares)
+        assert measurement.bias_share == pytest.approx(shares)
 
 
 def _bias_share(intake: Intake, sd_m: float, quality: int, source: str = "gnss") -> float:
     sd = (sd_m, sd_m, sd_m)
     stamp = MonotonicStamp(7)
     fix = PositionFix(source, 0, stamp, 0.5, 1.9, 10.0, quality=quality, sd_ned_m=sd)
-    (aid,) = intake.aids(fix, 7, 0.0)
-    assert isinstance(aid, PositionAid)
-    return aid.bias_share[0]
+    (measurement,) = intake.measurements_of(fix, 7, 0.0)
+    assert isinstance(measurement, PositionMeasurement)
+    return measurement.bias_share[0]
 
 
 def test_a_stated_sigma_that_collapses_makes_no_fix_one_by_carrier_phase() -> None:

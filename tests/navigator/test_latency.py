@@ -14,15 +14,15 @@ from fusiond.navigator.alignment.latency import SETTLED_SD_S, LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.position_jumps import Epoch
 from fusiond.navigator.navigator import Navigator
-from fusiond.studies.faults import aid_faults, imu_faults
+from fusiond.studies.faults import imu_faults, measurement_faults
 from fusiond.studies.faults.judge import longest_lie_s
 from fusiond.studies.faults.recording import Drive, Recording
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
 TICKS_HZ = 100.0
-LATE_S = aid_faults.LATE_S
+LATE_S = measurement_faults.LATE_S
 TRUTH, ON_TIME = Drive(duration_s=60.0).recorded(VEHICLE, seed=5)
-ALWAYS_LATE = aid_faults.late(ON_TIME, 0.0, math.inf)
+ALWAYS_LATE = measurement_faults.late(ON_TIME, 0.0, math.inf)
 
 
 def looked(
@@ -45,9 +45,11 @@ def looked(
         while recording.received[taken].seen_ns <= now_ns:
             item = recording.received[taken]
             taken += 1
-            aids = navigator._intake.aids(item.measurement, item.t_ns, 0.0, item.seen_ns)
-            assert not isinstance(aids, str)
-            late.hear(item.measurement.source, aids)
+            measurements = navigator._intake.measurements_of(
+                item.measurement, item.t_ns, 0.0, item.seen_ns
+            )
+            assert not isinstance(measurements, str)
+            late.receive(item.measurement.source, measurements)
         late.look(navigator.imu)
         while late.looking:
             late.look(navigator.imu)
@@ -59,9 +61,9 @@ def test_lateness_is_found_when_the_vehicle_drives_off() -> None:
     assert told == ["fixes_late"]
     item = ALWAYS_LATE.received[0]
     source = item.measurement.source
-    aids = navigator._intake.aids(item.measurement, item.t_ns, 0.0, item.seen_ns)
-    assert not isinstance(aids, str)
-    shifted_s = (aids[0].t_ns - late.hear(source, aids)[0].t_ns) * 1e-9
+    measurements = navigator._intake.measurements_of(item.measurement, item.t_ns, 0.0, item.seen_ns)
+    assert not isinstance(measurements, str)
+    shifted_s = (measurements[0].t_ns - late.receive(source, measurements)[0].t_ns) * 1e-9
     assert shifted_s == pytest.approx(LATE_S, abs=4.0 * SETTLED_SD_S)
 
 
@@ -121,7 +123,7 @@ def test_a_receiver_that_was_late_for_a_while_is_not_late_now() -> None:
     )
     _, on_time = Drive(duration_s=120.0).recorded(phone, seed=5)
     end_s = 42.0
-    recording = aid_faults.late(on_time, 30.0, end_s - 30.0)
+    recording = measurement_faults.late(on_time, 30.0, end_s - 30.0)
     told, late, _ = looked(recording, tuple(end_s + 1.0 + 1.5 * k for k in range(10)), phone)
     assert not told
     assert not late.suspects

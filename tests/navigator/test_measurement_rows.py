@@ -1,4 +1,4 @@
-"""Aids that a kernel takes by the row, against the same one by one: to the bit."""
+"""Measurements that a kernel takes by the row, against the same one by one: to the bit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def repeated(drive: Drive) -> None:
 def driven(
     monkeypatch: pytest.MonkeyPatch, alter: Alter, *, packs: bool, raw: bool = False
 ) -> tuple[Drive, list[Entry]]:
-    """A drive with two fixes that are ten seconds late, and its aids."""
+    """A drive with two fixes that are ten seconds late, and its measurements."""
     monkeypatch.setattr(KalmanEstimator, "packs", packs)
     drive, entries = Drive(2), []
     drive.navigator.timeline.keeps_raw = raw
@@ -54,7 +54,9 @@ def driven(
 
 
 @pytest.mark.parametrize("alter", [sound, off, repeated])
-def test_rows_are_what_aids_are_one_by_one(monkeypatch: pytest.MonkeyPatch, alter: Alter) -> None:
+def test_rows_are_what_measurements_are_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, alter: Alter
+) -> None:
     by_rows, entries = driven(monkeypatch, alter, packs=True)
     singly, others = driven(monkeypatch, alter, packs=False)
     one, other = by_rows.navigator.estimator, singly.navigator.estimator
@@ -76,7 +78,7 @@ def test_rows_are_what_aids_are_one_by_one(monkeypatch: pytest.MonkeyPatch, alte
     assert outcomes == singly.navigator.timeline.counters.outcomes
 
 
-def test_raw_innovations_are_those_of_the_aids(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_raw_innovations_are_those_of_the_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
     _, entries = driven(monkeypatch, sound, packs=True, raw=True)
     _, others = driven(monkeypatch, sound, packs=False, raw=True)
     units = {entry.raw.unit for entry in entries if entry.raw is not None}

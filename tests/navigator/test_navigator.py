@@ -77,15 +77,17 @@ def test_chunks_and_delays_leave_no_trace(chunks: list[int], delays: list[float]
     assert outcomes_of(navigator) == outcomes_of(_in_order())
 
 
-def test_outcomes_are_heard_and_each_aid_ends_in_one() -> None:
+def test_outcomes_are_heard_and_each_measurement_ends_in_one() -> None:
     last: dict[Any, Entry] = {}
 
-    def hear(entry: Entry) -> None:
+    def receive(entry: Entry) -> None:
         last[id(entry)] = entry
 
-    navigator, row = started(on_outcome=hear)
+    navigator, row = started(on_outcome=receive)
     feed(navigator, row, [33], [3.0] * 68)
-    heard = Counter((e.aid.source, e.outcome.name) for e in last.values() if e.outcome is not None)
+    heard = Counter(
+        (e.measurement.source, e.outcome.name) for e in last.values() if e.outcome is not None
+    )
     counted = {(s, n): c for s, names in outcomes_of(navigator).items() for n, c in names.items()}
     assert {k: c for k, c in heard.items() if k in counted} == counted
 
@@ -104,7 +106,7 @@ def test_refusals_are_named_and_counted() -> None:
         (rdss, now, "multi_value"),
         (replace(rdss, multi_value=False, precision_class_m=0.0), now, "no_sigma"),
         (Attitude("star", now, stamp, (0.0, 0.0, 0.0), (0.1, 0.1, 0.0)), now, "no_sigma"),
-        (TimeReport("gnss", now, 0, True), now, "not_an_aid"),
+        (TimeReport("gnss", now, 0, True), now, "not_a_measurement"),
     ]
     expected: dict[str, Counter[str]] = {}
     for m, t_ns, name in cases:

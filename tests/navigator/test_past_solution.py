@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.aiding.base import Aid, NotApplicable, State
+from fusiond.aiding.base import AidingMeasurement, NotApplicable, State
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
@@ -18,7 +18,7 @@ LAST = "~"
 """A source that comes after all others of its instant."""
 
 
-class Look(Aid):
+class Look(AidingMeasurement):
     """Changes nothing; who hears of it sees the filter at its instant."""
 
     def innovation(self, state: State) -> NotApplicable:
@@ -39,15 +39,15 @@ def everything(navigator: Navigator) -> tuple[bytes, ...]:
 
 @pytest.mark.parametrize("back_ns", [3_000_000, 20_000_000, 777_777_777, 5_123_456_789])
 def test_the_state_is_that_of_its_own_instant(back_ns: int) -> None:
-    """Seen by an aid that changes nothing and holds at that very instant; here with fixes and
-    constraints between it and the newest sample, and between samples or at one."""
+    """Seen by a measurement that changes nothing and holds at that very instant; here with fixes
+    and constraints between it and the newest sample, and between samples or at one."""
     seen: dict[str, Any] = {}
 
-    def hear(entry: Entry) -> None:
-        if entry.aid.source == LAST:
+    def receive(entry: Entry) -> None:
+        if entry.measurement.source == LAST:
             seen["nav"], seen["sd"] = navigator.estimator.nav.copy(), navigator.estimator.sigmas()
 
-    navigator = driven(on_outcome=hear)
+    navigator = driven(on_outcome=receive)
     t_ns = navigator.imu.latest_ns - back_ns
     solution = navigator.solution(t_ns)
     navigator.timeline.insert(Look(LAST, t_ns, 0.9999))

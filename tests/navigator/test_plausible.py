@@ -20,8 +20,8 @@ from drivers.measurements import (
     PositionFix,
     WheelSpeed,
 )
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.plausibility import PLAUSIBILITY, VehicleClass
 from fusiond.navigator.intake import Intake
@@ -45,8 +45,8 @@ GOOD = (FIX, RDSS, ATTITUDE, BEARING, HEADING, HEIGHT, WHEEL)
 
 
 def outcome(m: Measurement, vehicle: VehicleClass = "road") -> str:
-    aids = Intake({}, PLAUSIBILITY[vehicle]).aids(m, 7, 0.0, 7)
-    return aids if isinstance(aids, str) else "aids"
+    measurements = Intake({}, PLAUSIBILITY[vehicle]).measurements_of(m, 7, 0.0, 7)
+    return measurements if isinstance(measurements, str) else "aids"
 
 
 @pytest.mark.parametrize("m", GOOD, ids=lambda m: m.source)
@@ -110,10 +110,12 @@ def test_the_class_of_the_vehicle_says_what_it_can_do() -> None:
 
 def sigmas(change: dict[str, Any], section: GnssAiding | None = None) -> tuple[Any, Any]:
     """Of position and velocity, as the filter believes them."""
-    aids = Intake({"gnss": section or GnssAiding()}).aids(replace(FIX, **change), 7, 0.0)
-    position, velocity = aids
-    assert isinstance(position, PositionAid)
-    assert isinstance(velocity, VelocityAid)
+    measurements = Intake({"gnss": section or GnssAiding()}).measurements_of(
+        replace(FIX, **change), 7, 0.0
+    )
+    position, velocity = measurements
+    assert isinstance(position, PositionMeasurement)
+    assert isinstance(velocity, VelocityMeasurement)
     return position.sd, velocity.sd
 
 
@@ -143,14 +145,14 @@ def rate_of(rate_hz: float, seconds: float, start_s: float = 0.0) -> list[int]:
 def outcomes_of(intake: Intake, m: Measurement, instants: list[int]) -> Counter[str]:
     found: Counter[str] = Counter()
     for t_ns in instants:
-        aids = intake.aids(m, t_ns, 0.0)
-        found[aids if isinstance(aids, str) else "aids"] += 1
+        measurements = intake.measurements_of(m, t_ns, 0.0)
+        found[measurements if isinstance(measurements, str) else "aids"] += 1
     return found
 
 
 def test_a_kilohertz_of_fixes_is_left_out_and_named() -> None:
     told: list[tuple[str, str]] = []
-    intake = Intake({}, tell=lambda code, text: told.append((code, text)))
+    intake = Intake({}, report=lambda code, text: told.append((code, text)))
     assert outcomes_of(intake, FIX, rate_of(50.0, 4.0)) == {"aids": 200}
     mixed = sorted(rate_of(1000.0, 0.5, 5.0) + rate_of(5.0, 0.5, 5.0))
     burst = outcomes_of(intake, FIX, mixed)

@@ -33,13 +33,13 @@ def driven(
     half way on. The navigator at the end, and its events about levels."""
     heard: list[str] = []
 
-    def hear(code: str, text: str) -> None:
+    def receive(code: str, text: str) -> None:
         if code.startswith("protection"):
             heard.append(code)
 
     d = vehicle.drive()
     extra = {"other": GNSS} if two else {}
-    navigator = Navigator(Config.model_validate(settings(limit_m, **extra)), on_event=hear)
+    navigator = Navigator(Config.model_validate(settings(limit_m, **extra)), on_event=receive)
     waiting: list[Measurement] = list(d.measurements)
     for row in range(0, len(d.times), 10):
         navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
@@ -123,7 +123,7 @@ def test_the_level_bounds_what_is_published_with_all_that_is_open() -> None:
     now, estimator = navigator.imu.latest_ns, navigator.estimator
     before = navigator.solution(now)
     estimator.wider[:3] = 4.0, 4.0, 9.0
-    navigator._protection.tell()
+    navigator._protection.report()
     after = navigator.solution(now)
     assert after.bound.hpl_m > before.bound.hpl_m + 3.0
     assert after.bound.vpl_m > before.bound.vpl_m + 3.0

@@ -38,9 +38,9 @@ def at_rest(
         if k == epochs - 1:
             epoch = changed(epoch, change, only)
         estimator.step[STEP_SECONDS] = 10.0 + k
-        aid = raw.aid(epoch, k * 1_000_000_000)
-        outcome = estimator.update(aid.at(estimator.nav))
-        aid.judged(outcome.rows, outcome.whitened)
+        measurement = raw.measurement(epoch, k * 1_000_000_000)
+        outcome = estimator.update(measurement.at(estimator.nav))
+        measurement.judged(outcome.rows, outcome.whitened)
         assert outcome.name == "fused"
     return estimator
 
@@ -66,9 +66,9 @@ def test_ephemerides_of_yesterday_are_stale() -> None:
         if toe_s < 0.0:
             week, toe_s = week - 1, toe_s + WEEK_S
         raw.learn(replace(message, week=week, toe_s=toe_s, toc_s=toe_s))
-    aid = raw.aid(epoch, 0)
-    outcome = started(RawAiding()).update(aid.at(place(0)))
-    aid.judged(outcome.rows, outcome.whitened)
+    measurement = raw.measurement(epoch, 0)
+    outcome = started(RawAiding()).update(measurement.at(place(0)))
+    measurement.judged(outcome.rows, outcome.whitened)
     assert outcome.name == "no_satellites"
     assert set(raw.refused) == {"G_stale_ephemeris", "C_stale_ephemeris"}
     assert set(raw.sky().refused.values()) == {"stale_ephemeris"}
@@ -96,8 +96,8 @@ def test_a_number_that_has_become_another_satellites() -> None:
     raw = informed(sim=sim)
     epoch = sim.epoch(0)
     others = tuple(s for s in epoch.signals if s.satellite != name)
-    aid = raw.aid(replace(epoch, signals=others), 0)
-    clean.update(aid.at(clean.nav))
+    measurement = raw.measurement(replace(epoch, signals=others), 0)
+    clean.update(measurement.at(clean.nav))
     assert off(estimator) == pytest.approx(off(clean), abs=1e-3)
     # The other way round: the old one's of the next two hours, and then the new one's.
     mended = RawGnss("raw", RawAiding())

@@ -1,4 +1,5 @@
-"""From raw epochs to aids, health and verdicts: one receiver in the navigator and in `process`."""
+"""From raw epochs to measurements, health and verdicts: one receiver in the navigator and in
+`process`."""
 
 from __future__ import annotations
 
@@ -74,17 +75,17 @@ def off(estimator: KalmanEstimator) -> float:
     return float(np.hypot(d[0], d[1] * np.cos(place(0)[0])))
 
 
-# --------------------------------------------------------------------------- epochs to aids
+# --------------------------------------------------------------------------- epochs to measurements
 
 
 def test_without_ephemerides_an_epoch_does_not_apply_and_says_why() -> None:
     epoch = receiver().epoch(0)
     deaf = RawGnss("raw", RawAiding())
-    aid = deaf.aid(epoch, 0)
-    outcome = started(RawAiding()).update(aid.at(place(0)))
+    measurement = deaf.measurement(epoch, 0)
+    outcome = started(RawAiding()).update(measurement.at(place(0)))
     assert outcome.name == "no_satellites"
     for _ in range(2):  # a rewind brings it again
-        aid.judged(outcome.rows, outcome.whitened)
+        measurement.judged(outcome.rows, outcome.whitened)
     assert sum(deaf.refused.values()) == len(epoch.signals)
     assert set(deaf.refused) == {"G_no_ephemeris", "C_no_ephemeris"}
     assert set(deaf.sky().refused.values()) == {"no_ephemeris"}
@@ -92,7 +93,7 @@ def test_without_ephemerides_an_epoch_does_not_apply_and_says_why() -> None:
 
 def test_an_epoch_alone_starts_the_alignment() -> None:
     raw, sim = informed(), receiver()
-    position, velocity = raw.aid(sim.epoch(0), 7).candidates()
+    position, velocity = raw.measurement(sim.epoch(0), 7).candidates()
     assert isinstance(position, PositionCandidate)
     assert isinstance(velocity, VelocityCandidate)
     assert (position.t_ns, velocity.t_ns) == (7, 7)
@@ -102,17 +103,17 @@ def test_an_epoch_alone_starts_the_alignment() -> None:
     assert position.height_m is not None
     assert abs(position.height_m - height) < 5.0 * position.sd[2]
     few = replace(sim.epoch(1), signals=sim.epoch(1).signals[:3])
-    assert raw.aid(few, 8).candidates() == []
+    assert raw.measurement(few, 8).candidates() == []
     assert raw.refused["too_few"] == 1
 
 
 def test_options() -> None:
     epoch = receiver().epoch(0)
-    usual = informed().aid(epoch, 0).at(place(0))
-    wide = informed(RawAiding(sigma_scale=2.0)).aid(epoch, 0).at(place(0))
-    four = informed(RawAiding(best_four=True)).aid(epoch, 0).at(place(0))
-    gps = informed(RawAiding(systems=("G",))).aid(epoch, 0).at(place(0))
-    high = informed(RawAiding(elevation_mask_deg=40.0)).aid(epoch, 0).at(place(0))
+    usual = informed().measurement(epoch, 0).at(place(0))
+    wide = informed(RawAiding(sigma_scale=2.0)).measurement(epoch, 0).at(place(0))
+    four = informed(RawAiding(best_four=True)).measurement(epoch, 0).at(place(0))
+    gps = informed(RawAiding(systems=("G",))).measurement(epoch, 0).at(place(0))
+    high = informed(RawAiding(elevation_mask_deg=40.0)).measurement(epoch, 0).at(place(0))
     assert wide.range_variance == pytest.approx(4.0 * usual.range_variance)
     assert wide.rate_variance == pytest.approx(4.0 * usual.rate_variance)
     assert len(four.satellites) == 4
@@ -127,16 +128,16 @@ def test_sky_names_every_satellite() -> None:
     sim = receiver()
     raw = informed(sim=sim)
     epoch = sim.epoch(0)
-    epoch_aid = raw.aid(epoch, 0)
-    aid = epoch_aid.at(place(0))
-    n = len(aid.satellites)
+    epoch_measurement = raw.measurement(epoch, 0)
+    measurement = epoch_measurement.at(place(0))
+    n = len(measurement.satellites)
     codes = [KEPT] * (2 * n)
     codes[0], codes[1], codes[n + 2] = GATED, RESIDUAL, GATED
-    epoch_aid.judged(codes, (0.5,) * (2 * n))
+    epoch_measurement.judged(codes, (0.5,) * (2 * n))
     sky = raw.sky()
     assert set(sky.used) | set(sky.refused) == {s.satellite for s in epoch.signals}
     assert not set(sky.used) & set(sky.refused)
-    first, second, third = aid.satellites[:3]
+    first, second, third = measurement.satellites[:3]
     assert (sky.refused[first], sky.refused[second]) == ("gated", "residual")
     assert third in sky.used, "its range is used, its rate is not"
     assert sky.innovation_rms == pytest.approx(0.5)
@@ -151,7 +152,7 @@ def test_sky_names_every_satellite() -> None:
     assert mask_rad <= elevation <= 0.5 * math.pi
     assert cno == strongest
     # East and up of the line to it, from the receiver that was assumed.
-    sight = aid.position[0] - np.array(to_ecef(*place(0)[:3]))
+    sight = measurement.position[0] - np.array(to_ecef(*place(0)[:3]))
     axes = ned_axes(*place(0)[:2])
     north, east, down = axes.T @ (sight / np.linalg.norm(sight))
     assert math.atan2(east, north) == pytest.approx(azimuth, abs=1e-3)
@@ -163,24 +164,24 @@ def test_sky_names_every_satellite() -> None:
 
 def test_an_epoch_refused_as_a_whole_names_its_satellites() -> None:
     raw = informed()
-    epoch_aid = raw.aid(receiver().epoch(0), 0)
-    aid = epoch_aid.at(place(0))
-    epoch_aid.judged((GATED,) * (2 * len(aid.satellites)), ())
+    epoch_measurement = raw.measurement(receiver().epoch(0), 0)
+    measurement = epoch_measurement.at(place(0))
+    epoch_measurement.judged((GATED,) * (2 * len(measurement.satellites)), ())
     sky = raw.sky()
     assert sky.used == ()
-    assert {sky.refused[s] for s in aid.satellites} == {"gated"}
+    assert {sky.refused[s] for s in measurement.satellites} == {"gated"}
 
 
 def test_figures_of_a_system_are_standard_normal() -> None:
     rng = np.random.default_rng(2)
     raw = informed()
-    aid = raw.aid(receiver().epoch(0), 0).at(place(0))
-    rows = 2 * len(aid.satellites)
+    measurement = raw.measurement(receiver().epoch(0), 0).at(place(0))
+    rows = 2 * len(measurement.satellites)
     figures = []
     for _ in range(4000):
         codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
         whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
-        found = aid.series(whitened.tolist(), codes == KEPT)
+        found = measurement.series(whitened.tolist(), codes == KEPT)
         figures.append([*found["G"], *found["C"]])
     covariance = np.cov(np.array(figures).T)
     assert covariance == pytest.approx(np.eye(4), abs=0.1)
@@ -188,11 +189,13 @@ def test_figures_of_a_system_are_standard_normal() -> None:
 
 def test_a_system_without_rates_has_no_figure() -> None:
     raw = informed()
-    aid = raw.aid(receiver().epoch(0), 0).at(place(0))
-    rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
-    variances = aid.range_variance, aid.rate_variance
-    values = epoch_values(aid.position, aid.velocity, aid.ranges, rates, *variances)
-    silent = replace(aid, values=values)
+    measurement = raw.measurement(receiver().epoch(0), 0).at(place(0))
+    rates = np.where([s[0] == "G" for s in measurement.satellites], np.nan, measurement.rates)
+    variances = measurement.range_variance, measurement.rate_variance
+    values = epoch_values(
+        measurement.position, measurement.velocity, measurement.ranges, rates, *variances
+    )
+    silent = replace(measurement, values=values)
     rows = len(silent.labels)
     found = silent.series((1.0,) * rows, np.ones(rows, dtype=bool))
     assert set(found) == {"C"}
@@ -217,14 +220,14 @@ def test_a_clock_set_by_a_millisecond_moves_nothing_but_the_clock() -> None:
         raw, estimator = informed(section, sim), started(section)
         epoch = sim.epoch(0)
         for _ in range(3):
-            aid = raw.aid(epoch, 0).at(estimator.nav)
-            assert estimator.update(aid).name == "fused"
+            measurement = raw.measurement(epoch, 0).at(estimator.nav)
+            assert estimator.update(measurement).name == "fused"
         offset = estimator.xi[estimator.model.slots_of(CLOCK_OFFSET)].copy()
         before = off(estimator)
         jump = SPEED_OF_LIGHT_M_S * 1e-3
         set_clock = replace(moved(epoch, jump), clock_reset=flagged)
-        aid = raw.aid(set_clock, 0).at(estimator.nav)
-        outcome = estimator.update(aid)
+        measurement = raw.measurement(set_clock, 0).at(estimator.nav)
+        outcome = estimator.update(measurement)
         assert outcome.name == "fused"
         assert set(outcome.rows) == {KEPT}
         assert off(estimator) == pytest.approx(before, abs=0.5)
@@ -240,13 +243,15 @@ def test_fewer_than_four_satellites_help(count: int) -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):  # clocks are known from a fuller sky
-        aid = raw.aid(epoch, 0).at(estimator.nav)
-        estimator.update(aid)
+        measurement = raw.measurement(epoch, 0).at(estimator.nav)
+        estimator.update(measurement)
     for slot in range(6, 9):
         estimator.covariance[slot, slot] += 20.0**2
     before = estimator.sigmas()[:3].copy()
-    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0).at(estimator.nav)
-    outcome = estimator.update(aid)
+    measurement = raw.measurement(replace(epoch, signals=epoch.signals[:count]), 0).at(
+        estimator.nav
+    )
+    outcome = estimator.update(measurement)
     assert (outcome.name, outcome.degrees) == ("fused", 2 * count)
     after = estimator.sigmas()[:3]
     assert (after < before).all()
@@ -259,15 +264,15 @@ def test_one_bad_satellite_is_refused_alone() -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):
-        aid = raw.aid(epoch, 0).at(estimator.nav)
-        estimator.update(aid)
+        measurement = raw.measurement(epoch, 0).at(estimator.nav)
+        estimator.update(measurement)
     bad = epoch.signals[2].satellite
-    epoch_aid = raw.aid(moved(epoch, 80.0, {bad}), 0)
-    aid = epoch_aid.at(estimator.nav)
-    outcome = estimator.update(aid)
-    left_out = [label for label, code in zip(aid.labels, outcome.rows, strict=True) if code]
+    epoch_measurement = raw.measurement(moved(epoch, 80.0, {bad}), 0)
+    measurement = epoch_measurement.at(estimator.nav)
+    outcome = estimator.update(measurement)
+    left_out = [label for label, code in zip(measurement.labels, outcome.rows, strict=True) if code]
     assert left_out == [(bad, "range")]
-    epoch_aid.judged(outcome.rows, outcome.whitened)
+    epoch_measurement.judged(outcome.rows, outcome.whitened)
     assert set(raw.sky().refused) >= {bad}
 
 
@@ -300,8 +305,8 @@ def run(
     aiding = {kind: {"lever_arm_m": LEVER} for kind in ("gnss", "rdss", "raw")}
     config = {"imu": CAR_IMU, "aiding": aiding, "estimator": estimator}
     names = {"gnss": "gnss.csv", "rdss": "rdss.csv", "raw": "gnss.ubx"}
-    aids = [(kind, folder / names[kind]) for kind in kinds]
-    result = process(Config.model_validate(config), folder / "imu.csv", aids, out=out)
+    measurements = [(kind, folder / names[kind]) for kind in kinds]
+    result = process(Config.model_validate(config), folder / "imu.csv", measurements, out=out)
     return result, compare(read_solution(out), read_truth(folder / "truth.csv"), after_s=20.0)
 
 

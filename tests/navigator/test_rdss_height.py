@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.aiding.rdss_geometry import RdssGeometry, Sensitivity
-from fusiond.aiding.rdss_position import RdssPositionAid
+from fusiond.aiding.rdss_position import RdssPositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.navigator.intake.kind import Instants, Sections
-from fusiond.navigator.intake.rdss import aids
+from fusiond.navigator.intake.rdss import measurements_of
 
 LAT, LON = math.radians(30.0), math.radians(114.0)
 CONFIG = Config.model_validate({"aiding": {"rdss": {"height_sd_m": 40.0}}})
@@ -32,10 +32,10 @@ def covariance(height_sd_m: float | None, class_m: float = 1.0) -> np.ndarray:
         height_given=height_sd_m is not None,
         height_sd_m=height_sd_m,
     )
-    found = aids(fix, Sections(CONFIG.aiding), Instants(0, 0.0, 0))
+    found = measurements_of(fix, Sections(CONFIG.aiding), Instants(0, 0.0, 0))
     assert not isinstance(found, str)
-    (aid,) = [a for a in found if isinstance(a, RdssPositionAid)]
-    nn, ne, ee = aid.covariance
+    (measurement,) = [a for a in found if isinstance(a, RdssPositionMeasurement)]
+    nn, ne, ee = measurement.covariance
     return np.array([[nn, ne], [ne, ee]])
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, MonotonicStamp
-from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.aiding.rdss_position import HeldFeedback, RdssPositionMeasurement
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.imu_truth import Truth
@@ -172,15 +172,17 @@ def test_when_each_strategy_uses_a_fix() -> None:
     found = {}
     for strategy in ("rewind", "optimal_prediction", "position_compensation", "none"):
         options = RdssAiding(strategy=strategy, fix_height_sd_m=None)
-        aids = Intake({"rdss": options}).aids(fix, t_ns, 0.0, seen_ns)
-        assert not isinstance(aids, str)
+        measurements = Intake({"rdss": options}).measurements_of(fix, t_ns, 0.0, seen_ns)
+        assert not isinstance(measurements, str)
         found[strategy] = [
-            (a.t_ns, a.moved_s, a.holds) if isinstance(a, RdssPositionAid) else (type(a), a.t_ns)
-            for a in aids
+            (a.t_ns, a.moved_s, a.holds)
+            if isinstance(a, RdssPositionMeasurement)
+            else (type(a), a.t_ns)
+            for a in measurements
         ]
     assert found == {
         "rewind": [(t_ns, 0.0, False)],
-        "optimal_prediction": [(t_ns, 0.0, True), (FeedBackAid, seen_ns)],
+        "optimal_prediction": [(t_ns, 0.0, True), (HeldFeedback, seen_ns)],
         "position_compensation": [(seen_ns, 1.5, False)],
         "none": [(seen_ns, 0.0, False)],
     }

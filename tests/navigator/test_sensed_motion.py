@@ -102,13 +102,13 @@ def test_velocities_that_are_late_tilt_nobody_who_asks_whether_they_are(sd_late_
     wrong = (found.dcm @ (-found.biases[:3] + [0.0, 0.0, -9.8]))[:2]
     nees = wrong @ np.linalg.solve(h @ found.covariance @ h.T, wrong)
     if sd_late_s == 0.0:
-        assert found.late_s == found.covariance[9, 9] == 0.0
+        assert found.delay_s == found.covariance[9, 9] == 0.0
         assert nees > 25.0
         return
     assert nees < 9.0
     sd_s = np.sqrt(found.covariance[9, 9])
     assert sd_s < 0.03
-    assert abs(found.late_s - LATE_S) < 3.0 * sd_s
+    assert abs(found.delay_s - LATE_S) < 3.0 * sd_s
 
 
 def test_what_a_guess_says_moves_by_its_slopes(imu: ImuBuffer) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.measurements import Measurement, PositionFix
 from fusiond.integrity.service import Service
-from fusiond.navigator.source_status import CORRECTED_TOLD_NS, WORST_FIRST, SourceService, worst
+from fusiond.navigator.source_status import CORRECTED_SHOWN_NS, WORST_FIRST, SourceService, worst
 from fusiond.outputs.messages.fault import FaultReport, fault_report
 from tests.navigator import vehicle
 
@@ -125,7 +125,7 @@ def test_a_step_of_the_gyro_is_told_for_a_minute_after_it_was_corrected() -> Non
     assert (fault.kind, fault.axis, fault.action) == ("gyro", "z", "corrected")
     assert fault.size == pytest.approx(2.86, abs=4.0 * (fault.sd or 0.0))  # 0.05 rad/s
     (last,) = seen.service.faults(seen.end_ns)
-    over_ns = last.finding.t_ns + CORRECTED_TOLD_NS
+    over_ns = last.finding.t_ns + CORRECTED_SHOWN_NS
     assert seen.service.faults(over_ns) == [last]
     assert seen.service.faults(over_ns + 1) == []
 

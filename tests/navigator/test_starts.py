@@ -46,7 +46,7 @@ class Case(NamedTuple):
     from_s: float = 0.0
     fixes_from_s: float = 0.0
     lever: tuple[float, float, float] = (0.0, 0.0, -1.0)
-    late_s: float = 0.0
+    delay_s: float = 0.0
     """How much later than its stamp a velocity is valid."""
 
 
@@ -60,7 +60,7 @@ CASES = {
     ),
     "on the move": Case((Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER),
     "on the move, velocities late": Case(
-        (Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER, late_s=0.12
+        (Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER, delay_s=0.12
     ),
     "on the move, backward": Case(
         (Leg(1), Leg(6, speed_m_s=-6.0), Leg(4), Leg(4, speed_m_s=-4.0), Leg(6, turn_deg=-60.0),
@@ -88,8 +88,8 @@ def _fix(case: Case, row: int, rng: np.random.Generator) -> PositionFix:
     """What the receiver says at the end of the samples `row` to `row` + `EVERY`."""
     antenna, k = _antenna(case), row // EVERY
     p, v = antenna.position[k], antenna.v_ned[k]
-    if case.late_s:
-        v = _truth(case).at(antenna.t_s[k : k + 1] + case.late_s, case.lever).v_ned[0]
+    if case.delay_s:
+        v = _truth(case).at(antenna.t_s[k : k + 1] + case.delay_s, case.lever).v_ned[0]
     away = SD_M * rng.standard_normal(3) / np.abs(runs.metres(float(p[0]), float(p[2])))
     lat, lon, height = (p + away).tolist()
     north, east, down = (v + SD_M_S * rng.standard_normal(3)).tolist()

@@ -5,135 +5,32 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Aid
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
-from fusiond.aiding.velocity import VelocityAid
-from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.aiding.attitude import HeadingMeasurement
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.estimators import hypotheses
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.integrity.diagnosis import Diagnosis
-from fusiond.models.catalogue import make_model
-from fusiond.models.model import Model
-from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
-from fusiond.navigator.timeline import JUDGED, Entry, Timeline
+from fusiond.navigator.timeline import Entry, Timeline
 from tests import runs
-
-Array = NDArray[np.float64]
-
-IMU = Imu(rate_hz=50.0)
-SECONDS = 30.0
-START_NS = 5 * runs.SECOND
-KEEP_S = 10.0
-GATE = 0.9999
-
-
-def kinds(model: Model) -> list[Kind]:
-    """What may be wrong of all that the drive has."""
-    return kinds_of(model, {"gnss": "gnss", "compass": "compass", "rdss": "rdss"}, slips=False)
-
-
-class Drive:
-    """Half a minute of driving: samples, start and aids in order of validity."""
-
-    def __init__(self) -> None:
-        truth = runs.town_truth(SECONDS, IMU.rate_hz)
-        self.times = runs.sample_times(truth, START_NS)
-        self.samples = runs.imu_run(IMU, truth, 7).samples
-        self.nav = runs.true_nav(truth, np.zeros(1))[0]
-        self.sd = np.radians([0.3, 0.3, 2.0])
-        rng = np.random.default_rng(8)
-        self.aids: list[Aid] = []
-        for t in np.arange(0.507, SECONDS - 1.0, 0.9):
-            nav = runs.true_nav(truth, np.array([t]))[0]
-            nav = runs.with_error(
-                nav, rng.standard_normal(9) * ([0.01] * 3 + [0.1] * 3 + [1.5] * 3)
-            )
-            lat, lon, height, n, e, d = (float(x) for x in nav[:6])
-            if 11.0 < t < 13.0:
-                lat += 1e-4  # an outlier of 640 m
-            t_ns = START_NS + round(t * 1e9)
-            lever_v = (0.0, 0.0, 0.0)
-            yaw = rpy_from_dcm(dcm_from_quaternion(nav[6:]))[2]
-            sd = (1.5, 1.5, 1.5)
-            lever = (0.4, -0.3, -1.2)
-            if round(t) % 4 == 0:  # carried without feedback for 1.3 s, across other aids
-                late = t_ns + 1_300_000_000
-                held = RdssPositionAid(
-                    "rdss", t_ns + 3, GATE, lat, lon, (400.0, 50.0, 300.0), lever_v, holds=True
-                )
-                self.aids += [held, FeedBackAid("rdss_feedback", late, GATE)]
-            self.aids += [
-                HeadingAid("compass", t_ns, GATE, yaw, 0.01),
-                PositionAid("gnss", t_ns, GATE, lat, lon, height, sd, lever),
-                VelocityAid("gnss_velocity", t_ns - 100_000_000, GATE, (n, e, d), sd, lever_v),
-            ]
-        self.aids.sort(key=lambda a: (a.t_ns, a.source))
-
-    def estimator(self) -> KalmanEstimator:
-        """At the start, before the first sample."""
-        model = make_model("ins21", imu_noise(IMU))
-        estimator = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds(model)))
-        p = np.diag(runs.initial_sd(model, self.sd, 0.2, 3.0) ** 2)
-        estimator.initialise(START_NS, 0, self.nav, np.zeros(model.size), p)
-        return estimator
-
-    def timeline(self, keep_s: float = KEEP_S, checkpoint_s: float = 0.5) -> Timeline:
-        """Started, with no sample and no aid yet; its buffer is moved every 20 s or so."""
-        buffer = ImuBuffer(1.0, keep_s, np.eye(3), 0.0, IMU.gap_s)
-        estimator = self.estimator()
-        given = keep_s, checkpoint_s, None, kinds(estimator.model)
-        timeline = Timeline(estimator, buffer, *given)
-        timeline.start()
-        return timeline
-
-
-@lru_cache(maxsize=1)
-def drive() -> Drive:
-    return Drive()
-
-
-@lru_cache(maxsize=1)
-def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference, of which there is one."""
-    return applied_in_order()
-
-
-def applied_in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference knows no timeline: propagate to each aid in turn, apply and judge it, go on."""
-    d = drive()
-    estimator = d.estimator()
-    diagnosis = Diagnosis(kinds(estimator.model))
-    buffer = runs.filled_buffer(IMU, d.times, d.samples)
-    outcomes = []
-    for aid in d.aids:
-        estimator.propagate(buffer, aid.t_ns)
-        if isinstance(aid, FeedBackAid):
-            estimator.release()
-        elif isinstance(aid, RdssPositionAid):
-            estimator.hold()
-        one = diagnosis.comes(aid, estimator)
-        outcome = estimator.look(aid) if one.out else estimator.update(aid, one.noise)
-        outcomes.append(outcome)
-        if outcome.name in JUDGED:
-            correction = diagnosis.judge(aid, one, outcome, estimator)
-            if correction is not None:
-                estimator.adopt(correction.mean, correction.spread)
-    estimator.propagate(buffer, buffer.latest_ns)
-    return estimator, outcomes
+from tests.navigator.timeline_drive import (
+    IMU,
+    KEEP_S,
+    SECONDS,
+    START_NS,
+    applied_in_order,
+    drive,
+    in_order,
+    kinds,
+)
 
 
 def assert_same_state(a: KalmanEstimator, b: KalmanEstimator) -> None:
@@ -163,7 +60,7 @@ def test_the_reference_has_outliers_and_navigates() -> None:
 @given(st.data())
 def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
     d = drive()
-    count = len(d.aids)
+    count = len(d.measurements)
     delay = st.sampled_from([0.0, 0.1, 0.6, 1.5, 4.0, 8.0])
     delays = data.draw(st.lists(delay, min_size=count, max_size=count))
     early = data.draw(st.sets(st.integers(0, count - 1), max_size=5))
@@ -174,8 +71,8 @@ def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
 
     arrivals = [
-        (aid.t_ns + (-500_000_000 if i in early else round(delay_s * 1e9)), i)
-        for i, (aid, delay_s) in enumerate(zip(d.aids, delays, strict=True))
+        (measurement.t_ns + (-500_000_000 if i in early else round(delay_s * 1e9)), i)
+        for i, (measurement, delay_s) in enumerate(zip(d.measurements, delays, strict=True))
     ]
     arrivals += [(arrivals[i][0] + 300_000_000, i) for i in twice]
     rng.shuffle(arrivals)  # ties in any order
@@ -190,15 +87,15 @@ def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
         now = timeline.imu.latest_ns if sample < len(d.times) else arrivals[-1][0]
         while following < len(arrivals) and arrivals[following][0] <= now:
             i = arrivals[following][1]
-            entry = timeline.insert(d.aids[i])
+            entry = timeline.insert(d.measurements[i])
             if i in entries:
                 assert entry.outcome is not None
                 assert entry.outcome.name == "duplicate"
             entries.setdefault(i, entry)
             following += 1
             if not lazy:
-                timeline.run()
-        timeline.run()
+                timeline.advance()
+        timeline.advance()
 
     reference, outcomes = in_order()
     assert_same_state(timeline.estimator, reference)
@@ -210,18 +107,19 @@ def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
 
 
 def test_order_of_arrival_within_one_instant_is_not_seen() -> None:
-    """Aids of one instant at the very end of the data, before and after the filter got there."""
+    """Measurements of one instant at the very end of the data, before and after the filter got
+    there."""
     d = drive()
     end = int(d.times[-1])
-    last = [replace(a, t_ns=end) for a in d.aids[-3:]]  # type: ignore[type-var]
+    last = [replace(a, t_ns=end) for a in d.measurements[-3:]]  # type: ignore[type-var]
     states = []
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
         timeline = d.timeline()
         timeline.imu.append(d.times, d.samples)
-        timeline.run()
+        timeline.advance()
         for i in order:
             timeline.insert(last[i])
-            timeline.run()
+            timeline.advance()
         states.append(timeline.estimator)
     assert_same_state(states[0], states[1])
     assert_same_state(states[0], states[2])
@@ -231,15 +129,15 @@ def test_rows_of_one_instant_are_judged_together_as_each_by_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A compass and a position of one instant, some of which fail their gate: to the bit, the bank
-    as well. The reference goes on to each aid, and has judged those before it."""
+    as well. The reference goes on to each measurement, and has judged those before it."""
     d, judged = drive(), count(monkeypatch)
     reference, outcomes = applied_in_order()
     each = judged.total()
     judged.clear()
     timeline = d.timeline(keep_s=60.0)
     timeline.imu.append(d.times, d.samples)
-    entries = [timeline.insert(aid) for aid in d.aids]
-    timeline.run()
+    entries = [timeline.insert(measurement) for measurement in d.measurements]
+    timeline.advance()
     assert 0 < judged.total() < 0.8 * each
     assert [entry.outcome for entry in entries] == outcomes
     timeline.estimator.propagate(timeline.imu, timeline.imu.latest_ns)
@@ -263,30 +161,30 @@ def count(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 @pytest.mark.parametrize("chunk", [1, 33, 300])
-def test_an_aid_at_the_oldest_instant_is_exact_and_before_it_too_old(chunk: int) -> None:
+def test_a_measurement_at_the_oldest_instant_is_exact_and_before_it_too_old(chunk: int) -> None:
     """Whenever it comes: right after the buffer was moved, and with checkpoints far apart."""
     d = drive()
-    late = next(a for a in d.aids if isinstance(a, PositionAid))
+    late = next(a for a in d.measurements if isinstance(a, PositionMeasurement))
     for arrival in range(600, len(d.times), 97):
         timeline = d.timeline(checkpoint_s=1.0)
         for first in range(0, arrival, chunk):
             rows = slice(first, min(first + chunk, arrival))
             timeline.imu.append(d.times[rows], d.samples[rows])
             if rows.stop < arrival:
-                timeline.run()
+                timeline.advance()
         oldest = timeline.oldest_ns
         assert oldest <= timeline.imu.latest_ns - round(KEEP_S * 1e9)
         assert timeline.insert(replace(late, t_ns=oldest - 1)).outcome == Outcome("too_old")
-        aid = replace(late, t_ns=oldest)
-        assert timeline.insert(aid).outcome is None
-        timeline.run()
+        measurement = replace(late, t_ns=oldest)
+        assert timeline.insert(measurement).outcome is None
+        timeline.advance()
 
         reference = d.estimator()
         buffer = runs.filled_buffer(IMU, d.times[:arrival], d.samples[:arrival])
         reference.propagate(buffer, oldest)
         diagnosis = Diagnosis(kinds(reference.model))
-        one = diagnosis.comes(aid, reference)
-        assert diagnosis.judge(aid, one, reference.update(aid), reference) is None
+        one = diagnosis.comes(measurement, reference)
+        assert diagnosis.judge(measurement, one, reference.update(measurement), reference) is None
         reference.propagate(buffer, buffer.latest_ns)
         assert_same_state(timeline.estimator, reference)
 
@@ -294,30 +192,31 @@ def test_an_aid_at_the_oldest_instant_is_exact_and_before_it_too_old(chunk: int)
 def test_before_the_start() -> None:
     d = drive()
     timeline = Timeline(d.estimator(), d.timeline().imu, KEEP_S, 0.5)  # of no kinds
-    early = replace(d.aids[0], t_ns=START_NS - 1)  # type: ignore[type-var]
+    early = replace(d.measurements[0], t_ns=START_NS - 1)  # type: ignore[type-var]
     entry = timeline.insert(early)
-    timeline.insert(d.aids[1])
+    timeline.insert(d.measurements[1])
     timeline.start()
     assert entry.outcome == Outcome("no_alignment")
     assert timeline.counters.outcomes[early.source] == {"no_alignment": 1}
     assert timeline.insert(early).outcome == Outcome("too_old")
     timeline.imu.append(d.times, d.samples)
-    timeline.run()
-    assert timeline.counters.outcomes[d.aids[1].source]["fused"] == 1
+    timeline.advance()
+    assert timeline.counters.outcomes[d.measurements[1].source]["fused"] == 1
 
 
 def test_what_waits_is_bounded_and_ends_with_a_name() -> None:
-    """Days without alignment, or without IMU: aids come on and on, memory does not grow."""
+    """Days without alignment, or without IMU: measurements come on and on, memory does not grow."""
     d = drive()
     count = 20_000
-    aids = [replace(d.aids[0], t_ns=START_NS + k * 100_000_000) for k in range(count)]  # type: ignore[type-var]
-    source = d.aids[0].source
+    first: Any = d.measurements[0]
+    measurements = [replace(first, t_ns=START_NS + k * 100_000_000) for k in range(count)]
+    source = d.measurements[0].source
     for started, name in ((False, "no_alignment"), (True, "no_imu")):
         timeline = d.timeline()
         if not started:
             timeline.clear()
-        for aid in aids:
-            timeline.insert(aid)
+        for measurement in measurements:
+            timeline.insert(measurement)
         waiting = timeline.waiting
         assert waiting <= 5000
         assert timeline.counters.outcomes[source] == {name: count - waiting}
@@ -336,8 +235,8 @@ def test_memory_does_not_grow_on_a_long_run() -> None:
     for second in range(200):
         times = int(d.times[0]) + step * np.arange(1 + 50 * second, 51 + 50 * second)
         timeline.imu.append(times, still)
-        timeline.insert(replace(d.aids[0], t_ns=int(times[25]) - 3 * runs.SECOND))  # type: ignore[type-var]
-        timeline.run()
+        timeline.insert(replace(d.measurements[0], t_ns=int(times[25]) - 3 * runs.SECOND))  # type: ignore[type-var]
+        timeline.advance()
         sizes.append((len(timeline._entries), len(timeline._checkpoints), len(timeline.imu.times)))
     assert max(s[0] for s in sizes) < 20
     assert max(s[1] for s in sizes) < 40
@@ -353,21 +252,21 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
     timeline = d.timeline()
     fixes = [
         replace(a, lat_rad=a.lat_rad + (5e-5 if k >= 10 else 0.0))
-        for k, a in enumerate(a for a in d.aids if isinstance(a, PositionAid))
+        for k, a in enumerate(a for a in d.measurements if isinstance(a, PositionMeasurement))
     ]
     entries = []
     sample = 0
-    for velocity in (a for a in d.aids if isinstance(a, VelocityAid)):
+    for velocity in (a for a in d.measurements if isinstance(a, VelocityMeasurement)):
         timeline.insert(velocity)
     for fix in fixes:
         upto = int(np.searchsorted(d.times, fix.t_ns + round(delay_s * 1e9), side="right"))
         timeline.imu.append(d.times[sample:upto], d.samples[sample:upto])
         sample = upto
-        timeline.run()
+        timeline.advance()
         entries.append(timeline.insert(fix))
-        timeline.run()
+        timeline.advance()
     timeline.imu.append(d.times[sample:], d.samples[sample:])
-    timeline.run()
+    timeline.advance()
     names = [e.outcome.name for e in entries if e.outcome]
     assert set(names[:10]) == {"fused"}
     assert names[10:12] == ["gated"] * 2
@@ -379,18 +278,25 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
     assert finding.size[0] == pytest.approx(5e-5 * 6.35e6, rel=0.02)
 
 
-def test_a_wrong_heading_is_left_out() -> None:
-    """And told by how much it is off."""
+def with_wrong_heading() -> tuple[Timeline, list[str]]:
+    """The drive with a compass that is 40 deg off, and the outcomes of its headings."""
     d = drive()
     timeline = d.timeline()
     timeline.imu.append(d.times, d.samples)
     off = math.radians(40.0)
-    entries = [
-        timeline.insert(replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingAid) else a)
-        for a in d.aids
+    turned = [
+        replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingMeasurement) else a
+        for a in d.measurements
     ]
-    timeline.run()
-    names = [e.outcome.name for e in entries if e.outcome and isinstance(e.aid, HeadingAid)]
+    entries = [timeline.insert(measurement) for measurement in turned]
+    timeline.advance()
+    headings = [e for e in entries if isinstance(e.measurement, HeadingMeasurement)]
+    return timeline, [e.outcome.name for e in headings if e.outcome]
+
+
+def test_a_wrong_heading_is_left_out() -> None:
+    """And told by how much it is off."""
+    timeline, names = with_wrong_heading()
     # Until motion shows that it is not the unit that has turned nobody is accused.
     assert set(names[:3]) == {"gated"}
     assert set(names[3:]) == {"gated", "isolated"}
@@ -406,16 +312,7 @@ def test_a_wrong_heading_is_left_out() -> None:
 
 @pytest.mark.xfail(strict=True, reason="a unit that has turned fits a heading's offset for seconds")
 def test_a_wrong_heading_is_out_from_the_fourth_on() -> None:
-    d = drive()
-    timeline = d.timeline()
-    timeline.imu.append(d.times, d.samples)
-    off = math.radians(40.0)
-    entries = [
-        timeline.insert(replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingAid) else a)
-        for a in d.aids
-    ]
-    timeline.run()
-    names = [e.outcome.name for e in entries if e.outcome and isinstance(e.aid, HeadingAid)]
+    _, names = with_wrong_heading()
     assert set(names[3:]) == {"isolated"}
 
 
@@ -425,10 +322,10 @@ def test_a_heading_that_nothing_else_can_check_is_published_as_open() -> None:
     d = drive()
     timeline = d.timeline()
     timeline.imu.append(d.times, d.samples)
-    for a in d.aids:
-        if isinstance(a, HeadingAid):
+    for a in d.measurements:
+        if isinstance(a, HeadingMeasurement):
             timeline.insert(replace(a, yaw_rad=a.yaw_rad + math.radians(40.0)))
-    timeline.run()
+    timeline.advance()
     truth = runs.true_nav(runs.town_truth(SECONDS, IMU.rate_hz), np.array([SECONDS]))[0]
     error = runs.nav_error(timeline.estimator.nav, truth)[2]
     assert not timeline.diagnosis.findings

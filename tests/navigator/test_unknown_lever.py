@@ -8,7 +8,7 @@ import pytest
 
 from fusiond.configuration.aiding import UNKNOWN_LEVER_SD_M
 from fusiond.configuration.schema import Config
-from fusiond.models.vehicle import ANTENNA_LEVER, FIX_WANDER
+from fusiond.models.vehicle import ANTENNA_LEVER, FIX_MARKOV
 from fusiond.navigator.navigator import Navigator
 
 
@@ -20,7 +20,7 @@ def _levers(**settings: Any) -> dict[str, float]:
 
 def _wanders(**settings: Any) -> bool:
     """Whether the error that fixes share for seconds is a state."""
-    return Navigator(Config.model_validate(settings)).model.slots_of(FIX_WANDER) != []
+    return Navigator(Config.model_validate(settings)).model.slots_of(FIX_MARKOV) != []
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Directions that nothing shows: their sigma does not shrink, wherever the estimate goes.
 
 At one speed straight on nothing tells a lever arm from the place, a roll from a bias of the lateral
-accelerometer, or the heading; without aids, nothing tells a heading that was lost while the
+accelerometer, or the heading; without measurements, nothing tells a heading that was lost while the
 inertial unit was silent in a bend.
 """
 

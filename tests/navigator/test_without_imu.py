@@ -112,7 +112,7 @@ def test_the_unit_is_taken_in_when_it_comes() -> None:
     assert all(s.mode is Mode.NAVIGATING for s in d.said[130:took])
     assert d.said[took].reason == "Heading from GNSS course, on the move"
     assert not d.navigator.without_imu.active
-    assert d.navigator.serving is d.navigator.estimator
+    assert d.navigator.active_filter is d.navigator.estimator
 
 
 def test_it_takes_over_from_a_unit_that_has_fallen_silent_for_too_long() -> None:
@@ -184,7 +184,7 @@ def _late_fixes(strategy: str, kind: str) -> tuple[Array, Array]:
             errors.append(np.hypot(*way * runs.metres(true[0], true[2])[:2]))
             sigmas.append(math.hypot(*s.sd_ned_m[:2]))
     assert navigator.outcomes()["rdss"]["fused"] > 20
-    assert navigator.serving.isolates == (kind == "federated")
+    assert navigator.active_filter.isolates == (kind == "federated")
     return np.array(errors), np.array(sigmas)
 
 

@@ -20,7 +20,7 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
 from fusiond.offline.run_input import read_recorded
 from tests.clock.host_time import Host
-from tests.offline.options_drive import aids
+from tests.offline.options_drive import measurements
 
 Array = NDArray[np.float64]
 
@@ -59,13 +59,13 @@ def told(navigator: Navigator) -> Told:
 
 def by_process(config: Config, files: Path) -> Told:
     seen: list[Navigator] = []
-    process(config, files / "imu.csv", aids(config, files), watch=seen.append)
+    process(config, files / "imu.csv", measurements(config, files), watch=seen.append)
     return told(seen[-1])
 
 
 def by_daemon(config: Config, files: Path) -> Told:
     """The same arrivals through the daemon's chain, a tick a sample."""
-    read = read_recorded(config, files / "imu.csv", aids(config, files), (), None, None)
+    read = read_recorded(config, files / "imu.csv", measurements(config, files), (), None, None)
     times = np.rint(read.imu.t_s * 1e9).astype(np.int64)
     host = Host(mono=int(times[0]), true_utc_at_zero=0)
     clock = Clock(config.clock, host)

@@ -1,4 +1,5 @@
-"""A drive with every kind of aid as files, and the configuration that it is navigated by."""
+"""A drive with every kind of measurement as files, and the configuration that it is navigated
+by."""
 
 from __future__ import annotations
 
@@ -134,6 +135,6 @@ def write_files(folder: Path) -> Path:
     return folder
 
 
-def aids(config: Config, files: Path) -> list[tuple[str, Path]]:
+def measurements(config: Config, files: Path) -> list[tuple[str, Path]]:
     """The files that the configuration has a use for."""
     return [(FILES[n][0], files / FILES[n][1]) for n in config.aiding if n in FILES]

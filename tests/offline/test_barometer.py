@@ -1,4 +1,4 @@
-"""A barometer aids the height, by its own table and by the driver off a recorded bus."""
+"""A barometer measurements the height, by its own table and by the driver off a recorded bus."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_barometer_holds_the_height_by_table_and_by_bus(
     by_table, by_bus = tmp_path / "table.toml", tmp_path / "bus.toml"
     by_table.write_text(VEHICLE)
     by_bus.write_text(VEHICLE + BUS)
-    aids = [("gnss", written.files["gnss"]), ("barometer", written.files["barometer"])]
+    measurements = [("gnss", written.files["gnss"]), ("barometer", written.files["barometer"])]
     late = [("gnss", shifted(written.files["gnss"], tmp_path / "gnss.csv"))]
     log = bus(written, tmp_path / "bus.blf")
     seen: list[Navigator] = []
@@ -110,7 +110,7 @@ def test_a_barometer_holds_the_height_by_table_and_by_bus(
             found = process(config, None, late, window, out, can_log=log, watch=seen.append)
         else:
             config = load_config(by_table)
-            found = process(config, written.files["imu"], aids, window, out)
+            found = process(config, written.files["imu"], measurements, window, out)
         solution = read_solution(out)
         at_s = truth.t_s[(truth.t_s >= OUTAGE[0]) & (truth.t_s < SECONDS - 1.0)]
         rows = [

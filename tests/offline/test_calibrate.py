@@ -172,8 +172,8 @@ def test_times_scale_and_axle_of_a_simulated_drive_are_found(tmp_path: Path) -> 
         "aiding": {"gnss": {"lever_arm_m": [0.0, 0.0, -1.0], "bias_sd_m": 0.0}, "wheel": {}},
         "constraints": {"non_holonomic": {"enabled": True, "lever_arm_m": [0.0, 0.0, 0.5]}},
     }
-    aids = [("gnss", tmp_path / "gnss.csv"), ("wheel", tmp_path / "wheel.csv")]
-    found = calibrate(Config.model_validate(settings), files(tmp_path / "imu.csv", aids))
+    measurements = [("gnss", tmp_path / "gnss.csv"), ("wheel", tmp_path / "wheel.csv")]
+    found = calibrate(Config.model_validate(settings), files(tmp_path / "imu.csv", measurements))
     imu, wheel = found.config.imu, found.config.aiding["wheel"]
     assert isinstance(wheel, WheelAiding)
     assert imu.time_offset_s == pytest.approx(-GNSS_LATE_S, abs=0.04)

@@ -18,8 +18,8 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import MissingPackageError, TableError
 from fusiond.files.tables import read_gnss, read_imu, read_wheel
-from fusiond.offline.aid_files import READERS, Arrival
 from fusiond.offline.can_log import CanLog, read_can_log
+from fusiond.offline.measurement_files import READERS, Arrival
 from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.places import DATA, REPOSITORY

@@ -52,12 +52,12 @@ class Said(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What it said; `apart`, by how much at most the sigmas of a row are another's than those of
-    the daemon's solution of that instant; and the truth."""
+    """What it said; `without_overlap`, by how much at most the sigmas of a row are another's than
+    those of the daemon's solution of that instant; and the truth."""
 
     filtered: Said
     smoothed: Said
-    apart: float
+    without_overlap: float
     truth: TrajectoryTable
 
 
@@ -75,7 +75,7 @@ def _driven(folder: Path, run: int) -> Run:
     simulate(replace(scenario, path=town, gnss=receiver), folder, run, SECONDS)
     _shifted(folder / "gnss.csv", LATE_S, 2)
     _shifted(folder / "imu.csv", CLOCK_SD_S * NormalDist().inv_cdf((run + 0.5) / RUNS), 1)
-    rows, apart = [], [0.0]
+    rows, without_overlap = [], [0.0]
 
     def watch(navigator: Navigator) -> None:
         e, imu = navigator.estimator, navigator.imu
@@ -86,14 +86,14 @@ def _driven(folder: Path, run: int) -> Run:
         rows.append(np.array([e.t_ns * 1e-9, s.lat_rad, s.lon_rad, *said]))
         row = e.sample - 1 - imu.start
         if imu.times[row] == e.t_ns:  # nothing has been fused since it was written
-            apart.append(float(np.abs(imu.sigmas[row] / said - 1.0).max()))
+            without_overlap.append(float(np.abs(imu.sigmas[row] / said - 1.0).max()))
 
     out = folder / "solution.csv"
-    aids = [("gnss", folder / "gnss.csv")]
-    result = process(VEHICLE, folder / "imu.csv", aids, out=out, watch=watch, smooth=True)
+    measurements = [("gnss", folder / "gnss.csv")]
+    result = process(VEHICLE, folder / "imu.csv", measurements, out=out, watch=watch, smooth=True)
     assert "fixes_late" in [event["code"] for event in result["events"]]
     file, told = read_solution(out), np.array(rows)
-    assert len(apart) > 10
+    assert len(without_overlap) > 10
     return Run(
         Said(told[:, 0], told[:, 1:3], told[:, 3:]),
         Said(
@@ -101,7 +101,7 @@ def _driven(folder: Path, run: int) -> Run:
             np.column_stack((file.lat_rad, file.lon_rad)),
             np.hstack((file.sd_position, file.sd_v, file.sd_rpy)),
         ),
-        max(apart),
+        max(without_overlap),
         read_truth(folder / "truth.csv"),
     )
 
@@ -113,4 +113,4 @@ def test_sigma_holds_what_the_clock_may_be_off_by(tmp_path: Path) -> None:
     assert low <= sum(run.filtered.squares(run.truth) for run in runs) / RUNS <= high
     assert low <= sum(run.smoothed.squares(run.truth) for run in runs) / RUNS <= high
     # What is fused at the very instant of a sample comes after its row; the clock is a factor of 5.
-    assert max(run.apart for run in runs) < 0.01
+    assert max(run.without_overlap for run in runs) < 0.01

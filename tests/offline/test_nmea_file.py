@@ -15,7 +15,7 @@ from drivers.measurements import Heading, MagneticHeading, MonotonicStamp, Posit
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
-from fusiond.offline.aid_files import Arrival
+from fusiond.offline.measurement_files import Arrival
 from fusiond.offline.process import process
 from fusiond.offline.run_input import Recorded, read_recorded
 from tests.offline.nmea_lines import sentence

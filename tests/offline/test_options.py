@@ -1,8 +1,8 @@
 """Each option of the configuration changes `process` as it changes the daemon.
 
-One drive with every kind of aid, from files, goes through `process` and, arrival by arrival,
-through the door of the daemon's chain, tick by tick: the filter's state at the end is the same to
-the bit. An option that is new must be put here, or among those that no recorded file knows.
+One drive with every kind of measurement, from files, goes through `process` and, arrival by
+arrival, through the door of the daemon's chain, tick by tick: the filter's state at the end is the
+same to the bit. An option that is new must be put here, or among those that no recorded file knows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from fusiond.configuration.aiding import AnyAiding
 from fusiond.configuration.schema import Config
-from fusiond.offline.aid_files import source_of
+from fusiond.offline.measurement_files import source_of
 from tests.offline.both_ways import Told, by_daemon, by_process
 from tests.offline.options import CHANGED, NO_FILE_KNOWS
 from tests.offline.options_drive import BASE, write_files

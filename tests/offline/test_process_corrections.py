@@ -74,11 +74,11 @@ def imu(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def processed(folder: Path, imu: Path, corrected: bytes | None) -> TrajectoryTable:
     """The solution by GPS alone."""
     folder.mkdir()
-    aids, out = [("raw", STREAM)], folder / "solution.csv"
+    measurements, out = [("raw", STREAM)], folder / "solution.csv"
     if corrected is not None:
         (folder / "corrections.rtcm3").write_bytes(corrected)
-        aids.append(("raw", folder / "corrections.rtcm3"))
-    process(load_config(CONFIG), imu, aids, None, out, ("G",))
+        measurements.append(("raw", folder / "corrections.rtcm3"))
+    process(load_config(CONFIG), imu, measurements, None, out, ("G",))
     return read_solution(out)
 
 

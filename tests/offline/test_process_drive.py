@@ -43,8 +43,8 @@ def _process(
     if smooth:
         white = config.aiding["gnss"].model_copy(update={"bias_sd_m": 0.0})
         config = config.model_copy(update={"aiding": {**config.aiding, "gnss": white}})
-    aids = [("gnss", DRIVE / "gnss.csv")]
-    result = process(config, DRIVE / "imu.csv", aids, outages, out, smooth=smooth)
+    measurements = [("gnss", DRIVE / "gnss.csv")]
+    result = process(config, DRIVE / "imu.csv", measurements, outages, out, smooth=smooth)
     return result, out
 
 

@@ -46,8 +46,8 @@ def _process(
     systems: tuple[System, ...] | None = None,
 ) -> tuple[dict[str, Any], TrajectoryTable]:
     out = folder / "solution.csv"
-    aids = [("raw", stream)]
-    result = process(load_config(CONFIG), WALK / "imu.csv", aids, outages, out, systems)
+    measurements = [("raw", stream)]
+    result = process(load_config(CONFIG), WALK / "imu.csv", measurements, outages, out, systems)
     return result, read_solution(out)
 
 
@@ -169,8 +169,8 @@ FEW = np.arange(START_S, START_S + LENGTH_S, 0.25)
 
 def _growth(solution: TrajectoryTable, all_in_view: TrajectoryTable) -> float:
     """How far a solution gets away from the one with all satellites (m)."""
-    apart = _errors(solution, FEW) - _errors(all_in_view, FEW)
-    return float(np.hypot(*apart.T).max())
+    without_overlap = _errors(solution, FEW) - _errors(all_in_view, FEW)
+    return float(np.hypot(*without_overlap.T).max())
 
 
 @pytest.fixture(scope="module")

@@ -126,10 +126,12 @@ def test_three_protocols_give_one_navigation(logs: dict[str, Path], tmp_path: Pa
             (other.lon_rad, ubx.lon_rad, 6.4e6),
             (other.height_m, ubx.height_m, 1.0),
         ):
-            apart = np.abs(a[-rows:] - b[-rows:]) * metres
-            assert np.quantile(apart, 0.5) < 0.005
-            assert np.quantile(apart, 0.99) < 0.2  # a decision may fall an epoch apart
-            assert apart.max() < 0.5  # where the course starts it half a millisecond later
+            without_overlap = np.abs(a[-rows:] - b[-rows:]) * metres
+            assert np.quantile(without_overlap, 0.5) < 0.005
+            assert np.quantile(without_overlap, 0.99) < 0.2  # a decision may fall an epoch apart
+            assert (
+                without_overlap.max() < 0.5
+            )  # where the course starts it half a millisecond later
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from fusiond.commands.app import app
 from fusiond.files.tables import read_imu, read_solution
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
-from fusiond.offline.aid_files import READERS
+from fusiond.offline.measurement_files import READERS
 from tests.drivers.raw.test_rinex import BEIDOU, NOW, header, nav4, observed
 from tests.gnss.test_station import NAVIGATION, OBSERVATIONS, PLACE, STATION
 
@@ -52,11 +52,11 @@ def standing(path: Path, begin_s: float) -> Path:
     return path
 
 
-def run(tmp_path: Path, imu: Path, *aids: Path) -> tuple[int, str]:
+def run(tmp_path: Path, imu: Path, *measurements: Path) -> tuple[int, str]:
     (tmp_path / "c.toml").write_text(CONFIG)
     command = ["process", str(tmp_path / "c.toml"), "--imu", str(imu)]
-    for aid in aids:
-        command += ["--aid", f"raw={aid}"]
+    for measurement in measurements:
+        command += ["--aid", f"raw={measurement}"]
     done = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "out.csv")])
     return done.exit_code, done.output
 

@@ -44,9 +44,9 @@ class Files:
     def process(self, name: str, smoothed: bool) -> tuple[dict[str, Any], Path]:
         out = self.folder / name
         config = load_config(REPOSITORY / "config" / "vehicle.toml")
-        aids = [(kind, self.folder / f"{kind}.csv") for kind in ("gnss", "rdss")]
+        measurements = [(kind, self.folder / f"{kind}.csv") for kind in ("gnss", "rdss")]
         imu = self.folder / "imu.csv"
-        return process(config, imu, aids, self.outages, out, smooth=smoothed), out
+        return process(config, imu, measurements, self.outages, out, smooth=smoothed), out
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ from fusiond.outputs.messages.innovations import Innovation, innovations_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.short_message import of_stage
-from fusiond.outputs.messages.status import RecordingStatus, status_message
+from fusiond.outputs.messages.status import DaemonState, RecordingStatus, status_message
 from fusiond.outputs.messages.tracker import tracker_message
 
 UTC_NS = 1_795_217_587_123_456_789
@@ -101,24 +101,26 @@ EXAMPLES: dict[str, Any] = {
     "status": status_message(
         SOLUTION,
         UTC_NS,
-        since_utc_ns=UTC_NS - 3_500_000_000_000,
-        version="0.1.0",
-        config_digest="9f2c41d07be3",
-        uptime_s=3604.12,
-        scheduler=SCHEDULER,
-        fused=35_610,
-        rejected=14,
-        calibrated=False,
-        imu="imu",
-        faults=(FAULT,),
-        recording=RecordingStatus(
-            "recording",
-            "/var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap",
-            0,
-            41_290.4,
+        DaemonState(
+            since_utc_ns=UTC_NS - 3_500_000_000_000,
+            version="0.1.0",
+            config_digest="9f2c41d07be3",
+            uptime_s=3604.12,
+            scheduler=SCHEDULER,
+            fused=35_610,
+            rejected=14,
+            calibrated=False,
+            imu="imu",
+            faults=(FAULT,),
+            recording=RecordingStatus(
+                "recording",
+                "/var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap",
+                0,
+                41_290.4,
+            ),
+            injected=(),
+            mqtt={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
         ),
-        injected=(),
-        mqtt={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
     ),
     "health": health_message(
         UTC_NS,

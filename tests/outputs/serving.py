@@ -87,5 +87,5 @@ async def feed(output: Output, done: Callable[[], bool], **changed: Any) -> None
     """Epoch after epoch, each taken before the next, until `done`."""
     async with asyncio.timeout(PATIENCE_S):
         while not done():
-            output.take(NAV, nav(**changed))
+            output.publish(NAV, nav(**changed))
             await asyncio.sleep(0.001)

@@ -136,13 +136,13 @@ async def test_each_user_may_do_what_is_its_business(broker: Broker, certificate
         ):
             for listener in (seen, heard):
                 await listener.until(lambda li: li.payloads("fusiond/truck/online") == [b"online"])
-            publisher.take(NAV, EXAMPLES["nav"])
-            publisher.take(STATUS, EXAMPLES["status"])
-            publisher.take(HEALTH, EXAMPLES["health"])
-            publisher.take(CONSISTENCY, EXAMPLES["consistency"])
-            publisher.take(INNOVATIONS, EXAMPLES["innovations"])
-            publisher.take(CALIBRATION, EXAMPLES["calibration"])
-            publisher.take(EVENT, EXAMPLES["event"])
+            publisher.publish(NAV, EXAMPLES["nav"])
+            publisher.publish(STATUS, EXAMPLES["status"])
+            publisher.publish(HEALTH, EXAMPLES["health"])
+            publisher.publish(CONSISTENCY, EXAMPLES["consistency"])
+            publisher.publish(INNOVATIONS, EXAMPLES["innovations"])
+            publisher.publish(CALIBRATION, EXAMPLES["calibration"])
+            publisher.publish(EVENT, EXAMPLES["event"])
             figures = ("nav", "status", "health", "consistency", "innovations", "calibration")
             for topic in (*figures, "event"):
                 await seen.until(lambda li, name=topic: li.payloads(f"fusiond/truck/{name}"))
@@ -183,9 +183,9 @@ async def test_the_dashboard_listens_as_its_own_user(broker: Broker, certificate
     tls = _shown(certificates, "dashboard")
     with broker:
         listener = dashboard_broker.Broker(Access("127.0.0.1", broker.port, tls=tls), hub)
-        listens = asyncio.create_task(listener.run())
+        listens = asyncio.create_task(listener.listen())
         async with _daemon(broker, certificates, []) as publisher:
-            publisher.take(STATUS, EXAMPLES["status"])
+            publisher.publish(STATUS, EXAMPLES["status"])
             await until(lambda: "truck" in hub.vehicles and hub.vehicles["truck"].said("status"))
         assert hub.link.state == "up"
         listens.cancel()

@@ -88,7 +88,7 @@ async def test_a_server_waits_for_no_guest_of_another(monkeypatch: pytest.Monkey
 async def test_who_is_loud_does_not_silence_the_others() -> None:
     """Sixty-three who ask without end, and one who asks once."""
     async with gpsd() as server, connected(server.server.port.address) as patient:
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         loud = []
         for _ in range(63):
             sock = socket.create_connection(server.server.port.address)
@@ -149,13 +149,13 @@ async def test_a_poll_is_made_once_an_epoch(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(GpsdServer, "reports", counted)
     async with gpsd() as server, connected(server.server.port.address) as client:
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         await client.line()
         client.writer.write(b"?POLL;" * 20)
         answers = [await client.line() for _ in range(20)]
         assert len(set(answers)) == 1
         assert made == 1
-        server.take(NAV, nav(height_m=1.0))
+        server.publish(NAV, nav(height_m=1.0))
         client.writer.write(b"?POLL;")
         assert json.loads(await client.line())["tpv"][0]["altHAE"] == 1.0
         assert made == 2
@@ -168,7 +168,7 @@ async def test_who_sends_too_much_is_read_more_slowly() -> None:
         for _ in range(1000):
             talker.writer.write(b"x" * 4096)
         await until(lambda: server.counters["slowed"] > 0)
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         assert (await talker.line()).startswith(b"$GNRMC")
         # What goes on after a while is read again.
         await until(lambda: server.counters["slowed"] > 1)
@@ -192,8 +192,8 @@ async def test_who_asks_and_never_reads_is_dropped_in_time(
         deaf = socket.socket()
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         deaf.connect(server.server.port.address)
-        server.take(HEALTH, EXAMPLES["health"])
-        server.take(NAV, nav())
+        server.publish(HEALTH, EXAMPLES["health"])
+        server.publish(NAV, nav())
         deaf.sendall(b"?POLL;" * int(MESSAGES.burst))
         await until(lambda: server.counters["clients_dropped"] == 1)
         assert not server.server.clients

@@ -18,8 +18,8 @@ from fusiond.outputs.messages.event_catalogue import EVENTS, UNKNOWN, entry_of
 from tests.places import REPOSITORY
 from tools.event_page import PAGE, page
 
-REPORTING = {"_event", "on_event", "_on_event", "event", "DeviceEvent", "Notice", "_notify", "tell"}
-REPORTING |= {"_tell", "report", "navigator_event"}
+REPORTING = {"_event", "on_event", "_on_event", "event", "DeviceEvent", "Notice", "_notify"}
+REPORTING |= {"_report", "report", "navigator_event"}
 SERVERS = ("nmea", "gpsd", "prometheus", "foxglove")
 NOT_TOLD = {"message_sent", "message_delivered", "message_superseded"}
 """Ends of a message that are no event: it arrived, or a later one replaced it."""
@@ -89,8 +89,8 @@ def test_meaning_and_advice_are_short_sentences() -> None:
             assert sentence == "" or sentence.endswith(".")
 
 
-def test_every_error_has_a_next_step() -> None:
-    assert [code for code, e in EVENTS.items() if e.level == "error" and not e.advice] == []
+def test_every_warning_and_error_has_a_next_step() -> None:
+    assert [code for code, e in EVENTS.items() if e.level != "info" and not e.advice] == []
 
 
 def test_a_code_of_another_package_is_information() -> None:

@@ -96,7 +96,7 @@ async def test_a_viewer_sees_what_it_has_subscribed_to(protocol: str) -> None:
         serving() as (server, url),
         connect(url, subprotocols=[Subprotocol(protocol)]) as viewer,
     ):
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         hello, advertised = [json.loads(await viewer.recv()) for _ in range(2)]
         assert viewer.subprotocol == protocol
         assert (hello["op"], hello["name"]) == ("serverInfo", "fusiond truck")
@@ -111,7 +111,7 @@ async def test_a_viewer_sees_what_it_has_subscribed_to(protocol: str) -> None:
         subscription, t_ns, fix = await received(viewer)  # the last one, at once
         assert (subscription, t_ns) == (7, 1_795_217_587_123_000_000)
         assert fix["latitude"] == 31.025438871
-        server.take(HEALTH, EXAMPLES["health"])
+        server.publish(HEALTH, EXAMPLES["health"])
         subscription, _, health = await received(viewer)
         assert subscription == 2**32 - 1
         assert health == json.loads(EXAMPLES["health"].model_dump_json())
@@ -119,8 +119,8 @@ async def test_a_viewer_sees_what_it_has_subscribed_to(protocol: str) -> None:
         await subscribe(viewer, log=3)
         await viewer.send("{}")  # its answer comes when all before it has been carried out
         assert json.loads(await viewer.recv())["op"] == "status"
-        server.take(HEALTH, EXAMPLES["health"])
-        server.take(EVENT, EXAMPLES["event"])
+        server.publish(HEALTH, EXAMPLES["health"])
+        server.publish(EVENT, EXAMPLES["event"])
         subscription, _, said = await received(viewer)
         assert (subscription, said["level"], said["name"]) == (3, 3, "rdss")
         assert server.counters["malformed"] == 1
@@ -141,9 +141,9 @@ async def test_one_who_does_not_read_costs_the_others_nothing() -> None:
         await subscribe(quick, nav=2)
         async with asyncio.timeout(PATIENCE_S):
             while not server.counters["skipped"]:
-                server.take(HEALTH, EXAMPLES["health"])
+                server.publish(HEALTH, EXAMPLES["health"])
                 await asyncio.sleep(0)
-        server.take(NAV, nav(height_m=-5.0))
+        server.publish(NAV, nav(height_m=-5.0))
         while (await received(quick))[2]["height_m"] != -5.0:
             pass
         stuck.transport.abort()

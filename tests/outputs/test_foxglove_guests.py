@@ -106,7 +106,7 @@ async def test_a_message_is_encoded_once_for_all(monkeypatch: pytest.MonkeyPatch
             return dumps(*args, **options)
 
         monkeypatch.setattr("fusiond.outputs.foxglove.channels.json.dumps", counted)
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         got = [await viewer.recv() for viewer in (one, two) for _ in range(5)]
         assert len({bytes(data)[13:] for data in got if isinstance(data, bytes)}) == 1
         assert made == 1
@@ -157,7 +157,7 @@ def frames(draw: st.DrawFn) -> bytes:
 @settings(max_examples=200, deadline=None)
 def test_a_viewer_survives_everything(sent: list[bytes], upgraded: bool, piece: int) -> None:
     server = FoxgloveServer(Foxglove(port=1), Around().surroundings)
-    server.take(NAV, nav())
+    server.publish(NAV, nav())
     server.greeting = b""  # 0.05 s
     client = FakeClient()
     viewer = Viewer(server, client)  # type: ignore[arg-type]

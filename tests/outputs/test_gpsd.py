@@ -50,12 +50,12 @@ async def watching(server: GpsdServer, client: TcpClient, request: bytes) -> lis
 
 async def test_a_client_watches_and_polls() -> None:
     async with serving() as server, connected(server.server.port.address) as client:
-        server.take(HEALTH, EXAMPLES["health"])
+        server.publish(HEALTH, EXAMPLES["health"])
         lines = [json.loads(x) for x in await watching(server, client, WATCH)]
         assert [x["class"] for x in lines] == ["VERSION", "DEVICES", "WATCH"]
         assert lines[0]["proto_major"] == 3
         assert lines[2]["enable"] is lines[2]["json"] is True
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         epoch = [json.loads(await client.line()) for _ in range(4)]
         assert [x["class"] for x in epoch] == ["TPV", "ATT", "GST", "SKY"]
         assert {x["device"] for x in epoch} == {"fusiond://truck"}
@@ -67,7 +67,7 @@ async def test_a_client_watches_and_polls() -> None:
         client.writer.write(b'?WATCH={"enable":false};?NONSENSE;')
         answers = [json.loads(await client.line()) for _ in range(3)]
         assert [x["class"] for x in answers] == ["DEVICES", "WATCH", "ERROR"]
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         client.writer.write(b"?VERSION;")
         assert json.loads(await client.line())["class"] == "VERSION"
         assert server.counters["malformed"] == 1
@@ -78,15 +78,15 @@ async def test_a_client_without_semicolon_and_one_that_wants_nmea() -> None:
     async with serving() as server:
         async with connected(server.server.port.address) as gps3:
             await watching(server, gps3, b'?WATCH={"enable":true,"json":true}')
-            server.take(NAV, nav())
+            server.publish(NAV, nav())
             assert json.loads(await gps3.line())["class"] == "TPV"
         async with connected(server.server.port.address) as gpspipe:
             await watching(server, gpspipe, b'?WATCH={"enable":true,"nmea":true};\n')
-            server.take(NAV, nav())
+            server.publish(NAV, nav())
             assert (await gpspipe.line()).startswith(b"$GNRMC,233307.12,A,3101.5263323,N,")
         async with connected(server.server.port.address) as kismet:
             await watching(server, kismet, b'?WATCH={"json":true};\n')
-            server.take(NAV, nav())
+            server.publish(NAV, nav())
             assert json.loads(await kismet.line())["class"] == "TPV"
 
 
@@ -106,7 +106,7 @@ async def test_a_client_that_names_no_format_gets_answers_alone() -> None:
             "pps": False,
         }
         for _ in range(2):
-            server.take(NAV, nav())
+            server.publish(NAV, nav())
             await asyncio.sleep(0)
             client.writer.write(b"?POLL;\n")
             polled = json.loads(await client.line())
@@ -128,7 +128,7 @@ async def test_clients_that_leave_at_once_or_ask_nonsense_harm_nobody() -> None:
             await rude.line()
             assert json.loads(await rude.line())["class"] == "ERROR"
         await until(lambda: len(server.server.clients) == 1)
-        server.take(NAV, nav())
+        server.publish(NAV, nav())
         assert json.loads(await patient.line())["class"] == "TPV"
 
 
@@ -283,7 +283,7 @@ async def feed_seconds(server: GpsdServer | NmeaServer) -> None:
     assert t_ms is not None
     for second in range(10_000):
         at = t_ms % 60_000 // 1000 + second
-        server.take(
+        server.publish(
             NAV, nav(t_ms=t_ms + 1000 * second, t_utc=f"2026-11-20T23:33:{at % 60:02d}.123Z")
         )
         await asyncio.sleep(0.05)

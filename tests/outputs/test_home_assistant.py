@@ -69,7 +69,7 @@ async def test_the_broker_keeps_the_description_and_gets_it_again(tmp_path: Path
                 await client.publish("homeassistant/status", b"online", qos=1)
                 await listener.until(lambda li: len(li.payloads(address)) >= 2)
             assert output.counters["births"] == 1
-            mqtt.take(STATUS, EXAMPLES["status"])
+            mqtt.publish(STATUS, EXAMPLES["status"])
             await until(lambda: mqtt.counters["mqtt_published"] >= 4)
         async with listening(broker, "homeassistant/#") as (late, _):
             await late.until(lambda li: li.payloads(address))

@@ -22,16 +22,16 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
         async with listening(broker) as (listener, _):
             async with running(options(broker)) as it:
                 p = it.publisher
-                p.take(NAV, EXAMPLES["nav"])
-                p.take(STATUS, EXAMPLES["status"])
-                p.take(HEALTH, EXAMPLES["health"])
-                p.take(CALIBRATION, EXAMPLES["calibration"])
-                p.take(EVENT, EXAMPLES["event"])
+                p.publish(NAV, EXAMPLES["nav"])
+                p.publish(STATUS, EXAMPLES["status"])
+                p.publish(HEALTH, EXAMPLES["health"])
+                p.publish(CALIBRATION, EXAMPLES["calibration"])
+                p.publish(EVENT, EXAMPLES["event"])
                 for topic in (NAV, STATUS, HEALTH, CALIBRATION, EVENT):
                     payload = (await listener.until(heard(topic.name)))[0]
                     assert topic.message.model_validate_json(payload) == EXAMPLES[topic.name]
                 assert heard("online")(listener) == [b"online"]
-                p.take(EVENT, event("last words"))
+                p.publish(EVENT, event("last words"))
             await listener.until(lambda li: b"offline" in heard("online")(li))
             assert json.loads(heard("event")(listener)[-1])["text"] == "last words"
         async with listening(broker) as (late, _):
@@ -73,8 +73,8 @@ async def test_slow_broker_gets_the_newest_and_the_rest_is_counted(tmp_path: Pat
     broker = Broker(tmp_path)
     async with running(options(broker, queue=3)) as it:
         for k in range(10):
-            it.publisher.take(NAV, nav(float(k)))
-            it.publisher.take(EVENT, event(str(k)))
+            it.publisher.publish(NAV, nav(float(k)))
+            it.publisher.publish(EVENT, event(str(k)))
         assert it.publisher.counters["mqtt_dropped"] == 9 + 7
         await it.until(lambda r: "mqtt_absent" in r.codes())
         assert it.publisher.status.state == "absent"
@@ -90,14 +90,14 @@ async def test_slow_broker_gets_the_newest_and_the_rest_is_counted(tmp_path: Pat
 async def test_broker_killed_and_restarted(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker)) as it:
-            it.publisher.take(STATUS, EXAMPLES["status"])
-            it.publisher.take(CALIBRATION, EXAMPLES["calibration"])
+            it.publisher.publish(STATUS, EXAMPLES["status"])
+            it.publisher.publish(CALIBRATION, EXAMPLES["calibration"])
             async with listening(broker) as (listener, _):
                 await listener.until(heard("status"))
                 await listener.until(heard("calibration"))
             broker.kill()
             await it.until(lambda r: "mqtt_lost" in r.codes())
-            it.publisher.take(EVENT, event("while it was away"))
+            it.publisher.publish(EVENT, event("while it was away"))
             broker.start()
             async with listening(broker) as (listener, _):
                 await listener.until(heard("event"))
@@ -111,7 +111,7 @@ async def test_broker_killed_and_restarted(tmp_path: Path) -> None:
 async def test_frozen_broker_is_noticed_and_costs_no_tick(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker, keepalive_s=2)) as it:
-            it.publisher.take(STATUS, EXAMPLES["status"])
+            it.publisher.publish(STATUS, EXAMPLES["status"])
             async with listening(broker) as (listener, _):
                 await listener.until(heard("status"))
             broker.freeze()
@@ -120,7 +120,7 @@ async def test_frozen_broker_is_noticed_and_costs_no_tick(tmp_path: Path) -> Non
             def lost(r: Running) -> bool:
                 nonlocal ticks
                 ticks += 1
-                r.publisher.take(NAV, nav(float(ticks)))
+                r.publisher.publish(NAV, nav(float(ticks)))
                 return r.publisher.status.state == "absent"
 
             await it.until(lost)
@@ -144,14 +144,14 @@ async def test_shutdown_with_a_frozen_broker_ends(tmp_path: Path) -> None:
             async with running(options(broker, keepalive_s=600)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 broker.freeze()
-                it.publisher.take(EVENT, event("nobody hears this"))
+                it.publisher.publish(EVENT, event("nobody hears this"))
 
 
 async def test_heartbeat_keeps_an_idle_connection(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker, keepalive_s=1)) as it, listening(broker) as (li, _):
             await li.until(lambda li: len(heard("online")(li)) >= 4)
-            it.publisher.take(STATUS, EXAMPLES["status"])
+            it.publisher.publish(STATUS, EXAMPLES["status"])
             await li.until(lambda li: len(heard("status")(li)) >= 4)
             assert it.codes() == ["mqtt_connected"]
 

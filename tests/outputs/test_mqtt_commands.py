@@ -97,7 +97,7 @@ async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> No
             async with running(options(broker), on_command=handler(taken)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"3"}', qos=1)
-                it.publisher.take(EVENT, event("after the command"))
+                it.publisher.publish(EVENT, event("after the command"))
                 await listener.until(heard("event"))
     assert [c.id for c in taken] == ["2"]
 
@@ -127,17 +127,17 @@ async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(
             )
             sent = 0
             while sender.returncode is None:
-                it.publisher.take(NAV, nav(float(sent)))
+                it.publisher.publish(NAV, nav(float(sent)))
                 sent += 1
                 await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
-            it.publisher.take(EVENT, event("after the flood"))
+            it.publisher.publish(EVENT, event("after the flood"))
             await listener.until(heard("event"))
             # Commands and replies keep their order: whoever has the reply to a later one has all of
             # the flood's. One of too many is not answered, so it is asked for until it is.
             while not any(r["id"] and r["id"].startswith("later") for r in replies(listener)):
                 again = json.dumps({"id": f"later{sent}"})
                 await client.publish(f"{BASE}/cmd/reset_filter", again, qos=1)
-                it.publisher.take(NAV, nav(float(sent)))
+                it.publisher.publish(NAV, nav(float(sent)))
                 sent += 1
                 await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
     answers = replies(listener)

@@ -62,8 +62,8 @@ async def test_a_flood_delays_no_confirmation_and_is_not_listened_to(
             try:
                 await it.until(lambda it: "mqtt_flooded" in it.codes())
                 for number in range(20):
-                    it.publisher.take(EVENT, event(f"meanwhile {number}"))
-                    it.publisher.take(NAV, nav(float(number)))
+                    it.publisher.publish(EVENT, event(f"meanwhile {number}"))
+                    it.publisher.publish(NAV, nav(float(number)))
                     await listener.until(lambda li, n=number: len(heard("event")(li)) > n)
                     await listener.until(lambda li, n=number: len(heard("nav")(li)) > n)
             finally:

@@ -145,14 +145,14 @@ async def test_the_dashboard_verifies_its_broker_too(ours: Authority, tmp_path: 
     with served(tmp_path, *ours.issue("localhost")) as broker:
         stranger = ssl.create_default_context(cafile=str(Authority(tmp_path / "other").ca))
         access = Access("127.0.0.1", broker.port, tls=stranger)
-        listens = asyncio.create_task(DashboardBroker(access, hub).run())
+        listens = asyncio.create_task(DashboardBroker(access, hub).listen())
         await until(lambda: hub.link.state == "lost")
         assert "CERTIFICATE_VERIFY_FAILED" in hub.link.text
         listens.cancel()
         await asyncio.gather(listens, return_exceptions=True)
         known = ssl.create_default_context(cafile=str(ours.ca))
         access = Access("127.0.0.1", broker.port, tls=known)
-        listens = asyncio.create_task(DashboardBroker(access, hub).run())
+        listens = asyncio.create_task(DashboardBroker(access, hub).listen())
         await until(lambda: hub.link.state == "up")
         section = options(broker, tls=True, ca_file=ours.ca)
         async with running(section) as it:

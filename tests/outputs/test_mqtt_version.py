@@ -18,7 +18,7 @@ from fusiond.outputs.mqtt_version import MqttVersion
 from fusiond.outputs.topics import EVENT
 from tests.broker import Broker, listening
 from tests.outputs.old_broker import HANGS_UP, REFUSES, SILENT, old_broker
-from tests.outputs.publisher import BASE, event, heard, options, running
+from tests.outputs.publisher import BASE, Running, event, heard, options, running
 from tests.patience import PATIENCE_S, until
 
 
@@ -44,7 +44,7 @@ async def test_a_broker_of_3_1_1_is_spoken_to_in_its_version(
         ):
             await it.until(lambda r: r.codes() == ["mqtt_connected"])
             assert old.versions == [5, 4]
-            it.publisher.take(EVENT, event("by 3.1.1"))
+            it.publisher.publish(EVENT, event("by 3.1.1"))
             await listener.until(heard("event"))
             while not heard("reply")(listener):
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"1"}', qos=1)
@@ -55,12 +55,24 @@ async def test_a_broker_of_3_1_1_is_spoken_to_in_its_version(
             assert it.publisher.counters["mqtt_reconnects"] == 1
 
 
+async def test_a_broker_that_is_known_to_be_of_3_1_1_is_not_asked_for_5(tmp_path: Path) -> None:
+    with Broker(tmp_path) as broker:
+        async with old_broker(broker, SILENT) as old:
+            it = Running(_options(old.port))
+            it.publisher.begin_with_3_1_1()
+            task = asyncio.create_task(it.publisher.run())
+            await it.until(lambda r: r.codes() == ["mqtt_connected"])
+            task.cancel()
+            await asyncio.wait({task}, timeout=PATIENCE_S)
+            assert old.versions == [4]
+
+
 async def test_the_broker_of_the_demo_is_spoken_to_in_its_version() -> None:
     """amqtt waits for the end of a CONNECT of version 5 that it takes for one of 3.1.1."""
     with DemoBroker() as demo:
         async with running(_options(demo.port)) as it:
             await it.until(lambda r: r.codes() == ["mqtt_connected"])
-            it.publisher.take(EVENT, event("taken"))
+            it.publisher.publish(EVENT, event("taken"))
             await it.until(lambda r: r.publisher.counters["mqtt_published"] >= 2)
 
 

@@ -137,7 +137,7 @@ async def test_everyone_gets_whole_epochs() -> None:
         async with connected(address) as one, connected(address) as two:
             two.writer.write(b"whatever a plotter says\r\n")
             await until(lambda: len(server.server.clients) == 2)
-            server.take(NAV, nav())
+            server.publish(NAV, nav())
             for client in (one, two):
                 lines = [await client.line() for _ in DEFAULT]
                 assert [x[3:6].decode() for x in lines] == list(DEFAULT)

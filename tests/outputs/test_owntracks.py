@@ -21,10 +21,10 @@ ADDRESS = "owntracks/fusiond/truck"
 def told(output: OwnTracksLocations, **changed: Any) -> None:
     """A `nav` and the `tracker` that is made of it."""
     message = nav(**changed)
-    output.take(NAV, message)
+    output.publish(NAV, message)
     tracker = tracker_message(nav(lat_deg=message.lat_deg))
     assert tracker is not None
-    output.take(TRACKER, tracker)
+    output.publish(TRACKER, tracker)
 
 
 async def test_a_location_has_what_the_booklet_says_and_is_retained(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ LINE = re.compile(
 def endpoint(**changed: Message) -> PrometheusEndpoint:
     made = PrometheusEndpoint(Prometheus(port=free_port()), Around().surroundings)
     for topic in TOPICS:
-        made.take(topic, changed.get(topic.name, EXAMPLES.get(topic.name)))
+        made.publish(topic, changed.get(topic.name, EXAMPLES.get(topic.name)))
     return made
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.configuration.schema import Config
-from fusiond.demo.demo import demo_play
+from fusiond.demo.demo import demo_setup
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.clock.host_time import MS, Host
 from tests.recording.rig import Rig
@@ -22,7 +22,7 @@ class Drive(Rig):
     def __init__(
         self, folder: Path, duration_s: float, config: Config | None = None, **options: Any
     ) -> None:
-        play = demo_play()
+        play = demo_setup()
         config = config or play.served(1, folder)
         scenario = play.scenario.fitted(config)
         self.vehicle = SimulatedVehicle(scenario, seed=3, duration_s=duration_s)
@@ -38,7 +38,7 @@ class Drive(Rig):
     def _hear_requests(self) -> None:
         """What the driver sends goes to the terminal, and where it goes anyhow."""
         inputs = self.inputs["rdss"]
-        recorded = inputs.heard
+        recorded = inputs.on_input
 
         def heard(kind: str, t_ns: int, payload: Any) -> None:
             if kind == "sent":
@@ -46,7 +46,7 @@ class Drive(Rig):
             if recorded is not None:
                 recorded(kind, t_ns, payload)
 
-        inputs.heard = heard
+        inputs.on_input = heard
 
     @property
     def t_s(self) -> float:

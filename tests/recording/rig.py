@@ -67,7 +67,7 @@ class Rig:
         self.digests: list[bytes] = []
         self.recorder.listen(self.inputs)
         self.recorder.arm(RESTORED_STATE.dump_python(RestoredState(), mode="json"))
-        self.events.listen(partial(self.recorder.take, EVENT))
+        self.events.listen(partial(self.recorder.publish, EVENT))
         for name in self.inputs:
             self.take(name, "open")
 

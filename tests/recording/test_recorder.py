@@ -48,7 +48,7 @@ class Bench:
         self.event(code, "recording")
 
     def event(self, code: str, source: str = "navigator") -> None:
-        self.recorder.take(EVENT, event_message(None, source=source, code=code, text=code))
+        self.recorder.publish(EVENT, event_message(None, source=source, code=code, text=code))
 
     def tick(self, count: int = 1, payload: bytes = b"$GNGGA") -> None:
         """Ticks of 10 ms, each after a read."""
@@ -112,7 +112,7 @@ def test_it_begins_and_ends_when_told(make: Callable[..., Bench]) -> None:
     bench.tick(2)
     assert bench.recorder.end("told") == name
     assert bench.recorder.recording.state == "off"
-    assert bench.inputs.heard is None
+    assert bench.inputs.on_input is None
     bench.tick(2)
     bench.recorder.close()
     assert len(bench.ticks()) == 2
@@ -219,7 +219,7 @@ async def test_where_nothing_can_be_written_it_says_why(
     await until(failed)
     why = bench.events[-1][1]
     assert "File exists" in why if where == "a file" else "recording.min_free_mb" in why
-    assert bench.inputs.heard is None
+    assert bench.inputs.on_input is None
 
 
 async def test_a_recording_that_failed_takes_up_again_by_itself(

@@ -30,7 +30,7 @@ from fusiond.recording.reader import Log, LogError
 from fusiond.recording.records import Kind
 from fusiond.replay.replay import Replay
 from fusiond.replay.replay_config import config_of
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.clock.host_time import S
 from tests.recording.driven import Drive
 from tests.replay.track_judges import gpsbabel_points, gpx_points
@@ -128,7 +128,7 @@ def test_the_first_tick_that_differs_is_named(recorded: Recorded, tmp_path: Path
             break
     altered = tmp_path / "altered.mcap"
     _rewrite(whole, altered, record.payload, bytes([*record.payload[:-1], 0x24]))
-    found = replay([altered], Wish())
+    found = replay([altered], ReplayOptions())
     assert found["identical"] is False
     assert ticks < found["first_difference"]["tick"] <= ticks + 30
     assert found["first_difference"]["what"] == "the solution or the filter's state"
@@ -147,7 +147,7 @@ def test_a_log_with_lost_input_says_so(recorded: Recorded, tmp_path: Path) -> No
     trim(recorded.paths, 0.0, 4.0, short)
     log = Log([short])
     write_log(out, log.about, {}, (m for m in log.messages() if m.sequence not in (100, 101)))
-    found = replay([out], Wish())
+    found = replay([out], ReplayOptions())
     assert found["identical"] is False
     assert "inputs are missing in the log" in found["first_difference"]["what"]
     assert found["problems"] == ["2 messages of input are missing after message 99"]
@@ -177,7 +177,7 @@ def test_a_cut_from_the_start_is_compared_like_the_whole(
 ) -> None:
     cut = tmp_path / "cut.mcap"
     trim(recorded.paths, 0.0, 3.0, cut)
-    found = replay([cut], Wish())
+    found = replay([cut], ReplayOptions())
     assert found["identical"] is True
     assert 140 < found["compared"] < 160
 
@@ -267,7 +267,7 @@ def test_a_later_format_and_two_recordings_are_refused(recorded: Recorded, tmp_p
 
 
 def test_a_missing_part_is_told_and_not_compared(recorded: Recorded) -> None:
-    found = replay(recorded.paths[1:], Wish())
+    found = replay(recorded.paths[1:], ReplayOptions())
     assert found["identical"] is None
     assert found["started_from"] != "the daemon's start"
 

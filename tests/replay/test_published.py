@@ -6,7 +6,7 @@ import asyncio
 import json
 from pathlib import Path
 
-from fusiond.replay.run import Wish, replay
+from fusiond.replay.run import ReplayOptions, replay
 from tests.broker import Broker, listening
 from tests.recording.driven import Drive
 
@@ -17,7 +17,7 @@ async def test_a_replay_is_published_like_the_drive(tmp_path: Path) -> None:
     paths = drive.close()
     with Broker(tmp_path) as broker:
         where = ("mqtt.enabled=true", "mqtt.host=127.0.0.1", f"mqtt.port={broker.port}")
-        wish = Wish(settings=(*where, "vehicle=again"), speed=2.0)
+        wish = ReplayOptions(settings=(*where, "vehicle=again"), speed=2.0)
         async with listening(broker, "fusiond/again/#") as (listener, _):
             summary = await asyncio.to_thread(replay, paths, wish)
             await listener.until(lambda li: b"offline" in li.payloads("fusiond/again/online"))

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from fusiond.configuration.schema import Config
 from fusiond.files.tables import TrajectoryTable
-from fusiond.report.input_look import spectrum
+from fusiond.report.input_statistics import spectrum
 from fusiond.report.page import page
 from fusiond.report.plot_arrays import BUCKETS, thinned
 from fusiond.report.report import document
 from fusiond.report.run import Innovations, LogParts, Run
-from fusiond.report.settings import differing
+from fusiond.report.settings import changed_settings
 
 
 @settings(max_examples=30)
@@ -73,7 +73,7 @@ def test_what_differs_from_the_defaults() -> None:
             "estimator": {"model": "ins15"},
         }
     )
-    found = differing(config.model_dump_json().encode())
+    found = changed_settings(config.model_dump_json().encode())
     assert found is not None
     told = {d.key: (d.value, d.default) for d in found}
     assert told == {
@@ -87,9 +87,9 @@ def test_what_differs_from_the_defaults() -> None:
         "aiding.fix.sigma_scale": ("2.0", "1.0"),
         "estimator.model": ('"ins15"', '"ins21"'),
     }
-    assert differing(Config().model_dump_json().encode()) == []
-    assert differing(None) is None
-    assert differing(b"[1]") is None
+    assert changed_settings(Config().model_dump_json().encode()) == []
+    assert changed_settings(None) is None
+    assert changed_settings(b"[1]") is None
 
 
 def test_an_hour_stays_below_5_mb(tmp_path: Path) -> None:

@@ -140,7 +140,8 @@ def test_errors_are_those_of_compare(recorded: Recorded) -> None:
 
 
 def test_each_measurement_is_counted_once(recorded: Recorded) -> None:
-    """A late fix rewinds the filter, which meets later aids again: the log holds them twice."""
+    """A late fix rewinds the filter, which meets later measurements again: the log holds them
+    twice."""
     found = recorded.run.log
     assert found is not None
     gnss = found.innovations["gnss"]

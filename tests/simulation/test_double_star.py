@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusiond.demo.papers import paper_play
+from fusiond.demo.papers import paper_setup
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
@@ -18,7 +18,7 @@ SEEDS, SECONDS, SETTLED_S, EVERY_S = 4, 200.0, 30.0, 5.0
 def test_planar15_is_honest_with_optimal_prediction(tmp_path: Path) -> None:
     """NEES of attitude, velocity and position a degree in [0.7, 1.4], mean of four runs; position
     within half of a fix's 33 m."""
-    play = paper_play("000")
+    play = paper_setup("000")
     truth, nees, horizontal = play.scenario.truth(SECONDS), [], []
     for seed in range(SEEDS):
         files = simulate(play.scenario, tmp_path / str(seed), seed=seed, duration_s=SECONDS).files

@@ -38,8 +38,8 @@ def flown(model: str, bank: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     with TemporaryDirectory() as folder:
         path = Path(folder)
         files = simulate(SCENARIOS["flight-sar"], path, seed=SEED, duration_s=SECONDS).files
-        aids = [(kind, files[kind]) for kind in ("gnss", "attitude", "bearing")]
-        found = process(config, files["imu"], aids, out=path / "nav.csv")
+        measurements = [(kind, files[kind]) for kind in ("gnss", "attitude", "bearing")]
+        found = process(config, files["imu"], measurements, out=path / "nav.csv")
         report = compare(
             read_solution(path / "nav.csv"), read_truth(files["truth"]), after_s=AFTER_S
         )

@@ -57,8 +57,8 @@ def test_planar10_is_honest_on_it(kind: str, tmp_path: Path) -> None:
             x = x[slots]
             nees.append(x @ np.linalg.solve(e.covariance[np.ix_(slots, slots)], x) / len(slots))
 
-        aids = [("gnss", files["gnss"]), ("attitude", files["attitude"])]
-        found = process(config, files["imu"], aids, watch=watch)
+        measurements = [("gnss", files["gnss"]), ("attitude", files["attitude"])]
+        found = process(config, files["imu"], measurements, watch=watch)
         assert found["sources"]["star_tracker"]["fused"] > 150
         assert found["sources"]["gnss"].get("isolated", 0) == 0
     assert len(nees) > SEEDS * 20

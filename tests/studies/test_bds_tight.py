@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.settings import clock_noise
 from fusiond.gnss.ecef import ned_axes, to_geodetic
 from fusiond.gnss.single_point import SinglePoint
@@ -31,7 +31,7 @@ def result() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (runs, bds_tight):
             patch.setattr(module, "ORBIT_ERRORS_M", sizes)
-        return bds_tight.run(2)
+        return bds_tight.run_study(2)
 
 
 def test_keys_of_the_issue() -> None:
@@ -176,15 +176,15 @@ def test_every_case_has_the_same_errors() -> None:
     assert epochs["open"][100] == epochs["canyon3"][100]
 
 
-def test_a_fix_becomes_the_daemons_aids_with_the_receivers_sigmas() -> None:
+def test_a_fix_becomes_the_daemons_measurements_with_the_receivers_sigmas() -> None:
     simulated, observed = runs.observe("open", 0, 0)
     found = runs.Receiver(simulated).solve(observed[60])
     assert isinstance(found, SinglePoint)
-    aids = Intake({"gnss": runs.LOOSE}).aids(runs.fix(found, 5), 5, 0.0)
-    assert not isinstance(aids, str)
-    position, velocity = aids
-    assert isinstance(position, PositionAid)
-    assert isinstance(velocity, VelocityAid)
+    measurements = Intake({"gnss": runs.LOOSE}).measurements_of(runs.fix(found, 5), 5, 0.0)
+    assert not isinstance(measurements, str)
+    position, velocity = measurements
+    assert isinstance(position, PositionMeasurement)
+    assert isinstance(velocity, VelocityMeasurement)
     lat, lon, height = to_geodetic(*found.position)
     axes = ned_axes(lat, lon)
     assert (position.lat_rad, position.lon_rad, position.height_m) == (lat, lon, height)

@@ -56,7 +56,7 @@ def test_hysteresis_of_the_study_is_the_monitors() -> None:
 
 def test_study_runs_and_is_json(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
-    result = study.run(1000, seed=3, progress=lambda done, of: seen.append((done, of)))
+    result = study.run_study(1000, seed=3, progress=lambda done, of: seen.append((done, of)))
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert seen == [(i + 1, len(seen)) for i in range(len(seen))]
     low, high = result["false_alarm_interval"]

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.configuration.load import load_config
-from fusiond.studies.faults import aid_faults, imu_faults
+from fusiond.studies.faults import imu_faults, measurement_faults
 from fusiond.studies.faults.judge import (
     QUANTITIES,
     Course,
@@ -25,7 +25,7 @@ from fusiond.studies.faults.judge import (
 from fusiond.studies.faults.library import FAULTS, PHASES
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recording import Drive, Received, Recording
-from fusiond.studies.faults.runs import VEHICLE, Row, rows, run, run_row
+from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
 
 GOOD = (1.0,) * len(QUANTITIES)
 BEGIN_S, END_S = 10.0, 20.0
@@ -174,7 +174,7 @@ def test_a_fault_alters_nothing_before_it_begins(name: str) -> None:
 
 def test_a_step_is_500_m_to_the_north_in_the_window_alone() -> None:
     whole = recording()
-    found = aid_faults.step(whole, 10.0, 5.0)
+    found = measurement_faults.step(whole, 10.0, 5.0)
     for was, now in zip(whole.received, found.received, strict=True):
         assert now.seen_ns == was.seen_ns
         if not isinstance(was.measurement, PositionFix):
@@ -218,13 +218,13 @@ def test_noise_is_so_many_times_what_there_was() -> None:
 
 def test_absent_and_late_are_of_their_kinds() -> None:
     whole = recording()
-    assert len(aid_faults.absent(whole, 10.0, 5.0).received) == len(whole.received) - 15
-    wheels = aid_faults.absent(whole, 10.0, 5.0, WheelSpeed).received
+    assert len(measurement_faults.absent(whole, 10.0, 5.0).received) == len(whole.received) - 15
+    wheels = measurement_faults.absent(whole, 10.0, 5.0, WheelSpeed).received
     assert len(wheels) == len(whole.received) - 5
-    assert len(aid_faults.now_and_then(whole, 10.0, 10.0, WheelSpeed).received) == 81
+    assert len(measurement_faults.now_and_then(whole, 10.0, 10.0, WheelSpeed).received) == 81
     late = [
         item
-        for item in aid_faults.wheels_late(whole, 10.0, 5.0, late_s=0.5).received
+        for item in measurement_faults.wheels_delayed(whole, 10.0, 5.0, late_s=0.5).received
         if item.t_ns % 1_000_000_000
     ]
     assert [item.t_ns for item in late] == [s * 1_000_000_000 + 500_000_000 for s in range(10, 15)]
@@ -232,7 +232,7 @@ def test_absent_and_late_are_of_their_kinds() -> None:
 
 
 def test_multipath_jumps_again_behind_the_tunnel() -> None:
-    found = aid_faults.multipath_tunnel_jump(recording(), 10.0, 10.0)
+    found = measurement_faults.multipath_tunnel_jump(recording(), 10.0, 10.0)
     moved = [
         item.t_ns // 1_000_000_000
         for item in found.received
@@ -245,7 +245,7 @@ def test_multipath_jumps_again_behind_the_tunnel() -> None:
         if isinstance(item.measurement, PositionFix | DelayedFix)
     }
     assert fixes == {*range(1, 11), *range(20, 30)}
-    ends = aid_faults.multipath_tunnel_jump(recording(), 10.0, 25.0)
+    ends = measurement_faults.multipath_tunnel_jump(recording(), 10.0, 25.0)
     assert not any(
         item.t_ns > 11 * 10**9 for item in ends.received if item.measurement.source == "gnss"
     )
@@ -279,7 +279,7 @@ def test_a_spare_says_that_it_may_sit_askew() -> None:
     """It does, by half a degree: its own tilt is soon known to a tenth of that."""
     drive = Drive(spare=True, duration_s=46.0)
     fault = replace(FAULTS["imu_silent_spare"], begin_s=26.0, drive=drive)
-    found = run(fault, "navigating", seed=0)
+    found = run_fault(fault, "navigating", seed=0)
     assert found["verdict"] == "degraded and said so", found
     assert [event["code"] for event in found["events"]] == ["imu_spare"]
     assert found["largest_ratio"] < 5.0

@@ -7,8 +7,8 @@ from functools import lru_cache, partial
 import numpy as np
 import pytest
 
-from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
+from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.bounds import (
     DETECTED,
     OPEN,
@@ -50,7 +50,7 @@ def test_without_a_fault_nothing_is_heard_and_all_is_fused() -> None:
 def test_twice_a_fault_says_four_times_as_much() -> None:
     """The filter is linear as long as the fault is small."""
     sound = drive()[1]
-    one, two = (faulty(partial(aid.step, north_m=size)) for size in (1.0, 2.0))
+    one, two = (faulty(partial(measurement.step, north_m=size)) for size in (1.0, 2.0))
     (times, single), (same, double) = (information(sound, each, BEGIN_S) for each in (one, two))
     assert np.array_equal(times, same)
     assert (np.diff(single) >= 0.0).all()
@@ -64,7 +64,7 @@ def test_a_force_is_told_at_once_and_a_step_of_two_metres_is_not() -> None:
     assert force["beyond_s"] < 1.0
     assert force["beyond_s"] < force["open_s"] <= force["detected_s"] < 3.0
     assert not force["lies"]
-    step = bound(sound, faulty(partial(aid.step, north_m=2.0)), BEGIN_S, END_S)
+    step = bound(sound, faulty(partial(measurement.step, north_m=2.0)), BEGIN_S, END_S)
     assert step["detected_s"] is None
     assert step["information"] == sorted(step["information"])
 

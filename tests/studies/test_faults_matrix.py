@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.studies.faults.aid_faults import velocity_bias
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
 from fusiond.studies.faults.judge import LIE_S, longest_lie_s
 from fusiond.studies.faults.library import FAULTS, Fault
+from fusiond.studies.faults.measurement_faults import velocity_bias
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
 from fusiond.studies.faults.recording import Drive
-from fusiond.studies.faults.runs import Row, course_of, placed, run, run_row
+from fusiond.studies.faults.runs import Row, course_of, placed, run_fault, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 
 # Fault and phase; the event that names it; within how many seconds of its end the mode is
@@ -55,7 +55,7 @@ def test_it_is_told_and_never_lied_about(
     assert found["verdict"] == "degraded and said so", found
     codes = {e["code"] for e in found["events"]}
     assert event in codes
-    assert "aid_failed" not in codes
+    assert "measurement_failed" not in codes
     if within_s is not None:
         assert found["recovered_s"] is not None
         assert found["recovered_s"] <= within_s
@@ -97,7 +97,7 @@ def test_a_velocity_that_the_filter_follows_is_open() -> None:
     """Off by 0.2 m/s, of a receiver that states 0.05, twice a second: soon no innovation shows it,
     and positions good to a metre do not for many seconds. It was beyond five sigma for 6 s."""
     off = Fault(partial(velocity_bias, north_m_s=0.2), 30.0, drive=Drive(gnss_rate_hz=2.0))
-    found = run(off, "navigating", 4)
+    found = run_fault(off, "navigating", 4)
     assert found["longest_lie_s"] == 0.0, found
     assert found["verdict"] == "degraded and said so"
 

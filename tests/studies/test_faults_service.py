@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.measurements import PositionFix
-from fusiond.studies.faults.aid_faults import frozen
+from fusiond.studies.faults.measurement_faults import frozen
 from fusiond.studies.faults.published import (
     STEP_S,
     Published,

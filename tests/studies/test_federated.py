@@ -17,7 +17,7 @@ from fusiond.studies.federated import study as federated
 @cache
 def result() -> dict[str, Any]:
     seen: list[tuple[int, int]] = []
-    found = federated.run(2, seed=1, progress=lambda done, total: seen.append((done, total)))
+    found = federated.run_study(2, seed=1, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(k, 16) for k in range(1, 17)]
     return found
 
@@ -113,4 +113,4 @@ def test_pictures_and_tables(tmp_path: Path) -> None:
 
 def test_too_few_runs_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 2"):
-        federated.run(1)
+        federated.run_study(1)

@@ -28,7 +28,7 @@ def result() -> dict[str, Any]:
     """The study; steps are timed but twice, as in test_reduced_order."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ins_gnss_sar, "costs", partial(costs, rounds=2))
-        return ins_gnss_sar.run(RUNS, 1, seconds=SECONDS)
+        return ins_gnss_sar.run_study(RUNS, 1, seconds=SECONDS)
 
 
 def test_keys_of_the_issue() -> None:
@@ -133,4 +133,4 @@ def test_tables_and_picture(tmp_path: Path) -> None:
 
 def test_too_few_runs() -> None:
     with pytest.raises(ValueError, match="at least 2"):
-        ins_gnss_sar.run(1)
+        ins_gnss_sar.run_study(1)

@@ -19,7 +19,7 @@ KEYS = {"position_std_m", "velocity_std_m_s", "attitude_std_deg", "nees_mean", "
 
 @cache
 def result() -> dict[str, Any]:
-    return multiscale.run(2)
+    return multiscale.run_study(2)
 
 
 def test_keys_are_those_promised() -> None:

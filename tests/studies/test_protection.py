@@ -36,4 +36,4 @@ def test_correlation_time_of_a_first_order_sequence() -> None:
 
 def test_a_run_at_least() -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        protection.run(0)
+        protection.run_study(0)

@@ -18,7 +18,7 @@ from fusiond.studies.covariance_analysis import analyse
 from fusiond.studies.reduced_order import flight, study
 from fusiond.studies.reduced_order.cost import costs
 from fusiond.studies.reduced_order.runs import combinations, fly, started
-from fusiond.studies.reduced_order.study import plot, run, tables
+from fusiond.studies.reduced_order.study import plot, run_study, tables
 
 RUNS = 6
 
@@ -28,7 +28,7 @@ def result() -> dict[str, Any]:
     """The study; how long steps take is the benchmark's matter, so they are timed but twice."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "costs", partial(costs, rounds=2))
-        return run(RUNS)
+        return run_study(RUNS)
 
 
 def test_study_has_its_keys() -> None:
@@ -153,8 +153,8 @@ def test_measured_values_are_those_of_the_true_state() -> None:
     xi[of.slots_of("clock_offset")], xi[of.slots_of("clock_drift")] = 2e5, -120.0
     xi[of.slots_of("sar_misalignment")] = 1e-4, -2e-4, 3e-4
     true = State(nav, xi, np.zeros(STEP_SIZE), of)
-    aids = flight.measured(scene, true, np.zeros(scene.rows))
-    np.testing.assert_allclose(flight.rows(aids, true).z, 0.0, atol=1e-7)
+    measurements = flight.measured(scene, true, np.zeros(scene.rows))
+    np.testing.assert_allclose(flight.rows(measurements, true).z, 0.0, atol=1e-7)
     z = flight.rows(flight.measured(scene, true, np.ones(scene.rows)), true).z
     sd = [5.0] * 4 + [0.05] * 4 + [1e-3] * 2
     np.testing.assert_allclose(z, -np.array(sd), rtol=1e-6)
@@ -210,7 +210,7 @@ def test_tables_and_picture(tmp_path: Path) -> None:
 
 def test_too_few_runs() -> None:
     with pytest.raises(ValueError, match="at least 2"):
-        run(1)
+        run_study(1)
 
 
 def test_azimuth_of_the_points_stays_where_the_text_says() -> None:

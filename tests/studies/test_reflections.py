@@ -28,12 +28,12 @@ EPOCHS, FROM = 250, 30
 
 
 class Told(KalmanEstimator):
-    """Keeps what became of the last aid's rows."""
+    """Keeps what became of the last measurement's rows."""
 
     rows: tuple[int, ...] = ()
 
-    def update(self, aid: Linearised, noise: Any = AS_STATED) -> Outcome:
-        outcome = super().update(aid, noise)
+    def update(self, measurement: Linearised, noise: Any = AS_STATED) -> Outcome:
+        outcome = super().update(measurement, noise)
         self.rows = outcome.rows
         return outcome
 
@@ -75,14 +75,14 @@ def scored(per_hour: float, number: int) -> Scored:
     counts, believed, off, nees = np.zeros((2, 2), np.int64), [], [], []
     for k, t in enumerate(t_s):
         live.advance(t)
-        aid = raw.aid(sim.epoch(k), round(t * 1e9))
-        live.advance(t, [aid])
-        if k < FROM or aid.memory.corrected is None:
+        measurement = raw.measurement(sim.epoch(k), round(t * 1e9))
+        live.advance(t, [measurement])
+        if k < FROM or measurement.memory.corrected is None:
             continue
         x, p = nav_error(estimator.nav, nav[k + 1])[6:], estimator.covariance[6:9, 6:9]
         off.append(np.hypot(*x[:2]))
         nees.append(x @ np.linalg.solve(p, x))
-        labels = aid.memory.corrected.aid.labels
+        labels = measurement.memory.corrected.measurement.labels
         for (name, what), code in zip(labels, estimator.rows, strict=True):
             if what != "range":
                 continue

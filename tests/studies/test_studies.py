@@ -41,12 +41,12 @@ NAMES = {
 
 @cache
 def dynamic() -> dict[str, Any]:
-    return rdss_dynamic.run(2)
+    return rdss_dynamic.run_study(2)
 
 
 @cache
 def static() -> dict[str, Any]:
-    return rdss_static.run(40)
+    return rdss_static.run_study(40)
 
 
 def fusiond(*args: str | Path) -> subprocess.CompletedProcess[str]:

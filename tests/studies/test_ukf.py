@@ -14,7 +14,7 @@ import pytest
 
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
+from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.navigation.strapdown import STEP_RATE_B, STEP_SIZE
 from fusiond.studies import STUDIES
 from fusiond.studies.live_filter import LiveFilter, drive_samples, drive_truth
@@ -24,7 +24,7 @@ from fusiond.studies.ukf import study as ukf
 
 @cache
 def result() -> dict[str, Any]:
-    return ukf.run(2)
+    return ukf.run_study(2)
 
 
 def test_keys_of_the_issue() -> None:
@@ -61,9 +61,9 @@ def test_measurements_fit_the_truth() -> None:
     for problem, sd in ((ukf_runs.PROBLEMS[2], ukf_runs.RANGE_SD_M), (ukf_runs.PROBLEMS[0], 15.3)):
         rng = np.random.default_rng(8)
         if problem.clock:
-            aids, epoch_sd = ukf_runs._pseudoranges(rng, 5)
+            measurements, epoch_sd = ukf_runs._pseudoranges(rng, 5)
         else:
-            aids, epoch_sd = ukf_runs._double_star(rng)
+            measurements, epoch_sd = ukf_runs._double_star(rng)
         assert 0.5 * sd < epoch_sd < 6.0 * sd
         model = ukf_runs._model(problem)
         rng = np.random.default_rng(8)
@@ -73,16 +73,16 @@ def test_measurements_fit_the_truth() -> None:
             offset, drift = ukf_runs.draw_clock(rng)
         nav = ukf_runs._true_states(problem.every_s)[0]
         whitened = []
-        for k, epoch in enumerate(aids):
-            aid = epoch[0]
-            assert isinstance(aid, PseudorangeAid)
+        for k, epoch in enumerate(measurements):
+            measurement = epoch[0]
+            assert isinstance(measurement, PseudorangeMeasurement)
             step = np.zeros(STEP_SIZE)
             sample = round((k + 1) * problem.every_s * ukf_runs.IMU.rate_hz) - 1
             step[STEP_RATE_B : STEP_RATE_B + 3] = drive_truth().gyro[sample]
             if problem.clock:
                 xi[model.slots_of("clock_offset")] = offset[sample]
                 xi[model.slots_of("clock_drift")] = drift[sample]
-            found = aid.innovation(State(nav[k + 1], xi, step, model))
+            found = measurement.innovation(State(nav[k + 1], xi, step, model))
             assert isinstance(found, Innovation)
             whitened.append(found.z / np.sqrt(found.r))
         z = np.concatenate(whitened)
@@ -118,23 +118,25 @@ def test_a_clock_that_is_set_unannounced_is_found(name: str) -> None:
     problem = ukf_runs.PROBLEMS[2]
     rng = np.random.default_rng(4)
     samples = drive_samples(ukf_runs.IMU, rng)
-    aids = ukf_runs._pseudoranges(rng, 5)[0][:20]
+    measurements = ukf_runs._pseudoranges(rng, 5)[0][:20]
     model = ukf_runs._model(problem)
     sd = model.initial.copy()
     sd[:9] = [0.003, 0.003, 0.03, 0.5, 0.5, 0.5, 30.0, 30.0, 30.0]
     start = ukf_runs._true_states(problem.every_s)[0][0]
     live = LiveFilter(ukf_runs.FILTERS[name](model), ukf_runs.IMU.gap_s, samples, start, sd)
     (slot,) = model.slots_of("clock_offset")
-    for k, epoch in enumerate(aids):
-        aid = epoch[0]
-        assert isinstance(aid, PseudorangeAid)
+    for k, epoch in enumerate(measurements):
+        measurement = epoch[0]
+        assert isinstance(measurement, PseudorangeMeasurement)
         before = live.estimator.xi[slot]
         if k >= 10:
-            jumped = aid.ranges + SPEED_OF_LIGHT_M_S * 1e-3
-            variances = aid.range_variance, aid.rate_variance
-            values = epoch_values(aid.position, aid.velocity, jumped, aid.rates, *variances)
-            aid = replace(aid, values=values)
-        live.advance(k + 1.0, [aid])
+            jumped = measurement.ranges + SPEED_OF_LIGHT_M_S * 1e-3
+            variances = measurement.range_variance, measurement.rate_variance
+            values = epoch_values(
+                measurement.position, measurement.velocity, jumped, measurement.rates, *variances
+            )
+            measurement = replace(measurement, values=values)
+        live.advance(k + 1.0, [measurement])
         if k == 10:
             moved = live.estimator.xi[slot] - before
             assert moved == pytest.approx(SPEED_OF_LIGHT_M_S * 1e-3, abs=200.0)

@@ -181,7 +181,7 @@ export class TrackMap {
     if (!this.centre) {
       ctx.fillStyle = colour("quiet");
       ctx.textAlign = "center";
-      ctx.fillText("No position", this.width / 2, this.height / 2);
+      ctx.fillText("No position yet", this.width / 2, this.height / 2);
       return;
     }
     this.below(ctx);

@@ -6,7 +6,7 @@ const detail = element("div", "big"),
   table = element("table", "pairs"),
   canvas = element("canvas");
 const body = table.createTBody();
-const NONE = "No RDSS terminal.";
+const NONE = "No RDSS terminal configured or seen.";
 const BIN_S = 0.25;
 const NAMES = [
   ["requested", "asked"],

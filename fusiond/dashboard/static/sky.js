@@ -4,7 +4,7 @@ import { byId, colour, element, fixed, known, prepared, put } from "./text.js";
 const holder = byId("sky");
 const canvas = element("canvas"),
   notes = element("div", "notes");
-const NONE = "No source of raw satellite data; a receiver that only says where it is shows none.";
+const NONE = "No raw satellite data: switch on RAWX or MSM, or stay with fixes.";
 const RAD = Math.PI / 180;
 const CNO = { low: 20, high: 50 }; // dB-Hz: hardly tracked, very strong
 

@@ -23,7 +23,7 @@ export class Store {
   clear() {
     this.latest = {};
     this.rows = Object.fromEntries(Object.keys(MOST).map((kind) => [kind, []]));
-    this.innovations = new Map(); // by source and instant: after a rewind an aid comes again
+    this.innovations = new Map(); // by source and instant: after a rewind a measurement comes again
   }
 
   receive(frame) {

@@ -56,7 +56,7 @@ export function showCalibration(store) {
   if (!said) {
     if (!calibration.firstChild)
       calibration.append(
-        element("p", "none", "Nothing is calibrated, or it does not navigate yet."),
+        element("p", "none", "No calibration yet: it begins with navigation, if a parameter is estimated."),
       );
     return;
   }
@@ -66,7 +66,7 @@ export function showCalibration(store) {
     const head = table.createTHead().insertRow();
     for (const [text, name] of [
       ["", ""],
-      ["found", "n"],
+      ["estimate", "n"],
       ["1 sigma", "n"],
       ["", ""],
     ])
@@ -96,13 +96,13 @@ export function showSystem(store) {
     s = store.said("status");
   const rows = [];
   if (h) {
-    const late = `p50 ${fixed(h.lateness_p50_ms, 2)}, p99 ${fixed(h.lateness_p99_ms, 2)}, most ${fixed(h.lateness_max_ms, 1)} ms`;
+    const late = `p50 ${fixed(h.lateness_p50_ms, 2)}, p99 ${fixed(h.lateness_p99_ms, 2)}, max ${fixed(h.lateness_max_ms, 1)} ms`;
     rows.push([
       "CPU, memory",
       `${fixed(h.cpu_percent, 1)} % of a core, ${fixed(h.memory_mb, 0)} MB`,
     ]);
     rows.push(["ticks", `${whole(h.ticks)}, ${whole(h.overruns)} overruns`]);
-    rows.push(["ticks late by", late], ["clock", clockWords(h)]);
+    rows.push(["tick delay", late], ["clock", clockWords(h)]);
   }
   if (s) {
     rows.push(["recording", recordingWords(s)]);
@@ -115,7 +115,7 @@ export function showSystem(store) {
       `${whole(s.mqtt_published)} sent, ${whole(s.mqtt_dropped)} dropped, ${whole(s.mqtt_reconnects)} reconnects`,
     ]);
     if (s.protection !== "off") rows.push(["integrity", s.protection]);
-    if (s.injected && s.injected.length) rows.push(["faults put in", s.injected.join(", ")]);
+    if (s.injected && s.injected.length) rows.push(["simulated faults", s.injected.join(", ")]);
   }
   if (h) {
     for (const [name, o] of Object.entries(h.outputs || {}))

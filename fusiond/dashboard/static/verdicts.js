@@ -8,7 +8,7 @@ const WORDS = {
   optimistic: "sigma too small",
   pessimistic: "sigma too large",
   cannot_tell: "cannot tell: errors shared",
-  coloured: "errors alike",
+  coloured: "errors last from fix to fix",
   too_few: "too few yet",
 };
 
@@ -94,7 +94,7 @@ export function showVerdicts(store) {
   if (!names.length) {
     shown.clear();
     if (!holder.querySelector(".none"))
-      holder.replaceChildren(element("p", "none", "No source has been judged yet."));
+      holder.replaceChildren(element("p", "none", "No source judged yet: it takes minutes."));
     return;
   }
   if (names.join() !== [...shown.keys()].join()) {

@@ -5,8 +5,8 @@ process noise: no sharing factors, no bound. What the estimates share is carried
 each pair i, j:
 
     P_ij <- Phi P_ij Phi^T + Q                                   in between
-    P_ij <- (I - K_i H) P_ij                                     an aid of i alone
-    P_ij <- (I - K_i H) P_ij (I - K_j H)^T + K_i R K_j^T         an aid that is common to all
+    P_ij <- (I - K_i H) P_ij                                     a measurement of i alone
+    P_ij <- (I - K_i H) P_ij (I - K_j H)^T + K_i R K_j^T         a measurement that is common to all
 
 and the master is the best linear combination of them, for any number of filters:
 
@@ -33,8 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
-from fusiond.estimators.federated.filter import FederatedFilter
-from fusiond.estimators.federated.isolation import DIFFERENCE, Record
+from fusiond.estimators.federated.carried import CarriedFilter
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 
@@ -42,15 +41,6 @@ Array = NDArray[np.float64]
 
 # Of the variances of an estimate: differences below 1e-4 sigma are rounding, not information.
 SAME = 1e-8
-
-
-class _Own(NamedTuple):
-    joint: Array
-    dxs: Array
-    before: Array
-    phi: Array
-    factors: Array
-    records: tuple[Record, ...]
 
 
 class Fused(NamedTuple):
@@ -88,11 +78,9 @@ def best_combination(joint: Array) -> Fused:
     return Fused(weights, 0.5 * (fused + fused.T))
 
 
-class CorrelatedFilter(FederatedFilter):
+class CorrelatedFilter(CarriedFilter):
     """`no_reset` with the covariances between the local filters
     (`fusiond.estimators.base.Estimator`)."""
-
-    carries_transition = True
 
     def __init__(
         self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
@@ -101,8 +89,8 @@ class CorrelatedFilter(FederatedFilter):
         width, count = model.width, len(names)
         self._joint: Array = np.zeros((count, count, width, width))
         self._bank_dxs = np.zeros((count, model.size))
-        self._before: Array = np.zeros((width, width))
-        self._unit: Array = np.eye(width)
+        self._members: list[int] = []
+        self._combination = Fused(np.zeros((0, 0, 0)), np.zeros((0, 0)))
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n): the same for all."""
@@ -121,22 +109,14 @@ class CorrelatedFilter(FederatedFilter):
 
     # ------------------------------------------------------------------ in time
 
-    def _settle(self) -> None:
+    def _bring_up(self) -> None:
         """Bring all to the present; the noise of the interval is that of the published estimate."""
         n, phi = self.model.size, self._phi
         self._joint[:] = phi @ (self._joint - self._before) @ phi.T + self._covs[0]
         self._bank_dxs[:] = self._bank_dxs @ phi[:n, :n].T
         self._mark()
 
-    def _mark(self) -> None:
-        """All hold at the present."""
-        self._phi[:] = self._unit
-        self._before[:] = self._covs[0]
-
     # ------------------------------------------------------------------ update
-
-    def _bring_up(self) -> None:
-        self._settle()
 
     def _judge(self, local: int | None) -> tuple[Array, Array]:
         if local is None:
@@ -178,7 +158,7 @@ class CorrelatedFilter(FederatedFilter):
                     self._joint[k, other] = new
                     self._joint[other, k] = new.T
         if local is not None:
-            self._faults.heard(local, self.t_ns)
+            self._faults.received(local, self.t_ns)
         return self._fuse_all(local)
 
     def _of(self, members: Sequence[int]) -> Array:
@@ -192,38 +172,20 @@ class CorrelatedFilter(FederatedFilter):
         ]
         return joint
 
-    def _fuse_all(self, updated: int | None) -> str:
-        """Fuse, compare the local filter that was updated, publish; the outcome's name."""
-        members = self._believed()
-        fused = best_combination(self._of(members))
-        if not (np.diag(fused.covariance) > 0.0).all():
-            return "not_positive_definite"
-        if updated is not None and self.options.fault_detection:
-            worst = self._worst(updated)
-            if worst is not None and self._isolate(worst, DIFFERENCE):
-                return "isolated" if worst == updated else "fused"
-        self._publish(members, fused)
-        return "fused"
+    def _fuse(self) -> bool:
+        self._members = self._believed()
+        self._combination = best_combination(self._of(self._members))
+        return bool((np.diag(self._combination.covariance) > 0.0).all())
 
-    def _publish(self, members: Sequence[int], fused: Fused) -> None:
-        """Publish the fused estimate."""
-        order = self._order
-        estimates = self._bank_dxs[:, order][list(members)]
+    def _take_over(self, updated: int | None) -> None:
+        order, fused = self._order, self._combination
+        estimates = self._bank_dxs[:, order][self._members]
         self._covs[0][np.ix_(order, order)] = fused.covariance
         self._dxs[0][order] = np.einsum("kij,kj->i", fused.weights, estimates)
         self._mark()
         self._feed_back_published()
 
-    def _worst(self, updated: int) -> int | None:
-        """The local filter that stands out most, if the one just updated stands out at all."""
-        believed = self._believed()
-        own = self._difference(updated)
-        if self._faults.worst(dict.fromkeys(believed, own), self._tested) is None:
-            return None
-        return self._faults.worst({i: self._difference(i) for i in believed}, self._tested)
-
     def _difference(self, k: int) -> float:
-        """d^T cov(d)^-1 d of filter k and the best of all others, on position and velocity."""
         others = [i for i in self._believed() if i != k]
         if not others:
             return 0.0
@@ -237,8 +199,8 @@ class CorrelatedFilter(FederatedFilter):
         scale = np.sqrt(np.diag(joint[0, 0])[tail])
         values, vectors = np.linalg.eigh(s[tail, tail] / np.outer(scale, scale))
         along = vectors.T @ (d[tail] / scale)
-        told = values > SAME
-        return float(np.sum(along[told] ** 2 / values[told]))
+        distinct = values > SAME
+        return float(np.sum(along[distinct] ** 2 / values[distinct]))
 
     # ------------------------------------------------------------------ faults, feedback, snapshots
 
@@ -248,10 +210,9 @@ class CorrelatedFilter(FederatedFilter):
         self._factors[self._believed()] = 1.0
 
     def _leave_out(self, local: int) -> None:
-        members = self._believed()
-        fused = best_combination(self._of(members))
-        self._publish(members, fused)
-        self._copy_master(local, members, fused.weights)
+        self._fuse()
+        self._take_over(None)
+        self._copy_master(local, self._members, self._combination.weights)
 
     def _take_back(self, local: int) -> None:
         members = [i for i in self._believed() if i != local]
@@ -273,27 +234,5 @@ class CorrelatedFilter(FederatedFilter):
             self._joint[other, local] = self._joint[local, other].T
         self._joint[local, local] = self._covs[0]
 
-    def _shift(self, x: Array) -> None:
-        self._bank_dxs -= x
-
-    def release(self) -> None:
-        """Feed back what was carried."""
-        self._settle()
-        super().release()
-
-    def _own_snapshot(self) -> object:
-        return _Own(
-            self._joint.copy(),
-            self._bank_dxs.copy(),
-            self._before.copy(),
-            self._phi.copy(),
-            self._factors.copy(),
-            tuple(self._faults.records),
-        )
-
-    def _own_restore(self, extra: object) -> None:
-        assert isinstance(extra, _Own)
-        self._joint[:], self._bank_dxs[:] = extra.joint, extra.dxs
-        self._before[:], self._phi[:] = extra.before, extra.phi
-        self._factors[:] = extra.factors
-        self._faults.records = list(extra.records)
+    def _kept_arrays(self) -> tuple[Array, ...]:
+        return *super()._kept_arrays(), self._joint

@@ -1,11 +1,11 @@
-r"""Federated filter: a local filter for each source of aids, a master, fault isolation.
+r"""Federated filter: a local filter for each source of measurements, a master, fault isolation.
 
 Every local filter estimates the whole error state of the one common navigation state from its own
-source's aids; the master fuses the estimates and feeds the result back. What all share, the initial
-estimate, the process noise and aids of no source of its own (standstill, an operator), is split by
-the sharing factors beta_i, sum beta_i = 1:
+source's measurements; the master fuses the estimates and feeds the result back. What all share, the
+initial estimate, the process noise and measurements of no source of its own (standstill, an
+operator), is split by the sharing factors beta_i, sum beta_i = 1:
 
-    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common aid
+    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common measurement
 
 so that the sum of the information is that of one filter. P_i is then an upper bound that makes the
 estimates as good as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1 one of the
@@ -23,7 +23,7 @@ What becomes of the local filters after a fusion, which is after every update:
                 hands the rest to the master's own estimate: P_i <- P_i / retained.
 
 The first and the last are in fusiond.estimators.federated.no_reset, those with a reset in
-fusiond.estimators.federated.reset; here is what they share.
+fusiond.estimators.federated.reset; this module has what they share.
 
 Source: Carlson, IEEE Trans. AES 26 (1990), 517; Carlson and Berarducci, NAVIGATION 41 (1994), 297;
 paper 004, section 3. Tests and isolation: fusiond.estimators.federated.isolation.
@@ -32,6 +32,7 @@ paper 004, section 3. Tests and isolation: fusiond.estimators.federated.isolatio
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.federated.bank import combine
-from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
+from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection, Record
 from fusiond.estimators.federated.options import FederatedOptions, local_of
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import normalised_innovation_squared, update
@@ -50,6 +51,11 @@ Array = NDArray[np.float64]
 
 # No adaptive factor falls below this part of an equal one: a filter that starves cannot come back.
 LEAST_PART = 0.1
+
+
+class _Own(NamedTuple):
+    arrays: tuple[Array, ...]
+    records: tuple[Record, ...]
 
 
 class FederatedFilter(ErrorStateFilter):
@@ -127,26 +133,26 @@ class FederatedFilter(ErrorStateFilter):
 
     # ------------------------------------------------------------------ update
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not.
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not.
 
         NIS and whitened innovation of the outcome are those of what is published; those of a
-        screened aid are of the filter that judges its rows.
+        screened measurement are of the filter that judges its rows.
         """
-        i = self._linearise(aid)
+        i = self._linearise(measurement)
         if isinstance(i, NotApplicable):
             return Outcome(i.outcome)
-        if aid.source not in self._local_of:
-            self._local_of[aid.source] = local_of(aid.source, self.names)
-        local = self._local_of[aid.source]
+        if measurement.source not in self._local_of:
+            self._local_of[measurement.source] = local_of(measurement.source, self.names)
+        local = self._local_of[measurement.source]
         isolated = local is not None and self._faults.is_isolated(local)
         self._bring_up()
         judge = None if isolated else local
         cov, dx = self._judge(judge)
-        if aid.screened:
-            return self._update_by_rows(aid, i, local, cov, dx)
+        if measurement.screened:
+            return self._update_by_rows(measurement, i, local, cov, dx)
         degrees = i.z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
+        threshold = gate_threshold(measurement.gate, degrees)
         y = np.zeros(degrees)
         nis = published = normalised_innovation_squared(cov, i.z - i.h @ dx, i.h, i.r, y)
         if judge is not None and self.options.mode == "no_reset":
@@ -163,7 +169,7 @@ class FederatedFilter(ErrorStateFilter):
 
     def _update_by_rows(
         self,
-        aid: Linearised,
+        measurement: Linearised,
         rows: Innovation,
         local: int | None,
         cov: Array,
@@ -175,13 +181,13 @@ class FederatedFilter(ErrorStateFilter):
         not: single bad satellites are the screening's business.
         """
         trial = cov.copy()
-        s = self._screen(aid, rows, trial, dx)
+        s = self._screen(measurement, rows, trial, dx)
         kept = s.codes == KEPT
         count, most = int(kept.sum()), 2 * int(kept.sum()) >= len(kept)
         degrees = count if most else len(kept)
         nis = s.nis if most else math.inf
         codes = tuple(s.codes.tolist())
-        if not self._believes(local, nis, degrees, gate_threshold(aid.gate, degrees)):
+        if not self._believes(local, nis, degrees, gate_threshold(measurement.gate, degrees)):
             return Outcome("isolated", s.nis, count, (), codes)
         if not kept.any():
             return Outcome("gated", s.nis, 0, (), codes)
@@ -216,7 +222,7 @@ class FederatedFilter(ErrorStateFilter):
         """Make the bank ready for an update."""
 
     def _judge(self, local: int | None) -> tuple[Array, Array]:
-        """Covariance and error estimate by which an aid is gated."""
+        """Covariance and error estimate by which a measurement is gated."""
         return self._covs[0], self._dxs[0]
 
     def _kept(self) -> list[tuple[Array, float]]:
@@ -279,6 +285,21 @@ class FederatedFilter(ErrorStateFilter):
         """Factors proportional to 1 / `trace` (N,), scaled traces of the local covariances."""
         part = np.divide(1.0, trace, out=np.zeros_like(trace), where=trace > 0.0)
         self._share_out(np.maximum(part / part.sum(), LEAST_PART / len(part)))
+
+    # ------------------------------------------------------------------ snapshots
+
+    def _kept_arrays(self) -> tuple[Array, ...]:
+        """Arrays that a snapshot holds beside those of every filter."""
+        return (self._factors,)
+
+    def _own_snapshot(self) -> object:
+        return _Own(tuple(a.copy() for a in self._kept_arrays()), tuple(self._faults.records))
+
+    def _own_restore(self, extra: object) -> None:
+        assert isinstance(extra, _Own)
+        for array, kept in zip(self._kept_arrays(), extra.arrays, strict=True):
+            array[:] = kept
+        self._faults.records = list(extra.records)
 
     # ------------------------------------------------------------------ feedback
 

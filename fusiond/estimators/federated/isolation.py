@@ -47,13 +47,13 @@ class Record(NamedTuple):
     """State of one local filter; never changed, so that a snapshot may hold it.
 
     `window`: (NIS, degrees) of the last innovations; `reason`: why it is isolated; `passes`: how
-    many innovations in a row have passed since; `heard_ns`: its last fused aid.
+    many innovations in a row have passed since; `received_ns`: its last fused measurement.
     """
 
     window: tuple[tuple[float, int], ...] = ()
     reason: str = ""
     passes: int = 0
-    heard_ns: int = NEVER_NS
+    received_ns: int = NEVER_NS
 
 
 class FaultDetection:
@@ -74,9 +74,9 @@ class FaultDetection:
         """True if a local filter is kept out."""
         return bool(self.records[local].reason)
 
-    def heard(self, local: int, t_ns: int) -> None:
-        """An aid of a local filter has been fused at `t_ns`."""
-        self.records[local] = self.records[local]._replace(heard_ns=t_ns)
+    def received(self, local: int, t_ns: int) -> None:
+        """A measurement of a local filter has been fused at `t_ns`."""
+        self.records[local] = self.records[local]._replace(received_ns=t_ns)
 
     def innovation(self, local: int, nis: float, degrees: int, threshold: float) -> bool:
         """Take an innovation of a believed filter in; whether its window still passes."""
@@ -95,7 +95,7 @@ class FaultDetection:
     def may_isolate(self, local: int, t_ns: int) -> bool:
         """True if another filter is believed and was heard lately."""
         return any(
-            i != local and not r.reason and t_ns - r.heard_ns <= RECENT_NS
+            i != local and not r.reason and t_ns - r.received_ns <= RECENT_NS
             for i, r in enumerate(self.records)
         )
 
@@ -114,7 +114,7 @@ class FaultDetection:
         if passes < self._readmit_after or not self._passes(window, READMISSION):
             self.records[local] = record._replace(window=window, passes=passes)
             return False
-        self.records[local] = Record(heard_ns=record.heard_ns)
+        self.records[local] = Record(received_ns=record.received_ns)
         return True
 
     @staticmethod

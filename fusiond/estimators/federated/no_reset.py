@@ -8,9 +8,9 @@ an update the local filters, common to which is all the process noise but its sh
 Gate and innovation test are the local filter's own in `no_reset`; in `rescale`, where it has given
 most of what it knows away, the master's.
 
-A local filter whose aids do not observe some states grows without bound in them. Beyond `MOST`
-times the best variance it gets `LITTLE` of what all others know, and all others give it up: the sum
-stays. `no_reset` keeps local filters apart but for this part in a million.
+A local filter whose measurements do not observe some states grows without bound in them. Beyond
+`MOST` times the best variance it gets `LITTLE` of what all others know, and all others give it up:
+the sum stays. `no_reset` keeps local filters apart but for this part in a million.
 
 A local filter that is taken back gets x_g and P_g / beta_i, and the others give that share up: P_j
 <- P_j / (1 - beta_i).
@@ -19,8 +19,6 @@ Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +31,7 @@ from fusiond.estimators.federated.bank import (
     inverse_of_factor,
     publish,
 )
-from fusiond.estimators.federated.filter import FederatedFilter
-from fusiond.estimators.federated.isolation import DIFFERENCE, Record
+from fusiond.estimators.federated.carried import CarriedFilter
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 
@@ -45,23 +42,11 @@ LITTLE = 1e-6
 MOST = 1e8
 
 
-class _Own(NamedTuple):
-    bank: Array
-    dxs: Array
-    before: Array
-    phi: Array
-    factors: Array
-    shares: Array
-    records: tuple[Record, ...]
-
-
-class NoResetFilter(FederatedFilter):
+class NoResetFilter(CarriedFilter):
     """`no_reset` and `rescale` (`fusiond.estimators.base.Estimator`).
 
     Bank: 0 ... N - 1 the local filters, N the master's own part in `rescale`.
     """
-
-    carries_transition = True
 
     def __init__(
         self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
@@ -69,8 +54,6 @@ class NoResetFilter(FederatedFilter):
         self._rescales = options.mode == "rescale"
         self._bank_shares: Array = np.ones(len(names) + self._rescales)
         super().__init__(model, gap_s, names, options, len(names) + self._rescales)
-        self._unit: Array = np.eye(model.width)
-        self._before: Array = np.zeros((model.width, model.width))
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -89,8 +72,7 @@ class NoResetFilter(FederatedFilter):
 
     # ------------------------------------------------------------------ the bank in time
 
-    def _settle(self) -> None:
-        """Bring the bank to the present."""
+    def _bring_up(self) -> None:
         carry(
             self._bank,
             self._bank_dxs,
@@ -101,19 +83,11 @@ class NoResetFilter(FederatedFilter):
         )
         self._mark()
 
-    def _mark(self) -> None:
-        """The bank holds at the present."""
-        self._phi[:] = self._unit
-        self._before[:] = self._covs[0]
-
     def _members(self) -> list[int]:
         """Filters of the bank that put their information in."""
         return self._believed() + ([len(self.names)] if self._rescales else [])
 
     # ------------------------------------------------------------------ update
-
-    def _bring_up(self) -> None:
-        self._settle()
 
     def _judge(self, local: int | None) -> tuple[Array, Array]:
         if local is None or self._rescales:
@@ -131,32 +105,13 @@ class NoResetFilter(FederatedFilter):
                 self._fuse_into(self._bank[k], self._bank_dxs[k], i, share)
         else:
             self._fuse_into(self._bank[local], self._bank_dxs[local], i)
-            self._faults.heard(local, self.t_ns)
+            self._faults.received(local, self.t_ns)
         return self._fuse_all(local)
 
-    def _fuse_all(self, updated: int | None) -> str:
-        """Fuse, compare the local filter that was updated, publish; the outcome's name."""
-        if not self._weigh_and_combine():
-            return "not_positive_definite"
-        if updated is not None and self.options.fault_detection:
-            worst = self._worst(updated)
-            if worst is not None and self._isolate(worst, DIFFERENCE):
-                return "isolated" if worst == updated else "fused"
-        self._take_over(updated)
-        return "fused"
-
-    def _weigh_and_combine(self) -> bool:
+    def _fuse(self) -> bool:
         self._weight[:] = 0.0
         self._weight[self._members()] = 1.0
         return self._combine()
-
-    def _worst(self, updated: int) -> int | None:
-        """The local filter that stands out most, if the one just updated stands out at all."""
-        believed = self._believed()
-        own = self._difference(updated)
-        if self._faults.worst(dict.fromkeys(believed, own), self._tested) is None:
-            return None
-        return self._faults.worst({i: self._difference(i) for i in believed}, self._tested)
 
     def _difference(self, k: int) -> float:
         return difference(
@@ -221,7 +176,7 @@ class NoResetFilter(FederatedFilter):
     # ------------------------------------------------------------------ faults, feedback, snapshots
 
     def _leave_out(self, local: int) -> None:
-        if self._weigh_and_combine():
+        if self._fuse():
             self._take_over(None)
         self._bank[local] = self._covs[0]
         self._bank_dxs[local] = self._dxs[0]
@@ -234,28 +189,5 @@ class NoResetFilter(FederatedFilter):
         self._bank[local] = self._covs[0] / share
         self._bank_dxs[local] = self._dxs[0]
 
-    def _shift(self, x: Array) -> None:
-        self._bank_dxs -= x
-
-    def release(self) -> None:
-        """Feed back what was carried."""
-        self._settle()
-        super().release()
-
-    def _own_snapshot(self) -> object:
-        return _Own(
-            self._bank.copy(),
-            self._bank_dxs.copy(),
-            self._before.copy(),
-            self._phi.copy(),
-            self._factors.copy(),
-            self._bank_shares.copy(),
-            tuple(self._faults.records),
-        )
-
-    def _own_restore(self, extra: object) -> None:
-        assert isinstance(extra, _Own)
-        self._bank[:], self._bank_dxs[:] = extra.bank, extra.dxs
-        self._before[:], self._phi[:] = extra.before, extra.phi
-        self._faults.records = list(extra.records)
-        self._factors[:], self._bank_shares[:] = extra.factors, extra.shares
+    def _kept_arrays(self) -> tuple[Array, ...]:
+        return *super()._kept_arrays(), self._bank, self._bank_shares

@@ -1,4 +1,4 @@
-"""Options of a federated filter, and which aids belong to which of its local filters."""
+"""Options of a federated filter, and which measurements belong to which of its local filters."""
 
 from __future__ import annotations
 
@@ -38,5 +38,5 @@ def local_of(source: str, names: tuple[str, ...]) -> int | None:
     begins with (`gnss_velocity` to `gnss`); None: common to all."""
     if source in names:
         return names.index(source)
-    begun = [name for name in names if source.startswith(f"{name}_")]
-    return names.index(max(begun, key=len)) if begun else None
+    prefixed = [name for name in names if source.startswith(f"{name}_")]
+    return names.index(max(prefixed, key=len)) if prefixed else None

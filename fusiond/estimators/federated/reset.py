@@ -4,12 +4,12 @@ After a fusion, and as all are propagated alike, until the next,
 
     x_i = x_g,   P_i = P_g / beta_i
 
-so a local filter need not be kept: it is made from the master when its aid comes, updated, and
-fused with what the others know together, (1 - beta_i) P_g^-1. An aid that is common to all adds R /
-beta_i to each, which is R to the master. The result is the centralised filter's but for rounding,
-whatever the factors are. In `zero_reset` the master has all: beta_i = 0. A local filter that begins
-with no information holds, after its aid, that of the aid, H^T R^-1 H, and the master that adds it
-makes a measurement update: so that is what is done.
+so a local filter need not be kept: it is made from the master when its measurement comes, updated,
+and fused with what the others know together, (1 - beta_i) P_g^-1. A measurement that is common to
+all adds R / beta_i to each, which is R to the master. The result is the centralised filter's but
+for rounding, whatever the factors are. In `zero_reset` the master has all: beta_i = 0. A local
+filter that begins with no information holds, after its measurement, that of the measurement, H^T
+R^-1 H, and the master that adds it makes a measurement update: so that is what is done.
 
 The difference of a local filter and the others is its last innovation again, so that the difference
 test has nothing to say here, and what a fault has done before it was noticed is in the master.
@@ -19,26 +19,18 @@ Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
 from fusiond.estimators.federated.bank import publish
 from fusiond.estimators.federated.filter import FederatedFilter
-from fusiond.estimators.federated.isolation import Record
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
 UPDATED, OTHERS = 0, 1
-
-
-class _Own(NamedTuple):
-    factors: Array
-    records: tuple[Record, ...]
 
 
 class ResetFilter(FederatedFilter):
@@ -54,7 +46,7 @@ class ResetFilter(FederatedFilter):
             self._fuse_into(self._covs[0], self._dxs[0], i)
             self._feed_back_published()
             if local is not None:
-                self._faults.heard(local, self.t_ns)
+                self._faults.received(local, self.t_ns)
             return "fused"
         share = float(self._factors[local])
         self._bank[UPDATED] = self._covs[0] / share
@@ -64,7 +56,7 @@ class ResetFilter(FederatedFilter):
         self._fuse_into(self._bank[UPDATED], self._bank_dxs[UPDATED], i)
         if not self._combine():
             return "not_positive_definite"
-        self._faults.heard(local, self.t_ns)
+        self._faults.received(local, self.t_ns)
         if self.options.adaptive and share < 1.0:
             trace = self._trace[OTHERS] / self._factors
             trace[local] = self._trace[UPDATED]
@@ -83,11 +75,3 @@ class ResetFilter(FederatedFilter):
 
     def _leave_out(self, local: int) -> None:
         """Nothing: what is published has taken no part in this update."""
-
-    def _own_snapshot(self) -> object:
-        return _Own(self._factors.copy(), tuple(self._faults.records))
-
-    def _own_restore(self, extra: object) -> None:
-        assert isinstance(extra, _Own)
-        self._factors[:] = extra.factors
-        self._faults.records = list(extra.records)

@@ -1,6 +1,7 @@
 r"""Multi-scale filter: M = 2^(N-1) successive states estimated together, in the wavelet domain.
 
-An epoch is an instant at which an aid was fused. With epoch k the block (k-M+1 ... k) is predicted
+An epoch is an instant at which a measurement was fused. With epoch k the block (k-M+1 ... k) is
+predicted
 from the block (k-2M+1 ... k-M), updated with what was measured at its M epochs, and its last
 element is the solution. So M chains of blocks run interleaved; each sees every measurement once.
 What follows from what is said in `fusiond.estimators.multiscale.block`.
@@ -119,7 +120,7 @@ class MultiscaleEstimator(ErrorStateFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self._begin_anew(super().covariance.copy())
+        self._restart(super().covariance.copy())
 
     def propagate(
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
@@ -135,7 +136,7 @@ class MultiscaleEstimator(ErrorStateFilter):
         super().propagate(imu, target_ns, record)
         self._memory.head[USED] = 1
 
-    def _begin_anew(self, p: Array) -> None:
+    def _restart(self, p: Array) -> None:
         """No epoch yet: what follows starts from P (n, n)."""
         self._posterior = p
         self._window, self._blocks, self._starts = None, [], []
@@ -146,15 +147,15 @@ class MultiscaleEstimator(ErrorStateFilter):
         self._covs[0], self._dxs[1], self._carrying = 0.0, 0.0, False
         self._phi[:] = np.eye(len(self._phi))
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
-        innovation = self._linearise(aid)
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
+        innovation = self._linearise(measurement)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
-        if aid.screened:
-            return self._update_by_rows(aid, innovation)
+        if measurement.screened:
+            return self._update_by_rows(measurement, innovation)
         degrees = innovation.z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
+        threshold = gate_threshold(measurement.gate, degrees)
         nis, y = self._fuse(innovation, threshold)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
@@ -174,7 +175,7 @@ class MultiscaleEstimator(ErrorStateFilter):
             self._commit(o, total, h, r)
         return nis, y
 
-    def _update_by_rows(self, aid: Linearised, rows: Innovation) -> Outcome:
+    def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
         """Rows that pass are folded in, or none.
 
         They are judged on the newest element alone, which is all that they look at. Where the
@@ -184,12 +185,12 @@ class MultiscaleEstimator(ErrorStateFilter):
         o = self._open()
         mean, cov = self._newest(o)
         before, total = cov.copy(), z + h @ o.u
-        s = self._screen(aid, Innovation(total, h, r), cov, mean)
+        s = self._screen(measurement, Innovation(total, h, r), cov, mean)
         if not np.array_equal(cov, before):
-            self._begin_anew(self.covariance)
+            self._restart(self.covariance)
             o = self._open()
             total = z + h @ o.u
-            s = self._screen(aid, Innovation(total, h, r), o.block.cov, o.block.mean)
+            s = self._screen(measurement, Innovation(total, h, r), o.block.cov, o.block.mean)
         kept, codes = s.codes == KEPT, tuple(s.codes.tolist())
         if not kept.any():
             return Outcome("gated", s.nis, 0, (), codes)

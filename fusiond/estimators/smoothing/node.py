@@ -1,6 +1,7 @@
 r"""Node of a filter at an instant, so that a smoother can come back to it.
 
-A node is an instant t_j at which aids were fused, or one between them where they are far apart:
+A node is an instant t_j at which measurements were fused, or one between them where they are far
+apart:
 
     Phi_j   transition of the error state from node j - 1 to node j
     rows    of each scalar measurement at t_j in their order: h, k, s, nu
@@ -130,8 +131,9 @@ def write_body(
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])")
 def write_rows(cov: Array, dx: Array, z: Array, h: Array, r: Array, ops: Array) -> None:
-    """Write `ops` (m, 2 n + 2) of an update of P (width, width) by rows z = h dx + noise, and move
-    `dx` (n,) as the update does: h (m, n), z, r (m,).
+    """Record an update as rows `ops` (m, 2 n + 2), and apply it to `dx` (n,).
+
+    Of P (width, width) by rows z = h dx + noise: h (m, n), z, r (m,).
 
     Gains without P of each row: with P_a = P - sum_b k_b u_b^T,  P_a h_a^T = P h_a^T
     - sum_b k_b (u_b h_a^T), and u_b = s_b k_b.

@@ -151,14 +151,14 @@ class TapedKalman(TiltAxesFilter):
             self._close()
         super().propagate(imu, target_ns, record)
 
-    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
+    def _fold_in(self, measurement: Linearised, noise: Array) -> Outcome:
         np.copyto(self._before, self._covs[0])
         held = self._dxs[0].copy()
-        outcome = super()._fold_in(aid, noise)
+        outcome = super()._fold_in(measurement, noise)
         rows = self._rows
         if outcome.name == "fused" and not isinstance(rows, NotApplicable):
             z, h, r = rows
-            if aid.screened:
+            if measurement.screened:
                 kept = np.array(outcome.rows) == KEPT
                 z, h, r = z[kept], h[kept], r[kept]
             self._fold(held, z, h, r)
@@ -177,15 +177,16 @@ class TapedKalman(TiltAxesFilter):
         renew(renewal, self.model, (), (self._phi,))
         super()._renew(renewal)
 
-    def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
-        """The aid's innovation, linear in the error state."""
-        self._rows = super()._linearise(aid)
+    def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
+        """The measurement's innovation, linear in the error state."""
+        self._rows = super()._linearise(measurement)
         return self._rows
 
-    def _screen(self, aid: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
-        """Update by rows of a screened aid. A receiver's clock that starts anew has no past."""
+    def _screen(self, measurement: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
+        """Update by rows of a screened measurement. A receiver's clock that starts anew has no
+        past."""
         before = cov.copy()
-        screened = super()._screen(aid, rows, cov, dx)
+        screened = super()._screen(measurement, rows, cov, dx)
         if np.may_share_memory(cov, self._covs):
             offsets = self.model.slots_of(CLOCK_OFFSET)
             if not np.array_equal(before[offsets], cov[offsets]):

@@ -1,11 +1,11 @@
 r"""Unscented Kalman filter on the error state, closed loop: sigma points instead of Jacobians.
 
-Measurements: the transform is taken over the states that the aid depends on (the columns of its H
-that are not zero), each point through the aid's own innovation at the true state that its error
-would mean. What comes of it is linear in the error state again
+Measurements: the transform is taken over the states that the measurement depends on (the columns of
+its H that are not zero), each point through the measurement's own innovation at the true state that
+its error would mean. What comes of it is linear in the error state again
 (fusiond.estimators.unscented.sigma_points), so gate, update and feedback are those of the extended
 filter. All other states follow through their correlation, as in a full transform. A sigma point has
-no past: an aid that `remembers` goes by its Jacobian.
+no past: a measurement that `remembers` goes by its Jacobian.
 
 Propagation: the extended filter's covariance, or with `propagation` sigma points through the
 strapdown equations and a covariance that turns with a large correction of the attitude
@@ -52,10 +52,10 @@ class UnscentedEstimator(KalmanEstimator):
         self.spread = spread
         self.propagation = propagation
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not."""
         before = self.nav.copy()
-        outcome = super().update(aid, noise)
+        outcome = super().update(measurement, noise)
         if self.propagation and outcome.name == "fused" and not self._holding:
             turn_attitude(self._covs[0], before, self.nav)
         return outcome
@@ -67,15 +67,15 @@ class UnscentedEstimator(KalmanEstimator):
         if self.propagation:
             turn_attitude(self._covs[0], before, self.nav)
 
-    def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
-        """The aid's innovation over the sigma points, linear in the error state.
+    def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
+        """The measurement's innovation over the sigma points, linear in the error state.
 
-        Where the aid does not hold at a point, its pair goes by the Jacobian at the centre.
+        Where the measurement does not hold at a point, its pair goes by the Jacobian at the centre.
         """
-        if aid.remembers:
-            return super()._linearise(aid)
+        if measurement.remembers:
+            return super()._linearise(measurement)
         state = self.state
-        central = aid.innovation(state)
+        central = measurement.innovation(state)
         if isinstance(central, NotApplicable):
             return central
         model = self.model
@@ -96,18 +96,30 @@ class UnscentedEstimator(KalmanEstimator):
         for p in range(count):
             found: Innovation | NotApplicable = central
             if p > 0 or self._holding:
-                found = aid.innovation(State(navs[p], xis[p], steps[p], model))
+                found = measurement.innovation(State(navs[p], xis[p], steps[p], model))
             if isinstance(found, Innovation) and found.z.shape[0] == rows:
                 points[p] = found.z
         if not np.isfinite(points[0]).all():
             points[0] = central.z - central.h @ dx
-        if math.isfinite(aid.period):
-            points -= aid.period * np.nan_to_num(np.round((points - points[0]) / aid.period))
+        if math.isfinite(measurement.period):
+            points -= measurement.period * np.nan_to_num(
+                np.round((points - points[0]) / measurement.period)
+            )
         z, h, r = np.empty(rows), np.empty((rows, model.size)), np.empty(rows)
         linear_form(
-            points, central.h, central.r, dx, slots, root, self.spread, aid.screened, z, h, r
+            points,
+            central.h,
+            central.r,
+            dx,
+            slots,
+            root,
+            self.spread,
+            measurement.screened,
+            z,
+            h,
+            r,
         )
-        return self._weighed(aid, Innovation(z, h, r))
+        return self._weighed(measurement, Innovation(z, h, r))
 
     def propagate(
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False

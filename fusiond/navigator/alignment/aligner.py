@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -23,12 +23,13 @@ from fusiond.navigator.alignment.headings import (
     from_config,
     from_dual_antenna,
     from_gyrocompass,
+    from_positions,
     from_saved,
 )
 from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.missing import Journal, why_not
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.positions import Track, from_positions
+from fusiond.navigator.alignment.positions import Track
 from fusiond.navigator.alignment.start import Place, Start
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
@@ -69,18 +70,18 @@ class Aligner:
         """True if anything has come since the reason was said, and when (`SAID_NS`) that was."""
         self._basis = Basis(options, noise, model, saved, self.known, self._track)
 
-    def aids(self, aids: Sequence[Aid]) -> None:
-        """A measurement has arrived, as the aids it stands for."""
-        self.known.aids(aids)
-        self._track.hear(aids)
+    def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
+        """Receive the aiding measurements of one device measurement."""
+        self.known.receive(measurements)
+        self._track.receive(measurements)
         self._news = True
 
-    def sensed(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
+    def sensed(self, windows: Sequence[Window], measurements: Sequence[AidingMeasurement]) -> None:
         """Windows of the standstill detector have ended; constraints that hold."""
         for window in windows:
             self.known.window(window)
             self._news = True
-        self._track.hear(aids)
+        self._track.receive(measurements)
 
     def waits(self, start: Start, latency: LatencySearch) -> bool:
         """True if a start that was found must wait: while it is looked whether the fixes that it is

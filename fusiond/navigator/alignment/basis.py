@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
-from fusiond.navigation.earth import EARTH_RATE_RAD_S
-from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standstill
+from fusiond.navigator.alignment.evidence import AlignmentEvidence
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.positions import Track
 from fusiond.navigator.saved_state import SavedState
-
-if TYPE_CHECKING:
-    from fusiond.navigator.alignment.positions import Track
-
-Array = NDArray[np.float64]
 
 
 class Basis(NamedTuple):
@@ -30,20 +21,3 @@ class Basis(NamedTuple):
     saved: SavedState | None
     known: AlignmentEvidence
     track: Track
-
-
-def rest_bias(
-    noise: ImuNoise, standstill: Standstill, dcm: Array, lat: float, sd_yaw: float = 0.0
-) -> tuple[Array, float]:
-    """Rate bias (3,) seen at rest and its sigma.
-
-    Of the Earth's level rate w a heading that is off by y, one sigma s, takes out the wrong part,
-    w (cos y - 1, sin y): w y is the start's to correlate, the rest, half of it an axis, is
-
-        E (sin y - y)^2 + E (1 - cos y)^2 = s^2 + 2 - 2 (1 + s^2) exp(-s^2 / 2)
-    """
-    earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
-    rest = sd_yaw**2 + 2.0 - 2.0 * (1.0 + sd_yaw**2) * math.exp(-0.5 * sd_yaw**2)
-    wrong = float(earth[0]) * math.sqrt(0.5 * rest)
-    white = noise.rate_noise / math.sqrt(standstill.seconds)
-    return standstill.mean_rate - dcm.T @ earth, math.hypot(white, wrong)

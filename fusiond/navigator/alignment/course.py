@@ -34,9 +34,10 @@ from fusiond.navigation.rotation import (
     wrap_angle,
 )
 from fusiond.navigator.alignment import motion_fit, sensed_motion
-from fusiond.navigator.alignment.basis import Basis, rest_bias
+from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.evidence import Fix, Standstill
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.rest import rest_bias
 from fusiond.navigator.alignment.start import (
     BACKWARD,
     BIAS_SETTLING_S,
@@ -139,15 +140,15 @@ def _moved_off(
     sensed_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
     sd_sensed = _sensed_sd(by, g, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, speed)
     acceleration = dcm @ f.of.means[1, 3:] + [0.0, 0.0, g]
-    late = math.hypot(*acceleration[:2]) * _sd_late_s(by, velocity)
-    sd_speed = math.hypot(max(velocity.sd[:2]), late)
+    delay_v = math.hypot(*acceleration[:2]) * _sd_delay_s(by, velocity)
+    sd_speed = math.hypot(max(velocity.sd[:2]), delay_v)
     if abs(sensed_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_sensed, sd_speed):
         return None
     sensed = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
     backward = abs(sensed) > math.pi / 2.0
     by_course = _along(by.options, velocity, rate, backward)
-    apart = wrap_angle(sensed - by_course.angle)
-    if abs(apart) > COURSE_AGREEMENT_RAD:
+    difference = wrap_angle(sensed - by_course.angle)
+    if abs(difference) > COURSE_AGREEMENT_RAD:
         return by.known.doubted(reason("imu_sideways"))
     if backward:
         if not by.known.seen_at_rest(standstill):
@@ -156,7 +157,7 @@ def _moved_off(
             return why
     sd_sensed_angle = math.hypot(sd_sensed, sd_speed) / speed
     share = by_course.sd**2 / (by_course.sd**2 + sd_sensed_angle**2)
-    angle = by_course.angle + share * apart
+    angle = by_course.angle + share * difference
     sd = by_course.sd * sd_sensed_angle / math.hypot(by_course.sd, sd_sensed_angle)
     yaw = math.atan2(velocity.v_ned[1], velocity.v_ned[0]) - angle
     at_rest = dcm_from_rpy(*level(standstill.mean_force), yaw - turned)
@@ -228,8 +229,8 @@ def _reversing(by: Basis, velocity: VelocityCandidate) -> str:
     one backward.
     """
     speed = math.hypot(*velocity.v_ned[:2])
-    if speed > by.options.max_reverse_m_s or "imu_backwards" in by.known.told:
-        return by.known.tell("imu_backwards", reason("imu_backwards", speed=speed))
+    if speed > by.options.max_reverse_m_s or "imu_backwards" in by.known.reported:
+        return by.known.report("imu_backwards", reason("imu_backwards", speed=speed))
     for fix in by.known.fixes:
         age_ns = velocity.t_ns - fix.velocity.t_ns
         if 0 < age_ns <= SETTLED_NS:
@@ -250,7 +251,7 @@ class Ways:
     _options: AlignmentOptions
     _noise: ImuNoise
     _g: float
-    _sd_late_s: float
+    _sd_delay_s: float
 
     def fit(self, backward: bool) -> motion_fit.Fit:
         """The best fit of a vehicle that drives forward, or backward."""
@@ -259,7 +260,7 @@ class Ways:
         along = _along(self._options, velocity, self.sensed.rates[-1], backward)
         yaw = course - along.angle
         given = self._past, self.sensed, self._measured, self._noise, self._g
-        return motion_fit.fit(*given, yaw, along.sd, self._sd_late_s)
+        return motion_fit.fit(*given, yaw, along.sd, self._sd_delay_s)
 
 
 def ways(
@@ -269,12 +270,12 @@ def ways(
     options: AlignmentOptions,
     noise: ImuNoise,
     g: float,
-    sd_late_s: float = 0.0,
+    sd_delay_s: float = 0.0,
 ) -> Ways:
     """Of velocities in order of time, `latest` the last; they are late by 0 to within
-    `sd_late_s`."""
+    `sd_delay_s`."""
     f = sensed_motion.sensed(past, m.instants, sensed_motion.rate_before_motion(past, m))
-    return Ways(f, past, m, latest, options, noise, g, sd_late_s)
+    return Ways(f, past, m, latest, options, noise, g, sd_delay_s)
 
 
 def _on_the_move(
@@ -289,9 +290,9 @@ def _on_the_move(
         by.known.doubted(reason("collecting"))
         return None
     lat, _, height = (float(v) for v in place[1])
-    late = _sd_late_s(by, velocity)
+    delay_v = _sd_delay_s(by, velocity)
     m, g = sensed_motion.measured(usable, sensed_motion.MOST_FIXES), gravity(lat, height)
-    either = ways(imu, m, usable[-1], by.options, by.noise, g, late)
+    either = ways(imu, m, usable[-1], by.options, by.noise, g, delay_v)
     rate = either.sensed.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
@@ -314,23 +315,23 @@ def _on_the_move(
         return _build(*at, how, fitted=_fitted(backward_fit, doubt))
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
-    patience = FORWARD_AFTER_S[0 if fast else 1]
+    timeout_s = FORWARD_AFTER_S[0 if fast else 1]
     # The prior says forward, but not once an IMU was found to face the other way.
-    assumed = moving_s >= patience and ratio > -1.0 and "imu_backwards" not in by.known.told
+    assumed = moving_s >= timeout_s and ratio > -1.0 and "imu_backwards" not in by.known.reported
     if ratio < DECIDED and not assumed:
-        by.known.doubted(reason("direction", seconds=patience))
+        by.known.doubted(reason("direction", seconds=timeout_s))
         return None
     at = by, imu, velocity, place, forward_fit.dcm, LEAST_YAW_SD_RAD, rate
     return _build(*at, "GNSS course, on the move", fitted=_fitted(forward_fit, doubt))
 
 
-def _sd_late_s(by: Basis, velocity: VelocityCandidate) -> float:
+def _sd_delay_s(by: Basis, velocity: VelocityCandidate) -> float:
     """One sigma of how late a receiver's velocities are; 0 where that is not estimated."""
     return float(sum(by.model.initial[slot] for slot in by.model.slots_of(velocity.time)))
 
 
 def _fitted(fit: motion_fit.Fit, doubt: float) -> Fitted:
-    return Fitted(fit.biases, fit.late_s, doubt * fit.covariance)
+    return Fitted(fit.biases, fit.delay_s, doubt * fit.covariance)
 
 
 def _build(
@@ -354,7 +355,7 @@ def _build(
         force = force - fitted.biases[:3]
     acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]
     if fitted is not None:
-        velocity = velocity - acceleration * fitted.late_s
+        velocity = velocity - acceleration * fitted.delay_s
     return build_start(
         by.model,
         candidate.t_ns,

@@ -1,4 +1,4 @@
-"""Data of an alignment: rest seen by the IMU, and what the aids offered."""
+"""Data of an alignment: rest seen by the IMU, and what the measurements offered."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import (
     HeadingCandidate,
     HeightCandidate,
@@ -104,7 +104,7 @@ class AlignmentEvidence:
         """Reason to wait, beyond what the aligner sees itself."""
         self.poor_claims: dict[str, str] = {}
         """Reason why a claimed heading, by its origin, is no start."""
-        self.told: set[str] = set()
+        self.reported: set[str] = set()
         """Events that the operator has heard."""
         self.upside_down = False
         self.tried_ns = 0
@@ -169,10 +169,12 @@ class AlignmentEvidence:
         s.rate_sum += w.mean_rate * self._options.window_s
         s.force_sum += w.mean_force * self._options.window_s
 
-    def aids(self, aids: Sequence[Aid]) -> None:
-        """A measurement has arrived, as the aids it stands for."""
-        self.rest_evidence.hear(aids)
-        candidates = [candidate for aid in aids for candidate in aid.candidates()]
+    def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
+        """Receive the aiding measurements of one device measurement."""
+        self.rest_evidence.receive(measurements)
+        candidates = [
+            candidate for measurement in measurements for candidate in measurement.candidates()
+        ]
         height = next((o for o in candidates if isinstance(o, HeightCandidate)), None)
         position: PositionCandidate | None = None
         velocity: VelocityCandidate | None = None
@@ -251,10 +253,10 @@ class AlignmentEvidence:
         self.why = why
         return why
 
-    def tell(self, code: str, text: str) -> str:
+    def report(self, code: str, text: str) -> str:
         """The same, and an event the first time."""
-        if code not in self.told:
-            self.told.add(code)
+        if code not in self.reported:
+            self.reported.add(code)
             self._event(code, text)
         return self.doubted(text)
 
@@ -307,7 +309,7 @@ class AlignmentEvidence:
     def _gravity_points_up(self, w: Window) -> None:
         self.upside_down = bool(w.mean_force[2] > 0.5 * STANDARD_GRAVITY_M_S2)
         if self.upside_down:
-            self.tell("imu_upside_down", reason("imu_upside_down"))
+            self.report("imu_upside_down", reason("imu_upside_down"))
 
     def _turns(self, w: Window) -> bool:
         """True if the rate of quiet windows can be no bias that the data sheet allows."""
@@ -326,10 +328,10 @@ class AlignmentEvidence:
         """Position (rad, rad, m) to start at, the fix it came from, and its sigmas."""
         if self._position is not None:
             return self.place_of(self._position)
-        told = self._told()
-        if told is None:
+        reported = self._reported()
+        if reported is None:
             return None
-        (lat, lon, height), sd = told
+        (lat, lon, height), sd = reported
         if height is None:
             return Place(None, np.array([lat, lon, 0.0]), sd, UNKNOWN_HEIGHT_SD_M)
         return Place(None, np.array([lat, lon, height]), sd, sd)
@@ -343,7 +345,7 @@ class AlignmentEvidence:
             where += as_geodetic(moved, p.lat_rad)
         return Place(p, where, max(p.sd[:2]), sd_height)
 
-    def _told(self) -> tuple[tuple[float, float, float | None], float] | None:
+    def _reported(self) -> tuple[tuple[float, float, float | None], float] | None:
         """Position (rad, rad, m) by the configuration or the saved state , and one sigma (m)."""
         if self._options.position is not None:
             return self._options.position, self._options.position_sd_m
@@ -356,13 +358,13 @@ class AlignmentEvidence:
         far as roads climb on the way from there; 0 where nothing has told any."""
         if p.height_m is not None:
             return p.height_m, p.sd[2]
-        told = self._told()
-        if told is None:
+        reported = self._reported()
+        if reported is None:
             return 0.0, UNKNOWN_HEIGHT_SD_M
-        (lat, lon, height), sd = told
+        (lat, lon, height), sd = reported
         if height is None:
             return 0.0, UNKNOWN_HEIGHT_SD_M
-        apart = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
-        way_m = math.hypot(*(apart / as_geodetic(np.ones(3), lat)[:2]).tolist())
+        separation = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
+        way_m = math.hypot(*(separation / as_geodetic(np.ones(3), lat)[:2]).tolist())
         sd = math.hypot(sd, SLOPE_SD * way_m)
         return (height, sd) if sd < UNKNOWN_HEIGHT_SD_M else (0.0, UNKNOWN_HEIGHT_SD_M)

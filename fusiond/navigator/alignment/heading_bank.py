@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -81,7 +81,7 @@ class HeadingBank:
         self.positions = positions
         """Fixes that some cell has taken."""
         self._max_reverse_m_s = max_reverse_m_s
-        self._heard_ns: dict[str, int] = {}
+        self._received_ns: dict[str, int] = {}
         self._refused = 0
         self.backwards = False
         """The likeliest cell drove backward, faster than the vehicle can."""
@@ -96,14 +96,16 @@ class HeadingBank:
     def _best(self) -> Cell:
         return max(self._cells, key=lambda cell: cell.weight)
 
-    def run(self, imu: ImuBuffer, aids: Sequence[Aid], until_ns: int) -> None:
-        """To `until_ns`, with `aids` that are valid until then, in their order."""
-        for aid in aids:
-            if aid.t_ns < self._heard_ns.get(aid.source, 0) + INTERVAL_NS:
+    def advance(
+        self, imu: ImuBuffer, measurements: Sequence[AidingMeasurement], until_ns: int
+    ) -> None:
+        """To `until_ns`, with `measurements` that are valid until then, in their order."""
+        for measurement in measurements:
+            if measurement.t_ns < self._received_ns.get(measurement.source, 0) + INTERVAL_NS:
                 continue
-            self._heard_ns[aid.source] = aid.t_ns
-            self._propagate(imu, aid.t_ns)
-            self._hear(aid)
+            self._received_ns[measurement.source] = measurement.t_ns
+            self._propagate(imu, measurement.t_ns)
+            self._receive(measurement)
             if self.lost:
                 return
         self._propagate(imu, until_ns)
@@ -116,16 +118,16 @@ class HeadingBank:
         means, spread = [], np.zeros((best.model.size, best.model.size))
         for cell in self._cells:
             f = cell.filter
-            apart = best.between(f.nav, f.xi, turning)
-            means.append(apart)
-            jacobian = best.jacobian(apart, turning)
+            divergence = best.between(f.nav, f.xi, turning)
+            means.append(divergence)
+            jacobian = best.jacobian(divergence, turning)
             own = np.linalg.solve(jacobian, f.of_vehicle(f.nav, f.xi, -1.0))
             spread += cell.weight * own @ f.covariance @ own.T
         weights = np.array([cell.weight for cell in self._cells])
-        apart = np.array(means)
-        mean = weights @ apart
-        apart -= mean
-        spread += (apart * weights[:, None]).T @ apart
+        divergence = np.array(means)
+        mean = weights @ divergence
+        divergence -= mean
+        spread += (divergence * weights[:, None]).T @ divergence
         nav, xi = best.without(best.nav, best.xi, mean, turning)
         t = best.of_vehicle(nav, xi) @ best.jacobian(mean, turning)
         covariance = t @ spread @ t.T
@@ -138,10 +140,12 @@ class HeadingBank:
             cell.filter.propagate(imu, t_ns)
         self.t_ns = t_ns
 
-    def _hear(self, aid: Aid) -> None:
-        outcomes = [cell.filter.update(aid.at(cell.filter.nav)).name for cell in self._cells]
+    def _receive(self, measurement: AidingMeasurement) -> None:
+        outcomes = [
+            cell.filter.update(measurement.at(cell.filter.nav)).name for cell in self._cells
+        ]
         fused = "fused" in outcomes
-        if aid.locates:
+        if measurement.locates:
             self.positions += fused
             self._refused = 0 if fused else self._refused + 1
         # Cells are compared by what all of them were measured with; what none takes is an outlier.
@@ -150,7 +154,7 @@ class HeadingBank:
         logs = np.array([cell.filter.log_likelihood for cell in self._cells])
         for cell, factor in zip(self._cells, np.exp(logs - logs.max()), strict=True):
             cell.weight *= float(factor)
-        if aid.locates:
+        if measurement.locates:
             self._drop_backward()
         self._prune()
 

@@ -1,4 +1,7 @@
-"""Headings of a vehicle that stands: saved, configured, of two antennas, of the Earth's rate."""
+"""Headings of a vehicle that stands: saved, configured, of two antennas, of the Earth's rate.
+
+And that of positions, whose bank is elsewhere (fusiond.navigator.alignment.positions).
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,9 @@ from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
-from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.evidence import CONTRADICTION_SIGMAS
+from fusiond.navigator.alignment.basis import Basis
+from fusiond.navigator.alignment.evidence import CONTRADICTION_SIGMAS, FIXES_NS
+from fusiond.navigator.alignment.rest import REST_VELOCITY_SD, rest_bias
 from fusiond.navigator.alignment.start import (
     Levelled,
     Place,
@@ -37,8 +41,6 @@ POOR_SD_RAD = math.radians(15.0)
 PLAIN_CLAIM_RAD = math.radians(6.0)
 ON_THE_WAY = frozenset({"gnss_course", "positions"})
 """Sources that give a heading as the vehicle drives."""
-# One sigma of velocity (m/s) of a vehicle that stands.
-REST_VELOCITY_SD = np.full(3, 0.1)
 
 
 def _at_standstill(
@@ -81,14 +83,14 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         return None
     fix, where, sd, _ = place
     if fix is not None:
-        apart = where[:2] - np.array(by.saved.position[:2])
-        apart[1] = math.remainder(float(apart[1]), 2.0 * math.pi)
-        metres = apart / as_geodetic(np.ones(3), float(where[0]))[:2]
+        moved = where[:2] - np.array(by.saved.position[:2])
+        moved[1] = math.remainder(float(moved[1]), 2.0 * math.pi)
+        metres = moved / as_geodetic(np.ones(3), float(where[0]))[:2]
         away = math.hypot(*metres.tolist())
         if away > CONTRADICTION_SIGMAS * math.hypot(sd, by.saved.sd_position_m):
             text = reason("parked_elsewhere", distance=away)
             by.known.poor_claims[SAVED] = text
-            by.known.tell("saved_elsewhere", text)
+            by.known.report("saved_elsewhere", text)
             return None
     start = _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
     return start and replace(start, confirmed=by.saved.confirmed)
@@ -151,3 +153,16 @@ def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         levelled=Levelled(dcm),
         compassed=True,
     )
+
+
+def from_positions(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """Heading of positions alone; a velocity, where there is one, tells it sooner and better."""
+    fixes = by.known.fixes
+    if (
+        fixes
+        and "gnss_course" in by.options.heading
+        and imu.latest_ns - fixes[-1].velocity.t_ns < FIXES_NS
+    ):
+        by.track.give_up()
+        return None
+    return by.track.start(by.known, by.noise, imu, place)

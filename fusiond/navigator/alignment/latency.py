@@ -44,7 +44,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.estimators.base import gate_threshold
 from fusiond.models.blocks import ImuNoise
@@ -64,7 +64,7 @@ from fusiond.navigator.alignment.position_jumps import (
 from fusiond.navigator.alignment.sensed_motion import MOST_FIXES
 from fusiond.navigator.reasons import reason
 
-MOST_LATE_S = 3.0
+MOST_DELAY_S = 3.0
 """The longest that is searched."""
 # What is searched (s): a change of course at 10 deg/s is still one valley at twice the step.
 SEARCHED_S = tuple(0.2 * k for k in range(16))
@@ -85,7 +85,7 @@ MOST_WAITING = 4 * MOST_KEPT
 ALL_FIXES = 5 * KEPT_NS // 1_000_000_000
 # A delay that is known worse (s) is waited for so long (ns) to be known better: half the sigma
 # of the filter's own state for it, which takes over.
-SETTLED_SD_S, PATIENCE_NS = 0.05, 10_000_000_000
+SETTLED_SD_S, TIMEOUT_NS = 0.05, 10_000_000_000
 # So many looks must have seen it, within so many sigmas of each other.
 SEEN, AGREED = 3, 4.0
 # A look is 6 fits of 0.3 ms of a fast computer each, one that searches 45: as often is looked, and
@@ -121,17 +121,17 @@ class Found(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Heard:
-    """The aids of a measurement as they were stamped, and its velocities once they were asked
+class _Received:
+    """Aiding measurements of one device measurement as stamped, and its velocities once asked
     for."""
 
-    aids: tuple[Aid, ...]
+    measurements: tuple[AidingMeasurement, ...]
     found: list[Epoch] | None = None
 
     def epochs(self) -> list[Epoch]:
         """Its velocities, each with its position."""
         if self.found is None:
-            candidates = [candidate for aid in self.aids for candidate in aid.candidates()]
+            candidates = [candidate for m in self.measurements for candidate in m.candidates()]
             position = next((o for o in candidates if isinstance(o, PositionCandidate)), None)
             self.found = [
                 Epoch(o, position) for o in candidates if isinstance(o, VelocityCandidate)
@@ -144,31 +144,31 @@ class _Receiver:
     """The last measurements of a receiver, how late they are taken to be (ns), and what speaks for
     another delay since when (ns)."""
 
-    heard: deque[_Heard] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
-    late_ns: int = 0
+    received: deque[_Received] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
+    delay_ns: int = 0
     suspected: Delay | None = None
     since_ns: int = 0
     seen: int = 0
 
-    def suspect(self, late: Delay, t_ns: int) -> None:
+    def suspect(self, delay: Delay, t_ns: int) -> None:
         """Delay by the fixes until `t_ns`; what looks agree upon counts, the best known of it."""
         before = self.suspected
-        if before is None or not late.agrees(before):
-            self.suspected, self.since_ns, self.seen = late, t_ns, 1
+        if before is None or not delay.agrees(before):
+            self.suspected, self.since_ns, self.seen = delay, t_ns, 1
             return
         self.seen += 1
-        if late.sd < before.sd:
-            self.suspected = late
+        if delay.sd < before.sd:
+            self.suspected = delay
 
     def settled(self, t_ns: int) -> Delay | None:
         """Delay, once that is known; a suspicion that has not lasted ends."""
-        late = self.suspected
-        if late is None:
+        delay = self.suspected
+        if delay is None:
             return None
-        waited = t_ns - self.since_ns >= PATIENCE_NS
-        if self.seen >= SEEN and (waited or late.sd <= SETTLED_SD_S):
-            self.late_ns, self.suspected = round(late.seconds * 1e9), None
-            return late
+        waited = t_ns - self.since_ns >= TIMEOUT_NS
+        if self.seen >= SEEN and (waited or delay.sd <= SETTLED_SD_S):
+            self.delay_ns, self.suspected = round(delay.seconds * 1e9), None
+            return delay
         if waited:
             self.suspected = None
         return None
@@ -190,7 +190,7 @@ class LatencySearch:
         self._receivers: dict[str, _Receiver] = {}
         self.on_time: set[str] = set()
         """Known receivers whose stamps are taken as they are."""
-        self.waiting: deque[tuple[str, Sequence[Aid]]] = deque(maxlen=MOST_WAITING)
+        self.waiting: deque[tuple[str, Sequence[AidingMeasurement]]] = deque(maxlen=MOST_WAITING)
         """Measurements of receivers that are `on_time`, taken in when somebody looks."""
         self._due_ns = self._fitted_ns = 0
         self._looking: Generator[None, None, Found | None] | None = None
@@ -199,34 +199,36 @@ class LatencySearch:
     def _catch_up(self) -> None:
         """Take in what waits."""
         while self.waiting:
-            source, aids = self.waiting.popleft()
-            self._receivers[source].heard.append(_Heard(tuple(aids)))
+            source, measurements = self.waiting.popleft()
+            self._receivers[source].received.append(_Received(tuple(measurements)))
 
-    def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
-        """A measurement has come, as the aids it stands for; the same at the instants at which it
-        was true."""
+    def receive(
+        self, source: str, measurements: Sequence[AidingMeasurement]
+    ) -> Sequence[AidingMeasurement]:
+        """Aiding measurements of one device measurement, moved to the instants at which they were
+        true."""
         self._catch_up()
         receiver = self._receivers.get(source)
         if receiver is None:
-            if not any(aid.moves and not aid.screened for aid in aids):
-                return aids
+            if not any(m.moves and not m.screened for m in measurements):
+                return measurements
             receiver = self._receivers[source] = _Receiver()
-        receiver.heard.append(_Heard(tuple(aids)))
-        late_ns = receiver.late_ns
-        if late_ns:
+        receiver.received.append(_Received(tuple(measurements)))
+        delay_ns = receiver.delay_ns
+        if delay_ns:
             self.on_time.discard(source)
         else:
             self.on_time.add(source)
-        return [_earlier(aid, late_ns) for aid in aids] if late_ns else aids
+        return [_earlier(m, delay_ns) for m in measurements] if delay_ns else measurements
 
-    def kept(self) -> list[Aid]:
-        """The last aids of all receivers, at the instants at which they were true."""
+    def kept(self) -> list[AidingMeasurement]:
+        """The last measurements of all receivers, at the instants at which they were true."""
         self._catch_up()
         return [
-            _earlier(aid, receiver.late_ns)
+            _earlier(measurement, receiver.delay_ns)
             for receiver in self._receivers.values()
-            for heard in tuple(receiver.heard)[-HANDED_ON:]
-            for aid in heard.aids
+            for received in tuple(receiver.received)[-HANDED_ON:]
+            for measurement in received.measurements
         ]
 
     def due(self, t_ns: int) -> bool:
@@ -247,8 +249,8 @@ class LatencySearch:
         """Text on a receiver whose delay is suspected, in words; empty where none is."""
         for source, receiver in self._receivers.items():
             if receiver.suspected is not None:
-                late = receiver.suspected
-                return reason("fixes_delayed", source=source, seconds=late.seconds)
+                delay = receiver.suspected
+                return reason("fixes_delayed", source=source, seconds=delay.seconds)
         return ""
 
     def look(self, imu: ImuBuffer) -> Found | None:
@@ -280,7 +282,7 @@ class LatencySearch:
         self._catch_up()
         t_ns = imu.latest_ns
         self._due_ns = t_ns + EVERY_NS
-        earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
+        earliest_ns = round((MOST_DELAY_S + NEAR_S[0]) * 1e9)
         first_ns = max(imu.oldest_ns + earliest_ns, t_ns - KEPT_NS)
         past = sensed_motion.span_since(imu, first_ns - earliest_ns)
         # What was not felt, gravity neither, shows in a fix that falls there, and in none that
@@ -290,23 +292,23 @@ class LatencySearch:
             first_ns = max(first_ns, int(past.times[lost[-1] + 1]) + earliest_ns)
         for source, receiver in tuple(self._receivers.items()):
             yield from self._weigh(receiver, past, first_ns, t_ns)
-            late = receiver.settled(t_ns)
-            if late is None:
+            delay = receiver.settled(t_ns)
+            if delay is None:
                 continue
             self.on_time.discard(source)
             text = (
-                f"{source} is {late.seconds:.2f} s later than its stamps (sigma {late.sd:.2f}); "
+                f"{source} is {delay.seconds:.2f} s later than its stamps (sigma {delay.sd:.2f}); "
                 "corrected"
             )
             self._event("fixes_late", text)
-            return Found(text, late.sd)
+            return Found(text, delay.sd)
         return None
 
     def _weigh(
         self, receiver: _Receiver, past: sensed_motion.Past, first_ns: int, t_ns: int
     ) -> Generator[None, None, None]:
         """Weigh the delay by the fixes of a span; the best that they have said counts."""
-        of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
+        of_each = (epoch for received in receiver.received for epoch in received.epochs())
         epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
         looked = [e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns]
         fixes, place = _fixes(looked)
@@ -320,8 +322,8 @@ class LatencySearch:
         # Of each delay (ns) and share of the fixes: some are asked for twice or three times.
         known: dict[tuple[int, int], tuple[float, int]] = {}
 
-        def cost(late_s: float, most: int = ALL_FIXES) -> Fitting:
-            asked = round(late_s * 1e9), math.ceil(len(fixes) / most)
+        def cost(delay_s: float, most: int = ALL_FIXES) -> Fitting:
+            asked = round(delay_s * 1e9), math.ceil(len(fixes) / most)
             if asked not in known:
                 m = said[most]
                 either = ways(past, m._replace(instants=m.instants - asked[0]), *by)
@@ -332,7 +334,7 @@ class LatencySearch:
                 known[asked] = min((fit.cost, fit.degrees) for fit in (forward, backward))
             return known[asked]
 
-        now_s, suspected = receiver.late_ns * 1e-9, receiver.suspected
+        now_s, suspected = receiver.delay_ns * 1e-9, receiver.suspected
         now, degrees = yield from cost(now_s)
         some = yield from cost(now_s, MOST_FIXES)
         later = yield from cost(now_s + GLANCE_S, MOST_FIXES)
@@ -346,22 +348,22 @@ class LatencySearch:
             for s in SEARCHED_S:
                 costs.append(((yield from cost(s, MOST_FIXES))[0], s))
             about_s = min(costs)[1]
-        late = yield from _bottom(cost, about_s)
-        if late is None or late.seconds > MOST_LATE_S:
+        delay = yield from _bottom(cost, about_s)
+        if delay is None or delay.seconds > MOST_DELAY_S:
             return
-        least, _ = yield from cost(late.seconds)
+        least, _ = yield from cost(delay.seconds)
         time = self._model.slots_of(fixes[-1].time)
         prior = max([LEAST_PRIOR_S, *(float(self._model.initial[slot]) for slot in time)])
         if (
             least > gate_threshold(FITS, degrees)
             or now - least <= EVIDENCE
-            or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
-            or unchanged(epochs, abs(late.seconds - now_s), self._doubted_ns(t_ns))
-            or velocities_alone(since_leap(looked), late.seconds - now_s)
+            or abs(delay.seconds - now_s) <= PRIOR_SIGMAS * prior
+            or unchanged(epochs, abs(delay.seconds - now_s), self._doubted_ns(t_ns))
+            or velocities_alone(since_leap(looked), delay.seconds - now_s)
         ):
             return
         self._due_ns = t_ns + EVERY_NS
-        receiver.suspect(Delay(max(0.0, late.seconds), late.sd), t_ns)
+        receiver.suspect(Delay(max(0.0, delay.seconds), delay.sd), t_ns)
 
 
 def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityCandidate], PositionCandidate | None]:
@@ -392,5 +394,5 @@ def _bottom(
     return Delay(about_s, sd)
 
 
-def _earlier(aid: Aid, late_ns: int) -> Aid:
-    return replace(aid, t_ns=aid.t_ns - late_ns)
+def _earlier(measurement: AidingMeasurement, delay_ns: int) -> AidingMeasurement:
+    return replace(measurement, t_ns=measurement.t_ns - delay_ns)

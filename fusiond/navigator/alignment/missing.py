@@ -34,7 +34,7 @@ class Journal:
 
     def __init__(self, on_event: Callable[[str, str], None]) -> None:
         self._event = on_event
-        self._reason = self._kind = self._told = ""
+        self._reason = self._kind = self._reported = ""
         self._since_ns = 0
 
     def keep(self, reason: str, t_ns: int) -> None:
@@ -43,8 +43,8 @@ class Journal:
             self._reason, kind = reason, _NUMBER.sub("#", reason)
             if kind != self._kind:
                 self._kind, self._since_ns = kind, t_ns
-        if self._kind != self._told and t_ns - self._since_ns >= SETTLED_NS:
-            self._told = self._kind
+        if self._kind != self._reported and t_ns - self._since_ns >= SETTLED_NS:
+            self._reported = self._kind
             self._event("not_aligned", reason)
 
 
@@ -90,10 +90,10 @@ def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
     span_ns = imu.latest_ns - int(imu.times[first]) if first < imu.end else 0
     if span_ns < LEAST_COUNTED_NS:
         return []
-    seen, told = (imu.end - 1 - first) / (span_ns * 1e-9), by.options.rate_hz
-    if max(seen / told, told / seen) < RATE_FACTOR:
+    seen, reported = (imu.end - 1 - first) / (span_ns * 1e-9), by.options.rate_hz
+    if max(seen / reported, reported / seen) < RATE_FACTOR:
         return []
-    return [reason("imu_rate", seen=seen, configured=told)]
+    return [reason("imu_rate", seen=seen, configured=reported)]
 
 
 def _rest(by: Basis, imu: ImuBuffer) -> list[str]:

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.navigation.motion_descent import BIASES, FIRST, LATE, PRIORS, SOUGHT, descend
+from fusiond.navigation.motion_descent import BIASES, DELAY, FIRST, PRIORS, SOUGHT, descend
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.sensed_motion import Measured, Past, Sensed, stretch
 
@@ -65,7 +65,7 @@ class Fit(NamedTuple):
     degrees: int
     dcm: Array
     biases: Array
-    late_s: float
+    delay_s: float
     covariance: Array
     converged: bool
 
@@ -78,28 +78,29 @@ def fit(
     g: float,
     yaw: float,
     sd_yaw: float,
-    sd_late_s: float = 0.0,
+    sd_delay_s: float = 0.0,
 ) -> Fit:
-    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, and velocities that are
-    late by 0, to within `sd_late_s`, begun at `f`."""
+    """Best fit from `f`, with `yaw` (rad) at the last fix to within `sd_yaw`.
+
+    Velocities are delayed by 0, to within `sd_delay_s`."""
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     # The offset in its sigmas: one that is known has a column of zeros.
     prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3 + [1.0])
-    asked = Asked(noise, g, yaw, prior, sd_late_s)
+    asked = Asked(noise, g, yaw, prior, sd_delay_s)
     here = Guess(dcm_from_rpy(0.0, 0.0, yaw), f.biases, 0.0, m.velocity[0])
     for part in _parts(m, rate):
-        begun = stretch(past, part.instants).sensed(here.biases)
-        here = _descend(begun, part, asked, here.since(part)).here
+        started = stretch(past, part.instants).sensed(here.biases)
+        here = _descend(started, part, asked, here.since(part)).here
     found = _descend(f, m, asked, here.since(m))
-    here, scale = found.here, np.array([1.0] * 9 + [sd_late_s])
+    here, scale = found.here, np.array([1.0] * 9 + [sd_delay_s])
     known = np.asarray(np.linalg.inv(found.rows.T @ found.rows), np.float64)[:10, :10]
     return Fit(
         cost=float(found.z @ found.z),
         degrees=max(1, m.velocity.size - 3),
         dcm=here.last,
         biases=here.biases,
-        late_s=sd_late_s * here.late,
+        delay_s=sd_delay_s * here.delay,
         covariance=known * np.outer(scale, scale),
         converged=found.converged,
     )
@@ -113,13 +114,13 @@ class Asked(NamedTuple):
     g: float
     yaw: float
     prior: Array
-    sd_late_s: float
+    sd_delay_s: float
 
     def packed(self) -> Array:
         """(15,) for `descend`."""
         n, rate = self.noise, STANDARD_GRAVITY_M_S2 * self.noise.rate_noise
         white = [n.force_noise**2, rate**2 / 3.0]
-        return np.concatenate([self.prior, [self.yaw, self.g, self.sd_late_s], white])
+        return np.concatenate([self.prior, [self.yaw, self.g, self.sd_delay_s], white])
 
 
 class Descent(NamedTuple):
@@ -133,8 +134,10 @@ class Descent(NamedTuple):
 
 
 def _parts(m: Measured, rate_sd: float) -> list[Measured]:
-    """The last of the fixes over spans that double, from one in which a rate bias turns the axes by
-    `FIRST_RAD` at most, as long as they are shorter than that of all."""
+    """Last fixes over spans that double.
+
+    The first span is one in which a rate bias turns the axes by `FIRST_RAD` at most; the last is
+    shorter than that of all."""
     found: list[Measured] = []
     span_s = FIRST_RAD / (3.0 * rate_sd) if rate_sd > 0.0 else math.inf
     since_s = (m.instants[-1] - m.instants) * 1e-9
@@ -165,7 +168,7 @@ class Guess(NamedTuple):
 
     last: Array
     biases: Array
-    late: float
+    delay: float
     first: Array
 
     def since(self, m: Measured) -> Guess:
@@ -174,10 +177,10 @@ class Guess(NamedTuple):
 
     def packed(self) -> Array:
         """(19,) for `descend`."""
-        return np.concatenate([self.last.ravel(), self.biases, [self.late], self.first])
+        return np.concatenate([self.last.ravel(), self.biases, [self.delay], self.first])
 
     @staticmethod
     def of(packed: Array) -> Guess:
         """Unpacked."""
-        late = float(packed[LATE])
-        return Guess(packed[:BIASES].reshape(3, 3), packed[BIASES:LATE], late, packed[FIRST:])
+        delay = float(packed[DELAY])
+        return Guess(packed[:BIASES].reshape(3, 3), packed[BIASES:DELAY], delay, packed[FIRST:])

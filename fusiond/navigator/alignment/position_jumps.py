@@ -62,8 +62,8 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
     size = np.hypot(*steps.off_m.T)
     chance = LEAP_SIGMAS * median(size[looked]) / math.sqrt(2.0 * math.log(2.0))
     speed = np.hypot(*steps.v_m_s.T)
-    leaps = np.flatnonzero(looked & (size > np.maximum(chance, SAME_S * speed)))
-    return epochs[leaps[-1] + 1 :] if leaps.size else epochs
+    jumps = np.flatnonzero(looked & (size > np.maximum(chance, SAME_S * speed)))
+    return epochs[jumps[-1] + 1 :] if jumps.size else epochs
 
 
 def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:

@@ -3,7 +3,7 @@ r"""Heading from positions alone: a vehicle that drives, and fixes without veloc
 A bank of headings (fusiond.navigator.alignment.heading_bank) starts where the vehicle is last known
 to have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving
 all the time, at its first fix, with a road's slope and a road's speed. All that is measured from
-then on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what
+then on is weighed at its own instant: the bank runs `DELAYED_NS` behind the samples, so that what
 comes late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
 heading:
 
@@ -23,22 +23,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
-from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.invariant import InvariantFilter
+from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import MOUNTING, mounting
 from fusiond.navigation.alignment import level
 from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy, skew
-from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.evidence import FIXES_NS, Standstill
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standstill
 from fusiond.navigator.alignment.heading_bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
-from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.rest import REST_VELOCITY_SD, rest_bias
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 from fusiond.navigator.motion_constraints import GATE
 from fusiond.navigator.reasons import reason
@@ -47,7 +47,7 @@ from fusiond.navigator.timeline import MOST_WAITING
 Array = NDArray[np.float64]
 
 # An RDSS fix comes 0.6 to 5 s after its instant (two hops up and down, the centre's queue).
-LATE_NS = 6_000_000_000
+DELAYED_NS = 6_000_000_000
 # The bank is run in pieces of this length: a tick has little to do, and each piece enough.
 PIECE_NS = 100_000_000
 # One sigma (rad) of the heading at which the filter takes over: its sine is then wrong by 1.5 %
@@ -94,23 +94,23 @@ class Track:
         self._size = model.size
         # Where the vehicle's own constraint is off, the bank has one of its own.
         self._own_slip = not model.slots_of(MOUNTING) and bool(self._model.slots_of(MOUNTING))
-        self._aids: list[Aid] = []
+        self._measurements: list[AidingMeasurement] = []
         self._bank: HeadingBank | None = None
         self._left: Standstill | None = None
-        self._begun_ns = 0
+        self._started_ns = 0
 
-    def hear(self, aids: Sequence[Aid]) -> None:
+    def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """Measurements and constraints have come."""
         if "positions" not in self._options.heading:
             return
-        for aid in aids:
-            if not aid.screened:
-                insort(self._aids, aid, key=lambda a: (a.t_ns, a.source))
-        del self._aids[:-MOST_WAITING]
+        for measurement in measurements:
+            if not measurement.screened:
+                insort(self._measurements, measurement, key=lambda a: (a.t_ns, a.source))
+        del self._measurements[:-MOST_WAITING]
 
     def give_up(self) -> None:
         """Forget all: something else tells the heading."""
-        self._aids.clear()
+        self._measurements.clear()
         self._bank = self._left = None
 
     @property
@@ -118,32 +118,34 @@ class Track:
         """True if a bank seeks the heading."""
         return self._bank is not None
 
-    def start(self, by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    def start(
+        self, known: AlignmentEvidence, noise: ImuNoise, imu: ImuBuffer, place: Place
+    ) -> Start | None:
         """A start, once the heading is known."""
-        until_ns = imu.latest_ns - LATE_NS
+        until_ns = imu.latest_ns - DELAYED_NS
         if self._bank is None:
-            self._bank = self._begin(by, imu, place, until_ns)
+            self._bank = self._begin(known, noise, imu, place, until_ns)
         bank = self._bank
         if bank is None:
-            self._forget(imu, by.known.standstill)
+            self._forget(imu, known.standstill)
             return None
         if until_ns < bank.t_ns + PIECE_NS:
             return None
-        due = [aid for aid in self._aids if aid.t_ns <= until_ns]
-        del self._aids[: len(due)]
+        due = [measurement for measurement in self._measurements if measurement.t_ns <= until_ns]
+        del self._measurements[: len(due)]
         if self._own_slip:
             due = self._with_slip(due, bank.t_ns, until_ns)
-        bank.run(imu, due, until_ns)
+        bank.advance(imu, due, until_ns)
         if bank.lost:
             self._bank = None
             if bank.backwards:
-                by.known.tell("imu_backwards", reason("imu_backwards_by_fixes"))
+                known.report("imu_backwards", reason("imu_backwards_by_fixes"))
                 return None
-            by.known.doubted(reason("searching_again"))
+            known.doubted(reason("searching_again"))
             return None
         found = bank.mixture()
         if bank.positions < FEWEST_FIXES or found.sd_yaw > KNOWN_SD_RAD:
-            by.known.doubted(
+            known.doubted(
                 reason(
                     "searching",
                     sd=math.degrees(found.sd_yaw),
@@ -154,45 +156,64 @@ class Track:
             )
             return None
         if found.sd_speed > KNOWN_SD_M_S:
-            by.known.doubted(reason("searching_speed", sd=found.sd_speed, limit=KNOWN_SD_M_S))
+            known.doubted(reason("searching_speed", sd=found.sd_speed, limit=KNOWN_SD_M_S))
             return None
         n = self._size
         return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, turns=True)
 
-    def _begin(self, by: Basis, imu: ImuBuffer, place: Place, until_ns: int) -> HeadingBank | None:
+    def _begin(
+        self,
+        known: AlignmentEvidence,
+        noise: ImuNoise,
+        imu: ImuBuffer,
+        place: Place,
+        until_ns: int,
+    ) -> HeadingBank | None:
         """A bank, where there is something to begin with: the end of a rest, or the first fix."""
-        known = by.known
         if place.fix is not None and place.fix.height_m is not None:
             place = place._replace(sd_height=ANYWHERE_M)  # the bank is told the fixes themselves
         left = self._left or known.left
-        if left is not None and left.end_ns < max(imu.oldest_ns, self._begun_ns):
+        if left is not None and left.end_ns < max(imu.oldest_ns, self._started_ns):
             left = None
         if left is not None and known.rested(left):
             self._left = left
             if left.end_ns > until_ns:
                 return None
-            there = [a for a in self._aids if a.locates and left.start_ns <= a.t_ns <= left.end_ns]
+            there = [
+                a
+                for a in self._measurements
+                if a.locates and left.start_ns <= a.t_ns <= left.end_ns
+            ]
             begin_ns, fixes = left.end_ns, len(there)
-            cells = self._from_rest(by, imu, place, left, there[-MOST_AT_REST:])
+            cells = self._from_rest(noise, imu, place, left, there[-MOST_AT_REST:])
             if not known.confirmed_rest(left):
                 cells += self._on_the_move(imu, place, begin_ns, QUIET_AT_SPEED)
         else:
-            first = next((a for a in self._aids if a.locates and a.t_ns >= imu.oldest_ns), None)
+            first = next(
+                (a for a in self._measurements if a.locates and a.t_ns >= imu.oldest_ns), None
+            )
             if known.levelled() is not None or first is None or first.t_ns > until_ns:
                 return None
             begin_ns, fixes = first.t_ns - 1, 0
             cells = self._on_the_move(imu, place, begin_ns, 1.0)
-        self._left, self._begun_ns = None, begin_ns + 1
-        self._aids = [aid for aid in self._aids if aid.t_ns > begin_ns]
+        self._left, self._started_ns = None, begin_ns + 1
+        self._measurements = [
+            measurement for measurement in self._measurements if measurement.t_ns > begin_ns
+        ]
         return HeadingBank(cells, begin_ns, fixes, self._options.max_reverse_m_s)
 
     def _from_rest(
-        self, by: Basis, imu: ImuBuffer, place: Place, left: Standstill, there: Sequence[Aid]
+        self,
+        noise: ImuNoise,
+        imu: ImuBuffer,
+        place: Place,
+        left: Standstill,
+        there: Sequence[AidingMeasurement],
     ) -> list[Cell]:
         """Cells of a vehicle that has stood until `left` ended; fixes `there` tell the place."""
         place = place._replace(fix=None, sd=ANYWHERE_M)
         roll, pitch = level(left.mean_force)
-        there = [replace(aid, t_ns=left.end_ns) for aid in there]
+        there = [replace(measurement, t_ns=left.end_ns) for measurement in there]
         cells = []
         for yaw in YAWS_RAD:
             dcm = dcm_from_rpy(roll, pitch, yaw)
@@ -205,12 +226,12 @@ class Track:
                 np.zeros(3),
                 REST_VELOCITY_SD,
                 HOW,
-                bias=rest_bias(by.noise, left, dcm, float(place.where[0])),
+                bias=rest_bias(noise, left, dcm, float(place.where[0])),
                 levelled=Levelled(dcm),
             )
             cell = self._cell(imu, start, 1.0)
-            for aid in there:
-                cell.filter.update(aid)
+            for measurement in there:
+                cell.filter.update(measurement)
             cells.append(cell)
         return cells
 
@@ -248,7 +269,12 @@ class Track:
     def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:
         """Position (rad, rad, m) of a moving vehicle at an instant, and one sigma (m): where it was
         at the fix before, as far as it may have driven since, or about `where` it is now."""
-        fixes = [o for a in self._aids for o in a.candidates() if isinstance(o, PositionCandidate)]
+        fixes = [
+            o
+            for a in self._measurements
+            for o in a.candidates()
+            if isinstance(o, PositionCandidate)
+        ]
         before = [o for o in fixes if o.t_ns <= t_ns]
         if not before:
             return where, ANYWHERE_M
@@ -256,12 +282,14 @@ class Track:
         way = math.hypot(ROAD_SPEED_M_S, ROAD_SPEED_SD_M_S) * (t_ns - o.t_ns) * 1e-9
         return np.array([o.lat_rad, o.lon_rad, where[2]]), math.hypot(max(o.sd[:2]), way)
 
-    def _with_slip(self, due: list[Aid], begin_ns: int, until_ns: int) -> list[Aid]:
+    def _with_slip(
+        self, due: list[AidingMeasurement], begin_ns: int, until_ns: int
+    ) -> list[AidingMeasurement]:
         """Measurements that are due, and that the vehicle does not slide, twice a second."""
         lever = self._options.no_slip_m or (0.0, 0.0, 0.0)
         first = (begin_ns // SLIP_NS + 1) * SLIP_NS
-        own: list[Aid] = [
-            NonHolonomicAid(
+        own: list[AidingMeasurement] = [
+            NonHolonomicConstraint(
                 "no_slip", t_ns, GATE, SLIP_SD_M_S, HEAVE_SD_M_S, LEAST_SPEED_M_S, lever
             )
             for t_ns in range(first, until_ns + 1, SLIP_NS)
@@ -270,21 +298,8 @@ class Track:
 
     def _forget(self, imu: ImuBuffer, standstill: Standstill | None) -> None:
         """Drop measurements that no bank can use."""
-        since = imu.latest_ns - 2 * LATE_NS
+        since = imu.latest_ns - 2 * DELAYED_NS
         begin = since if standstill is None else min(since, standstill.start_ns)
-        old = [a for a in self._aids if a.t_ns < since]
+        old = [a for a in self._measurements if a.t_ns < since]
         kept = [a for a in old if a.locates and a.t_ns >= begin][-MOST_AT_REST:]
-        self._aids = kept + self._aids[len(old) :]
-
-
-def from_positions(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Heading of positions alone; a velocity, where there is one, tells it sooner and better."""
-    fixes = by.known.fixes
-    if (
-        fixes
-        and "gnss_course" in by.options.heading
-        and imu.latest_ns - fixes[-1].velocity.t_ns < FIXES_NS
-    ):
-        by.track.give_up()
-        return None
-    return by.track.start(by, imu, place)
+        self._measurements = kept + self._measurements[len(old) :]

@@ -17,7 +17,7 @@ from fusiond.aiding.candidates import (
     PositionCandidate,
     VelocityCandidate,
 )
-from fusiond.aiding.position import wander_of
+from fusiond.aiding.position import markov_sd_of
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import (
@@ -80,20 +80,22 @@ def velocity_of(candidate: VelocityCandidate) -> tuple[Array, Array]:
 
 
 class Levelled(NamedTuple):
-    """Attitude C_nb (3, 3) when gravity told roll and pitch, and one sigma (rad) of what has come
-    to them since and beside the force errors of then."""
+    """Attitude C_nb (3, 3) at the instant of levelling, and its sigma (rad).
+
+    The sigma is of what roll and pitch have gained since, beside the force errors of then."""
 
     dcm: Array
     sd: float = LEVEL_SD_RAD
 
 
 class Fitted(NamedTuple):
-    """Force and rate biases (6,) of a level found in motion, offset in time (s) of the velocities
-    that it was found from, and the covariance (10, 10) that they share with the attitude, which
-    comes first."""
+    """Force and rate biases (6,) of a level found in motion.
+
+    With the offset in time (s) of the velocities that it was found from, and the covariance
+    (10, 10) that they share with the attitude, which comes first."""
 
     biases: Array
-    late_s: float
+    delay_s: float
     covariance: Array
 
 
@@ -230,8 +232,8 @@ def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocit
     by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
     for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
         by[DR + row, slot] = fix.bias_share[row]
-    for row, slot in enumerate(model.slots_of(fix.wander)):
-        by[DR + row, slot] = wander_of(row, fix.wander_m, fix.sd)
+    for row, slot in enumerate(model.slots_of(fix.markov)):
+        by[DR + row, slot] = markov_sd_of(row, fix.markov_m, fix.sd)
     for slot in model.slots_of(fix.time):
         by[DR : DR + 3, slot] = velocity
     for axis, slot in enumerate(model.slots_of(fix.rest)):
@@ -240,7 +242,7 @@ def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocit
 
 
 def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
-    """Rows of the velocity in `by` (n, n), likewise (fusiond.aiding.velocity)
+    """Rows of the velocity in `by` (n, n) (fusiond.aiding.velocity).
 
     dv = e + a dtau + C [w x] dl - (C (w x l)) x phi
     """
@@ -273,7 +275,7 @@ def _take_fitted(
     for slot in time:
         slots.append(slot)
         rows.append(9)
-        xi[slot], p[slot, slot] = fitted.late_s, 0.0
+        xi[slot], p[slot, slot] = fitted.delay_s, 0.0
     p[np.ix_(slots, slots)] += fitted.covariance[np.ix_(rows, rows)]
     for axis in range(3):
         for slot in model.parameters(FORCE_ERROR + axis)[:1]:

@@ -56,7 +56,7 @@ class StartCheck:
         self, t_ns: int, nav: Array, covariance: Array, measured: RestEvidence, doubted: bool
     ) -> tuple[str, str] | None:
         """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
-        the start was wrong. `doubted`: it has not fitted the aids since."""
+        the start was wrong. `doubted`: it has not fitted the measurements since."""
         axes = dcm_elements(nav[Q0:])
         v_n, v_e, v_d = nav[VN : VN + 3].tolist()
         backward = -(axes[0] * v_n + axes[3] * v_e + axes[6] * v_d)
@@ -95,13 +95,13 @@ class StartCheck:
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
             self._since_ns = None
             return None
-        apart = abs(wrap_angle(math.atan2(east, north) - yaw))
+        residual = abs(wrap_angle(math.atan2(east, north) - yaw))
         sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
         if doubted:
             return "heading_contradicted", (
                 f"The first motion disagrees with the {self._claim}: aligning again by the course"
             )
-        if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
+        if min(residual, math.pi - residual) <= HEADING_SIGMAS * sd:
             self._claim, self._unproven = "", False
             self._say()
             return None
@@ -110,5 +110,5 @@ class StartCheck:
         if t_ns - self._since_ns < CONTRADICTED_NS:
             return None
         return "heading_contradicted", (
-            f"The {self._claim} is {math.degrees(apart):.0f} deg from the course: aligning again"
+            f"The {self._claim} is {math.degrees(residual):.0f} deg from the course: aligning again"
         )

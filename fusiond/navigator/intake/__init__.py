@@ -1,6 +1,6 @@
-"""The door of the navigator: a driver's measurement becomes aids, or is refused by name.
+"""Input of the navigator: aiding measurements of a device's, or the name of its refusal.
 
-Here the configuration meets the measurement: lever arm, sigma where the device states none, floors
+The configuration is applied here: lever arm, sigma where the device states none, floors
 and gates. Behind it everything is in SI units with a settled instant, and can be true (`plausible`,
 `pace`). Each kind of measurement has a module of its own, which `KINDS` lists; nothing else knows
 them.
@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from drivers.measurements import DelayedFix, Measurement, PositionFix, UtcStamp
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import AnyAiding
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility
 from fusiond.models.blocks import Block
@@ -48,7 +48,7 @@ KINDS: tuple[Kind, ...] = (
 class Intake:
     """Holds `aiding` by source name; a source without a section takes its kind's defaults.
 
-    `limits` are those of the vehicle's class; `tell(code, text)` hears of a source that is too
+    `limits` are those of the vehicle's class; `report(code, text)` hears of a source that is too
     fast.
     """
 
@@ -56,24 +56,24 @@ class Intake:
         self,
         aiding: Mapping[str, AnyAiding],
         limits: Plausibility = PLAUSIBILITY["aircraft"],
-        tell: Callable[[str, str], None] = lambda code, text: None,
+        report: Callable[[str, str], None] = lambda code, text: None,
     ) -> None:
         self._sections = Sections(aiding)
         self._limits = limits
-        self._pace = Pace(tell)
+        self._pace = Pace(report)
         self.receivers = self._sections.receivers
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section."""
         self._sections.set_gates(gates)
 
-    def aids(
+    def measurements_of(
         self, m: Measurement | RawGnssEpoch, t_ns: int, sd_time_s: float, seen_ns: int = 0
-    ) -> Sequence[Aid] | str:
-        """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
+    ) -> Sequence[AidingMeasurement] | str:
+        """Aiding measurements of `m`, valid at `t_ns`, or the name of its refusal."""
         when = Instants(t_ns, sd_time_s, seen_ns)
         for kind in KINDS:
-            if isinstance(m, kind.measurement):
+            if isinstance(m, kind.reported):
                 refused = refusal(m, self._limits) or self._pace.refusal(m, t_ns)
                 if refused is not None:
                     return refused
@@ -82,13 +82,13 @@ class Intake:
                     sections.place = m.lat_rad, m.lon_rad
                     if isinstance(m.stamp, UtcStamp):
                         sections.utc_ns = m.stamp.utc_ns
-                found = kind.aids(m, sections, when)
+                found = kind.measurements_of(m, sections, when)
                 if isinstance(found, str) or not sections.any_robust:
                     return found
                 if not sections.robust(m.source):
                     return found
-                return [replace(aid, robust=True) for aid in found]
-        return "not_an_aid"
+                return [replace(measurement, robust=True) for measurement in found]
+        return "not_a_measurement"
 
     @property
     def fixes_shown(self) -> dict[str, tuple[float, ...]]:
@@ -96,12 +96,13 @@ class Intake:
         return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
 
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Let receivers that have not been heard begin with that."""
+        """Start receivers without a fix so far from these sums."""
         self._sections.fixes_shown = fixes_shown
 
     def extra_blocks(self) -> list[Block]:
-        """Blocks that the aids need in the model beside its own blocks: errors that successive
-        measurements share. Of a block that two sources need, the first says the noise."""
+        """Blocks that the measurements need in the model beside its own blocks: errors that
+        successive measurements share. Of a block that two sources need, the first says the
+        noise."""
         blocks: dict[str, Block] = {}
         for source, section in self._sections.aiding.items():
             for kind in KINDS:

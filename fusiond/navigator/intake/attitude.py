@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 
 from drivers.measurements import Attitude
-from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
-from fusiond.aiding.base import Aid
+from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import Aiding, AttitudeAiding, StarTrackerAiding
 from fusiond.configuration.settings import ARCSEC
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
 
 
-def aids(m: Attitude, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(
+    m: Attitude, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
     """The attitude; `no_sigma` where an angle has none."""
     own = sections.aiding.get(m.source)
     tracker = isinstance(own, StarTrackerAiding) or (own is None and m.source == "star_tracker")
@@ -31,7 +33,7 @@ def aids(m: Attitude, sections: Sections, when: Instants) -> list[Aid] | str:
     if not all(s > 0.0 or math.isnan(a) for s, a in zip(sd, m.rpy_rad, strict=True)):
         return "no_sigma"
     gate = o.gate_probability
-    return [AttitudeAid(m.source, when.t_ns, gate, m.rpy_rad, sd, when.sd_time_s, block)]
+    return [AttitudeMeasurement(m.source, when.t_ns, gate, m.rpy_rad, sd, when.sd_time_s, block)]
 
 
-KIND = Kind(Attitude, aids, {StarTrackerAiding: misalignment_blocks(STAR_BLOCK)})
+KIND = Kind(Attitude, measurements_of, {StarTrackerAiding: misalignment_blocks(STAR_BLOCK)})

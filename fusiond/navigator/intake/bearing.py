@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from drivers.measurements import Bearing
-from fusiond.aiding.base import Aid
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.aiding import SarAiding
 from fusiond.configuration.settings import ARCSEC, DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
 
 
-def aids(m: Bearing, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(
+    m: Bearing, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
     """The bearing; `unknown_target` where neither it nor the configuration says the place."""
     o = sections.of(m.source, SarAiding)
     point = m.point
@@ -25,7 +27,7 @@ def aids(m: Bearing, sections: Sections, when: Instants) -> list[Aid] | str:
     if not (azimuth > 0.0 and elevation > 0.0):
         return "no_sigma"
     return [
-        BearingAid(
+        BearingMeasurement(
             m.source,
             when.t_ns,
             o.gate_probability,
@@ -41,4 +43,4 @@ def aids(m: Bearing, sections: Sections, when: Instants) -> list[Aid] | str:
     ]
 
 
-KIND = Kind(Bearing, aids, {SarAiding: misalignment_blocks(SAR_BLOCK)})
+KIND = Kind(Bearing, measurements_of, {SarAiding: misalignment_blocks(SAR_BLOCK)})

@@ -14,8 +14,14 @@ from datetime import UTC, datetime
 from functools import lru_cache
 
 from drivers.measurements import MagneticHeading
-from fusiond.aiding.base import Aid
-from fusiond.aiding.compass import DEVIATION, DISTURBANCE, CompassAid, deviation, disturbance
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.compass import (
+    DEVIATION,
+    DISTURBANCE,
+    CompassMeasurement,
+    deviation,
+    disturbance,
+)
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.settings import DEG
 from fusiond.models.blocks import Block
@@ -28,7 +34,9 @@ warns of compasses."""
 _MODEL = "wmm/WMM_2025.COF"
 
 
-def aids(m: MagneticHeading, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(
+    m: MagneticHeading, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
     """The heading with the declination. Refused are `place_unknown` and `date_unknown` before a
     fix has said them, `near_magnetic_pole`, `beyond_magnetic_model` (its five years), and
     `no_magnetic_model` without the package; with a declination of the configuration none is."""
@@ -40,7 +48,9 @@ def aids(m: MagneticHeading, sections: Sections, when: Instants) -> list[Aid] | 
     names = _names(m.source, o, sections)
     lasting = math.hypot(o.deviation_sd_deg, o.disturbance_sd_deg) * DEG
     yaw = math.remainder(m.yaw_rad + found, math.tau)
-    return [CompassAid(m.source, when.t_ns, o.gate_probability, yaw, sd_rad, *names, lasting)]
+    return [
+        CompassMeasurement(m.source, when.t_ns, o.gate_probability, yaw, sd_rad, *names, lasting)
+    ]
 
 
 def _declination(o: CompassAiding, sections: Sections) -> float | str:
@@ -89,4 +99,4 @@ def _names(source: str, section: CompassAiding, sections: Sections) -> tuple[str
     return own(DEVIATION, source, section), own(DISTURBANCE, source, section)
 
 
-KIND = Kind(MagneticHeading, aids, {CompassAiding: blocks})
+KIND = Kind(MagneticHeading, measurements_of, {CompassAiding: blocks})

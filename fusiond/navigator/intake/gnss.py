@@ -7,21 +7,21 @@ from typing import NamedTuple
 
 from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.fix_errors import LASTS_S, Fix, FixErrors, Shares
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import SUFFIX, VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import SUFFIX, VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     CLOCK_SKEW,
+    FIX_MARKOV,
     FIX_TIME,
-    FIX_WANDER,
     VELOCITY_TIME,
     antenna_lever,
     clock_skew,
-    fix_wander,
+    fix_markov_block,
     time_offset,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
@@ -61,8 +61,9 @@ Motion = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class _Receiver(NamedTuple):
-    """Options of a receiver: its own, whether its raw data are the aid, what its velocities are
-    called, and the blocks of what its fixes share (`blocks`), empty where it is not estimated."""
+    """Options of a receiver: its own, whether its raw data are the measurement, what its velocities
+    are called, and the blocks of what its fixes share (`blocks`), empty where it is not
+    estimated."""
 
     section: GnssAiding
     raw: bool
@@ -71,10 +72,10 @@ class _Receiver(NamedTuple):
     velocity_time: str
     lever: str
     bias: tuple[str, ...]
-    wander: str
+    markov: str
     holds: bool
     """True if the model has states for what its fixes share: its section is configured."""
-    told: bool
+    shares_stated: bool
     """True if the section says what fixes share, beside what they state."""
     shared_m: tuple[float, float]
     """One sigma of the states of that, horizontal and down."""
@@ -85,17 +86,19 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
     raw = isinstance(sections.aiding.get(source), RawAiding)
     names = (sections.own(block, source, o) for block in (FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER))
     time, velocity_time, lever = names
-    bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
+    bias, markov = _fix_bias(source, o, sections), _markov_block(source, o, sections)
     holds = bool(bias) and any(section is o for section in sections.aiding.values())
     shared = o.bias_sd_m is not None, (o.shared_sd_m, o.bias_down_sd_m)
-    own = o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds
+    own = o, raw, source + SUFFIX, time, velocity_time, lever, bias, markov, holds
     return _Receiver(*own, *shared)
 
 
-def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(
+    m: PositionFix, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
     """Position, and velocity where it is measured and used.
 
-    `raw_is_used`: the receiver's raw data are the aid, not its fixes.
+    `raw_is_used`: the receiver's raw data are the measurement, not its fixes.
     """
     source = m.source
     receiver: _Receiver | None = sections.made.get((source, _receiver))
@@ -124,12 +127,12 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
     by_phase = _by_phase(m, sections)
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
-    wander, wander_m = "" if by_phase else receiver.wander, 0.0
+    markov, markov_m = "" if by_phase else receiver.markov, 0.0
     level_m = math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2))
-    shares = _shares(m, when, motion, by_phase, o, sections, level_m) if receiver.wander else None
+    shares = _shares(m, when, motion, by_phase, o, sections, level_m) if receiver.markov else None
     if shares is not None:
-        wander_m = math.sqrt(shares.wanders) * level_m
-        if receiver.holds and not receiver.told:
+        markov_m = math.sqrt(shares.wanders) * level_m
+        if receiver.holds and not receiver.shares_stated:
             share = _lasting(sd, shares, receiver.shared_m)
     height = m.height_m
     if receiver.holds:
@@ -137,7 +140,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
             share = _with_geoid(share, m.geoid_sd_m, o)
     elif m.geoid_sd_m > sd[2]:
         height = None  # nothing holds what fixes share: sigma would shrink with their number
-    position = PositionAid(
+    position = PositionMeasurement(
         source,
         when.t_ns,
         o.gate_probability,
@@ -151,13 +154,13 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         receiver.time,
         receiver.lever,
         share,
-        wander,
-        wander_m if wander else 0.0,
+        markov,
+        markov_m if markov else 0.0,
     )
     if motion is None or not o.use_velocity:
         return [position]
     v, sd_v = motion
-    velocity = VelocityAid(
+    velocity = VelocityMeasurement(
         receiver.velocities,
         when.t_ns - round(o.velocity_delay_s * 1e9),
         o.gate_probability,
@@ -230,9 +233,9 @@ def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str
     return level, f"{level}_down"
 
 
-def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
+def _markov_block(source: str, section: GnssAiding, sections: Sections) -> str:
     """The block of the error that fixes share for seconds; "" where none is estimated."""
-    return sections.own(FIX_WANDER, source, section) if section.shared_sd_m else ""
+    return sections.own(FIX_MARKOV, source, section) if section.shared_sd_m else ""
 
 
 def _shares(
@@ -291,13 +294,17 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
         lasts_s = section.bias_correlation_s
         found.append(position_bias(level, section.shared_sd_m, lasts_s))
         found.append(position_bias(down, section.bias_down_sd_m, lasts_s, "d"))
-        found.append(fix_wander(_wander(source, section, sections), LASTS_S))
+        found.append(fix_markov_block(_markov_block(source, section, sections), LASTS_S))
     return found
 
 
-def told_by_operator(t_ns: int, where: tuple[float, float, float], sd_m: float) -> PositionAid:
+def operator_position(
+    t_ns: int, where: tuple[float, float, float], sd_m: float
+) -> PositionMeasurement:
     """Position (rad, rad, m) by an operator, one sigma (m) of each axis."""
-    return PositionAid("operator", t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0))
+    return PositionMeasurement(
+        "operator", t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0)
+    )
 
 
-KIND = Kind(PositionFix, aids, {GnssAiding: blocks})
+KIND = Kind(PositionFix, measurements_of, {GnssAiding: blocks})

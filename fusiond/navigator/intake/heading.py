@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 
 from drivers.measurements import Heading
-from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Aid
+from fusiond.aiding.attitude import HeadingMeasurement
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import HeadingAiding
 from fusiond.configuration.settings import DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
-def aids(m: Heading, sections: Sections, when: Instants) -> list[Aid]:
+def measurements_of(m: Heading, sections: Sections, when: Instants) -> list[AidingMeasurement]:
     """The heading, with the section's sigma where the device states none, and what rounding
     adds."""
     o = sections.of(m.source, HeadingAiding)
     sd_rad = math.hypot((m.sd_rad or o.sd_deg * DEG) * o.sigma_scale, m.rounding_sd_rad)
     # One receiver may send position and heading of the same instant: two names.
     name = m.source if m.source == o.kind else f"{m.source}_heading"
-    return [HeadingAid(name, when.t_ns, o.gate_probability, m.yaw_rad, sd_rad)]
+    return [HeadingMeasurement(name, when.t_ns, o.gate_probability, m.yaw_rad, sd_rad)]
 
 
-KIND = Kind(Heading, aids, {})
+KIND = Kind(Heading, measurements_of, {})

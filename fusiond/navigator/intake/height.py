@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from drivers.measurements import Height
-from fusiond.aiding.base import Aid
-from fusiond.aiding.height import BarometerAid, HeightAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.height import BarometerMeasurement, HeightMeasurement
 from fusiond.configuration.aiding import BarometerAiding, HeightAiding
 from fusiond.models.blocks import Block
 from fusiond.models.vehicle import (
@@ -20,7 +20,7 @@ from fusiond.models.vehicle import (
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
-def aids(m: Height, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(m: Height, sections: Sections, when: Instants) -> list[AidingMeasurement] | str:
     """The height, with the section's sigma where the device states none, and what rounding adds.
 
     `weather_unknown`: a barometer's height is off by the weather, 100 m and more, for hours alike;
@@ -28,13 +28,13 @@ def aids(m: Height, sections: Sections, when: Instants) -> list[Aid] | str:
     """
     if not m.barometric:
         o = sections.of(m.source, HeightAiding)
-        return [HeightAid(m.source, when.t_ns, o.gate_probability, m.height_m, _sd_m(m, o))]
+        return [HeightMeasurement(m.source, when.t_ns, o.gate_probability, m.height_m, _sd_m(m, o))]
     b = sections.of(m.source, BarometerAiding)
     if not any(b is section for section in sections.aiding.values()):
         return "weather_unknown"
     names = _names(m.source, b, sections)
     sd_m = _sd_m(m, b)
-    return [BarometerAid(m.source, when.t_ns, b.gate_probability, m.height_m, sd_m, *names)]
+    return [BarometerMeasurement(m.source, when.t_ns, b.gate_probability, m.height_m, sd_m, *names)]
 
 
 def _sd_m(m: Height, o: HeightAiding | BarometerAiding) -> float:
@@ -60,4 +60,4 @@ def _names(source: str, section: BarometerAiding, sections: Sections) -> tuple[s
     )
 
 
-KIND = Kind(Height, aids, {BarometerAiding: blocks})
+KIND = Kind(Height, measurements_of, {BarometerAiding: blocks})

@@ -1,4 +1,4 @@
-"""Interface of a kind of measurement: its sections, its aids, its blocks."""
+"""Interface of a kind of device measurement: its sections, aiding measurements and blocks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.fix_errors import FixErrors
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
@@ -42,7 +42,7 @@ def shown_as(source: str, by_phase: bool) -> str:
 
 class Sections:
     """The configuration's `[aiding.NAME]` by source name; `receivers` are those whose raw data are
-    the aid, not their fixes."""
+    the measurement, not their fixes."""
 
     def __init__(self, aiding: Mapping[str, AnyAiding]) -> None:
         self.aiding = aiding
@@ -114,13 +114,13 @@ class Sections:
 
 @immutable()
 class Kind:
-    """A kind of measurement.
+    """A kind of device measurement.
 
-    `measurement`: its class. `aids(measurement, sections, instants)`: the aids that it stands for,
-    or the name of its refusal. `blocks`: by class of section, what `blocks(source, section,
-    sections)` adds to the model: errors that successive measurements share.
+    `reported`: its class. `measurements_of(reported, sections, instants)`: the aiding measurements
+    that it stands for, or the name of its refusal. `blocks`: by class of section, the blocks that
+    `blocks(source, section, sections)` adds to the model: errors that successive ones share.
     """
 
-    measurement: type
-    aids: Callable[[Any, Sections, Instants], Sequence[Aid] | str]
+    reported: type
+    measurements_of: Callable[[Any, Sections, Instants], Sequence[AidingMeasurement] | str]
     blocks: Mapping[type[Aiding], Callable[[str, Any, Sections], list[Block]]]

@@ -52,10 +52,10 @@ CALM_NS = 1_000_000_000
 
 
 class Pace:
-    """The buckets. `tell(code, text)` hears of a source that is too fast, once an episode."""
+    """The buckets. `report(code, text)` hears of a source that is too fast, once an episode."""
 
-    def __init__(self, tell: Callable[[str, str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str, str], None]) -> None:
+        self._report = report
         self._buckets: dict[tuple[str, type], tuple[float, int]] = {}
         self._fast_ns: dict[tuple[str, type], int] = {}
 
@@ -76,7 +76,7 @@ class Pace:
         if tokens < 0.0:
             self._fast_ns[key] = t_ns
             if fast_ns is None:
-                self._tell(
+                self._report(
                     "source_too_fast",
                     f"{m.source} sends more than {rate_hz:g} {what} a second: it is left out until "
                     "it does not",

@@ -1,4 +1,4 @@
-"""Plausibility of measurements: every kind is looked at here, once, before it is an aid.
+"""Plausibility of device measurements: each is checked here once, before anything uses it.
 
 Outcomes: `not_finite`; `position_implausible` (no place on the Earth, too near a pole for north and
 east to mean anything, or exactly 0 N 0 E), `height_implausible` and `speed_implausible` (outside

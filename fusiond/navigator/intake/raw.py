@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.settings import clock_noise
 from fusiond.models.blocks import Block, clock_blocks, position_bias, shared_error
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
-def aids(m: RawGnssEpoch, sections: Sections, when: Instants) -> list[Aid] | str:
-    """The epoch; `raw_not_used` where the receiver's fixes are the aid, not its raw data."""
+def measurements_of(
+    m: RawGnssEpoch, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
+    """The epoch; `raw_not_used` where the receiver's fixes are the measurement, not its raw
+    data."""
     receiver = sections.receivers.get(m.source)
     if receiver is None:
         return "raw_not_used"
-    return [receiver.aid(m, when.t_ns)]
+    return [receiver.measurement(m, when.t_ns)]
 
 
 EPOCH_S = 0.01
@@ -50,4 +53,4 @@ def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     return found
 
 
-KIND = Kind(RawGnssEpoch, aids, {RawAiding: blocks})
+KIND = Kind(RawGnssEpoch, measurements_of, {RawAiding: blocks})

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.measurements import DelayedFix
-from fusiond.aiding.base import Aid, NotApplicable
-from fusiond.aiding.height import HeightAid
+from fusiond.aiding.base import AidingMeasurement, NotApplicable
+from fusiond.aiding.height import HeightMeasurement
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
-from fusiond.aiding.rdss_position import BIAS_BLOCK, FeedBackAid, RdssPositionAid
+from fusiond.aiding.rdss_position import BIAS_BLOCK, HeldFeedback, RdssPositionMeasurement
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.models.blocks import Block, position_bias
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
@@ -19,7 +19,9 @@ from fusiond.navigator.intake.kind import Instants, Kind, Sections
 COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 5.0
 
 
-def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
+def measurements_of(
+    m: DelayedFix, sections: Sections, when: Instants
+) -> list[AidingMeasurement] | str:
     """The fix; the instant of its feedback where that waits; its height where it says anything new.
 
     Refused: `multi_value`, `no_sigma`, and by name a place without geometry.
@@ -46,8 +48,8 @@ def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
     t_ns = arrival_ns if at_arrival else when.t_ns
     compensated = o.strategy == "position_compensation"
     gate = o.gate_probability
-    found: list[Aid] = [
-        RdssPositionAid(
+    found: list[AidingMeasurement] = [
+        RdssPositionMeasurement(
             m.source,
             t_ns,
             gate,
@@ -61,10 +63,12 @@ def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
         )
     ]
     if holds:
-        found.append(FeedBackAid(f"{m.source}_feedback", arrival_ns, gate))
+        found.append(HeldFeedback(f"{m.source}_feedback", arrival_ns, gate))
     if o.fix_height_sd_m is not None and not m.height_given:
         sd_m = o.fix_height_sd_m * o.sigma_scale
-        found.append(HeightAid(f"{m.source}_height", t_ns, gate, m.height_m, sd_m, (BIAS_BLOCK,)))
+        found.append(
+            HeightMeasurement(f"{m.source}_height", t_ns, gate, m.height_m, sd_m, (BIAS_BLOCK,))
+        )
     return found
 
 
@@ -78,4 +82,4 @@ def blocks(source: str, section: RdssAiding, sections: Sections) -> list[Block]:
     return []
 
 
-KIND = Kind(DelayedFix, aids, {RdssAiding: blocks})
+KIND = Kind(DelayedFix, measurements_of, {RdssAiding: blocks})

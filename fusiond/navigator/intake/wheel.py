@@ -6,8 +6,8 @@ import math
 
 from drivers.measurements import WheelSpeed
 from drivers.rounding import SHARED_SD
-from fusiond.aiding.base import Aid
-from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.models.blocks import Block
 from fusiond.models.vehicle import (
@@ -22,17 +22,17 @@ from fusiond.models.vehicle import (
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
-# What a wheel errs by, in the order of `WheelSpeedAid`.
+# What a wheel errs by, in the order of `WheelSpeedMeasurement`.
 _ERRORS = WHEEL_DRIFT, WHEEL_SCALE, WHEEL_LATENCY, WHEEL_ROUNDING
 
 
-def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
+def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[AidingMeasurement]:
     """The speed, with the section's sigma where the device states none, and what rounding adds."""
     o = sections.of(m.source, WheelAiding)
     sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
     drift, scale, latency, rounding = sections.each_own(_ERRORS, m.source, o)
     return [
-        WheelSpeedAid(
+        WheelSpeedMeasurement(
             m.source,
             when.t_ns - round(o.latency_s * 1e9),
             o.gate_probability,
@@ -65,4 +65,4 @@ def blocks(source: str, section: WheelAiding, sections: Sections) -> list[Block]
     return found
 
 
-KIND = Kind(WheelSpeed, aids, {WheelAiding: blocks})
+KIND = Kind(WheelSpeed, measurements_of, {WheelAiding: blocks})

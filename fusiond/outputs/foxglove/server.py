@@ -69,12 +69,12 @@ class FoxgloveServer:
         self._queued = asyncio.Event()
         self._latest: dict[Topic, Message] = {}
         self._encoded: dict[int, Data | None] = {}
-        self._origin_told_s: float | None = None
+        self._origin_logged_s: float | None = None
         self.port = Port(self.name, section.host, section.port, around.on_event)
         self.server = TcpServer(self.name, self.port, around.guests, self._greet, MOST_VIEWERS)
         self.counters = self.server.counters
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         self._latest[topic] = message
         if not self.server.clients:
             self._encoded.clear()
@@ -121,10 +121,10 @@ class FoxgloveServer:
         """A page of that site wanted to connect."""
         self.counters["origins_refused"] += 1
         now_s = time.monotonic()
-        if self._origin_told_s is None or now_s - self._origin_told_s > ORIGIN_EVENT_S:
-            self._origin_told_s = now_s
-            told = ascii(origin[:80])
-            self.port.report("origin_refused", f"a page of {told}: outputs.foxglove.origins")
+        if self._origin_logged_s is None or now_s - self._origin_logged_s > ORIGIN_EVENT_S:
+            self._origin_logged_s = now_s
+            shown = ascii(origin[:80])
+            self.port.report("origin_refused", f"a page of {shown}: outputs.foxglove.origins")
 
     def _greet(self, client: Client) -> Viewer:
         client.request_due = True

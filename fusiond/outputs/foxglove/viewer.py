@@ -101,7 +101,7 @@ class Viewer:
             self._socket.send_binary(_DATA.pack(_OPCODE_DATA, number, t_ns) + payload)
             self._pass_on()
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if self._socket.state is OPEN:  # not after a frame that has ended it, in the same piece
             self._socket.send_text(text.encode())
 
@@ -131,7 +131,7 @@ class Viewer:
                 if isinstance(event, Request):
                     self._shake_hands(event)
                 elif isinstance(event, Frame):
-                    self._heard(event)
+                    self._on_event(event)
             self._pass_on()
             if self._client.closed:
                 return
@@ -154,7 +154,7 @@ class Viewer:
             self._pass_on()
             self._client.send(self._server.greeting)
 
-    def _heard(self, frame: Frame) -> None:
+    def _on_event(self, frame: Frame) -> None:
         if frame.opcode not in (OP_TEXT, OP_BINARY, OP_CONT):
             return
         self._message += frame.data
@@ -167,7 +167,7 @@ class Viewer:
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             self._server.counters["malformed"] += 1
             why = str(error) if isinstance(error, NotUnderstoodError) else "no such request"
-            self._tell(f'{{"op":"status","level":1,"message":"not understood: {why}"}}')
+            self._report(f'{{"op":"status","level":1,"message":"not understood: {why}"}}')
 
     def _carry_out(self, asked: Any) -> None:
         """Raises `ValueError`, `TypeError` or `KeyError` for what is no request."""

@@ -39,9 +39,9 @@ class RequestReader:
     """Takes what a client has sent, in pieces of any size."""
 
     def __init__(self) -> None:
-        self._begin_anew()
+        self._restart()
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self._waiting = bytearray()
         self._depth = 0
         self._quoted = self._escaped = False
@@ -54,12 +54,12 @@ class RequestReader:
                 continue
             text = (bytes(self._waiting) + data[begin : index + 1]).strip(b"; \t\r\n")
             begin = index + 1
-            self._begin_anew()
+            self._restart()
             if text:
                 yield _parsed(text.decode("utf-8", "replace"))
         self._waiting += data[begin:]
         if len(self._waiting) > MOST_BYTES:
-            self._begin_anew()
+            self._restart()
             yield Malformed("request too long")
 
     def _ends(self, byte: int) -> bool:

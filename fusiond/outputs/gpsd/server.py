@@ -100,7 +100,7 @@ class GpsdServer:
     def status(self) -> DriverStatus:
         return self.server.port.status
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):
             self._activated = self._activated or message.t_utc
             self._epoch = _Epoch(message, self)
@@ -148,23 +148,23 @@ class GpsdServer:
         if isinstance(request, Request) and request.name == "POLL":
             self.counters["requests"] += 1
             return self._epoch.polled() if self._epoch is not None else encoded(_poll(None, {}))
-        return b"".join(map(encoded, self._answers(watch, request)))
+        return b"".join(map(encoded, self._replies(watch, request)))
 
-    def _answers(self, watch: Watch, request: Request | Malformed) -> list[Report]:
+    def _replies(self, watch: Watch, request: Request | Malformed) -> list[Report]:
         if isinstance(request, Malformed):
             self.counters["malformed"] += 1
             return [reports.error(request.text)]
         self.counters["requests"] += 1
-        answers: dict[str, Callable[[], list[Report]]] = {
+        replies: dict[str, Callable[[], list[Report]]] = {
             "VERSION": lambda: [reports.version(self._release)],
             "DEVICES": lambda: [self._devices()],
             "DEVICE": lambda: [reports.device(self.device, self._activated)],
             "WATCH": lambda: self._watching(watch, request.argument or {}, request.argument),
         }
-        if request.name not in answers:
+        if request.name not in replies:
             self.counters["malformed"] += 1
             return [reports.error(f"Unrecognized request '?{request.name}'")]
-        return answers[request.name]()
+        return replies[request.name]()
 
     def _devices(self) -> Report:
         return {"class": "DEVICES", "devices": [reports.device(self.device, self._activated)]}

@@ -1,4 +1,4 @@
-"""`calibration`: how the sensors sit on the vehicle and when they speak, as far as it is known."""
+"""`calibration`: mounting, lever arms, delays and scales as estimated."""
 
 from __future__ import annotations
 

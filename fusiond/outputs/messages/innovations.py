@@ -1,4 +1,4 @@
-"""`innovations`: how the latest aids ended when the filter met them."""
+"""`innovations`: how the latest measurements ended when the filter met them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from fusiond.outputs.messages.base import Count, Message, Milliseconds, Number, 
 
 
 class Innovation(BaseModel):
-    """One aid. A late measurement rewinds the filter: an aid after it comes again, with the same
-    source and `t_ms`, and the last one counts."""
+    """One measurement. A late measurement rewinds the filter: a measurement after it comes again,
+    with the same source and `t_ms`, and the last one counts."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from pydantic import Field
@@ -58,50 +58,56 @@ class StatusMessage(Message):
     mqtt_commands_limited: Count
 
 
-def status_message(
-    solution: Solution,
-    utc_ns: int | None,
-    *,
-    since_utc_ns: int | None,
-    version: str,
-    config_digest: str,
-    uptime_s: float,
-    scheduler: SchedulerStatus,
-    fused: int,
-    rejected: int,
-    calibrated: bool,
-    imu: str | None,
-    faults: tuple[FaultReport, ...],
-    recording: RecordingStatus,
-    injected: tuple[str, ...],
-    mqtt: Mapping[str, int],
-) -> StatusMessage:
-    """`status`; `mqtt` are the publisher's counters."""
+@dataclass(frozen=True, slots=True)
+class DaemonState:
+    """State of the daemon beside its solution; the defaults are those before the first tick.
+
+    `since_utc_ns`: when the mode began; `mqtt`: the publisher's counters.
+    """
+
+    since_utc_ns: int | None
+    version: str
+    config_digest: str
+    uptime_s: float
+    scheduler: SchedulerStatus
+    fused: int = 0
+    rejected: int = 0
+    calibrated: bool = False
+    imu: str | None = None
+    faults: tuple[FaultReport, ...] = ()
+    recording: RecordingStatus = field(default_factory=RecordingStatus)
+    injected: tuple[str, ...] = ()
+    mqtt: Mapping[str, int] = field(default_factory=dict)
+
+
+def status_message(solution: Solution, utc_ns: int | None, daemon: DaemonState) -> StatusMessage:
+    """`status` at `utc_ns`."""
     t_utc, t_ms = stamp(utc_ns)
-    since_utc, since_ms = stamp(since_utc_ns)
+    since_utc, since_ms = stamp(daemon.since_utc_ns)
+    recording, mqtt = daemon.recording, daemon.mqtt
     return StatusMessage(
         t_utc=t_utc,
         t_ms=t_ms,
         mode=solution.mode,
         why=solution.reason,
         protection=solution.bound.state,
-        imu=imu,
-        faults=faults,
-        calibrated=calibrated,
+        imu=daemon.imu,
+        faults=daemon.faults,
+        calibrated=daemon.calibrated,
         since_utc=since_utc,
         since_ms=since_ms,
-        version=version,
-        config_digest=config_digest,
-        uptime_s=round(uptime_s, 3),
-        ticks=scheduler.ticks,
-        overruns=scheduler.overruns,
-        fused=fused,
-        rejected=rejected,
+        version=daemon.version,
+        config_digest=daemon.config_digest,
+        uptime_s=round(daemon.uptime_s, 3),
+        ticks=daemon.scheduler.ticks,
+        overruns=daemon.scheduler.overruns,
+        fused=daemon.fused,
+        rejected=daemon.rejected,
         recording=recording.state,
         recording_file=recording.file,
         recording_dropped=recording.dropped,
         disk_free_mb=None if recording.free_mb is None else round(recording.free_mb, 1),
-        injected=injected,
+        injected=daemon.injected,
         mqtt_published=mqtt.get("mqtt_published", 0),
         mqtt_dropped=mqtt.get("mqtt_dropped", 0),
         mqtt_reconnects=mqtt.get("mqtt_reconnects", 0),

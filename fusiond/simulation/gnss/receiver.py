@@ -32,7 +32,7 @@ _MODE = {1: "A", 2: "D", 4: "R", 5: "F"}
 
 @dataclass(frozen=True, slots=True)
 class GnssOptions:
-    """One-sigma errors each axis; sd pairs are (horizontal, vertical).
+    """One sigma of each axis' error; sd pairs are (horizontal, vertical).
 
     White by default, as filters assume; `correlated_sd_m` adds what a single receiver has besides.
     """

@@ -51,8 +51,17 @@ def signal_id(system: System, prn: int, signal: str) -> int:
 
 def sfrbx(system: System, prn: int, words: Sequence[int]) -> bytes:
     """RXM-SFRBX with a subframe heard on GPS L1 C/A or BeiDou B1I."""
-    heard = {"G": "1C", "C": "2I", "E": "1C"}[system]
-    head = (GNSS_ID[system], prn, signal_id(system, prn, heard), 0, len(words), prn % 32, 2, 0)
+    broadcast_on = {"G": "1C", "C": "2I", "E": "1C"}[system]
+    head = (
+        GNSS_ID[system],
+        prn,
+        signal_id(system, prn, broadcast_on),
+        0,
+        len(words),
+        prn % 32,
+        2,
+        0,
+    )
     return frame(RXM, SFRBX, struct.pack(f"<8B{len(words)}I", *head, *words))
 
 

@@ -75,8 +75,8 @@ class RdssOptions:
     mute_probability: float = 0.0
     """A request or a message is swallowed by a terminal that is busy: no feedback, no burst."""
     convoy: bool = False
-    """Another vehicle of a convoy reports its place, sends a text now and then and confirms those
-    that ask for it (simulation.rdss.network)."""
+    """True for a convoy: another vehicle reports its place, sends texts and confirms those that ask
+    for it (simulation.rdss.network)."""
     multi_value_probability: float = 0.0
     foreign_probability: float = 0.0
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -164,16 +164,18 @@ def simulate(seed: int, number: int) -> dict[str, Trace]:
         horizontal, height, velocity, tilt, heading = START_SD
         sd = model.initial.copy()
         sd[:9] = [tilt * DEG, tilt * DEG, heading * DEG, *[velocity] * 3, *[horizontal] * 2, height]
-        begun = with_error(nav[0], unit * sd[:9])
-        live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, begun, sd)
+        started = with_error(nav[0], unit * sd[:9])
+        live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, started, sd)
         raw = intake.receivers["raw"]
         for message in broadcast(simulated):
             raw.learn(message)
         trace = Trace(np.empty((len(t_s), 9)), np.empty(len(t_s)))
         for k, t in enumerate(t_s):
             live.advance(t)
-            aids: list[Aid] = [raw.aid(observed[k], round(t * 1e9))] if row.aided else []
-            live.advance(t, aids)
+            measurements: list[AidingMeasurement] = (
+                [raw.measurement(observed[k], round(t * 1e9))] if row.aided else []
+            )
+            live.advance(t, measurements)
             x, p = nav_error(live.estimator.nav, nav[k + 1]), live.estimator.covariance[:9, :9]
             scale = np.sqrt(np.diag(p))
             trace.error[k] = x

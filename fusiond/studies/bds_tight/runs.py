@@ -5,10 +5,11 @@ simulated receiver (`fusiond.simulation.gnss.raw`) observes B1I pseudoranges and
 second, with receiver clock, atmosphere, multipath, orbit errors and its own noise. From the same
 IMU, observations and start every row of a case makes its own solution:
 
-`tight_ekf`, `tight_ukf`   the daemon's raw aid in its filters `kalman` and `unscented`
+`tight_ekf`, `tight_ukf`   the daemon's raw measurement in its filters `kalman` and `unscented`
 `tight_scaled`  `tight_ekf` with `sigma_scale = 2`: twice the sigma of every range and rate
 `loose`      `kalman`, aided by position and velocity of the receiver's fix as the daemon takes
-             them, with states for the error that fixes share (`bias_sd_m` as the raw aid has)
+             them, with states for the error that fixes share (`bias_sd_m` as the raw measurement
+             has)
 `loose_white`  the same without those states, as is the daemon's default
 `coasting`   `tight_ekf` without any observation in the stretch
 `receiver`   least squares of each epoch alone (`fusiond.gnss.single_point`)
@@ -36,7 +37,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -309,14 +310,14 @@ def _filter_trace(
     for k, t in enumerate(t_s):
         t_ns = round(t * 1e9)
         live.advance(t)
-        aids: list[Aid] = []
+        measurements: list[AidingMeasurement] = []
         found = solved[k]
         if raw is not None and not away[k]:
-            aids = [raw.aid(observed[k], t_ns)]
+            measurements = [raw.measurement(observed[k], t_ns)]
         elif raw is None and found is not None:
-            accepted = intake.aids(fix(found, t_ns), t_ns, 0.0)
-            aids = [] if isinstance(accepted, str) else list(accepted)
-        live.advance(t, aids)
+            accepted = intake.measurements_of(fix(found, t_ns), t_ns, 0.0)
+            measurements = [] if isinstance(accepted, str) else list(accepted)
+        live.advance(t, measurements)
         x, p = nav_error(estimator.nav, nav[k + 1]), estimator.covariance[:9, :9]
         trace.error[k] = x[6:]
         trace.sigma[k] = math.sqrt(p[6, 6] + p[7, 7])

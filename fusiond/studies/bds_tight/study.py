@@ -69,7 +69,9 @@ PAPER = {
 }
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 50) of each case. Repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
@@ -268,25 +270,9 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
     """All epochs; the stretch with its growth; the smaller orbit errors."""
     low, high = result["nees_interval"]
     first, last = result["stretch_s"]
-    keys = ("horizontal_rms_m", "vertical_rms_m", "nees_mean", "availability", "solution_rate")
     header = ["case", "row", "horizontal m", "vertical m", "NEES", "available", "solution"]
-    every, few, orbits = [], [], []
-    for case, found in result["cases"].items():
-        for row in ROWS:
-            if row not in found:
-                continue
-            name, figures = row.replace("_", " "), found[row]
-            every.append([case, name, *(_text(figures[key]) for key in keys)])
-            if case != "open":
-                growth = figures.get("growth_m", {})
-                few.append(
-                    [
-                        case,
-                        name,
-                        *(_text(figures["stretch"][key]) for key in keys),
-                        *(_text(growth.get(f"{s:.0f}")) for s in GROWTH_S),
-                    ]
-                )
+    every, few = _by_case(result["cases"])
+    orbits = []
     for entry in result["orbit_errors"]:
         for case, found in entry["cases"].items():
             figures = [
@@ -325,6 +311,25 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             mine,
         ),
     ]
+
+
+def _by_case(cases: dict[str, Any]) -> tuple[list[list[str]], list[list[str]]]:
+    """Rows of all epochs, and of the stretch with its growth."""
+    keys = ("horizontal_rms_m", "vertical_rms_m", "nees_mean", "availability", "solution_rate")
+    every, few = [], []
+    for case, found in cases.items():
+        for row in ROWS:
+            if row not in found:
+                continue
+            name, figures = row.replace("_", " "), found[row]
+            every.append([case, name, *(_text(figures[key]) for key in keys)])
+            if case != "open":
+                growth = figures.get("growth_m", {})
+                stretch = (_text(figures["stretch"][key]) for key in keys)
+                few.append(
+                    [case, name, *stretch, *(_text(growth.get(f"{s:.0f}")) for s in GROWTH_S)]
+                )
+    return every, few
 
 
 def _text(value: float | None) -> str:

@@ -1,6 +1,8 @@
-"""Run the fault matrix or rows of it, how well faults are detected, how often none is one, what
-becomes of those that happen now and then, how long they cost service, how soon any test could tell
-them, how sharp sigma is, or what is told of recorded drives."""
+"""Run the fault matrix, or one of the studies beside it.
+
+They are: single rows, how well faults are detected, how often none is one, faults that happen now
+and then, what they cost in service, how soon any test could tell them, how sharp sigma is, and what
+is reported of recorded drives."""
 
 from __future__ import annotations
 

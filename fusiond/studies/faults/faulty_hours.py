@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from fusiond.navigator.navigator import Navigator
-from fusiond.studies.faults.aid_faults import sparing
 from fusiond.studies.faults.hours import (
     HOUR_S,
     KINDS,
@@ -44,6 +43,7 @@ from fusiond.studies.faults.judge import (
     longest_lie_s,
 )
 from fusiond.studies.faults.library import TO_THE_END
+from fusiond.studies.faults.measurement_faults import sparing
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import largest
 from fusiond.studies.faults.recording import GNSS, SECOND, Recording, town

@@ -1,8 +1,8 @@
 """Every fault of the matrix by its name: what it alters, for how long, and in which phases.
 
 `aligning` begins at rest, before the first heading; `navigating` on a straight at 20 m/s with all
-aids; `coasting` in an outage of all fixes, where the faults of IMU and wheels begin in its midst
-and those of fixes with the first that come back.
+measurements; `coasting` in an outage of all fixes, where the faults of IMU and wheels begin in its
+midst and those of fixes with the first that come back.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Literal
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config, SpareImu
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
+from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.recording import (
     BEND_S,
     DURATION_S,
@@ -160,59 +160,59 @@ _of_two = partial(Fault, drive=Drive(second=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
 _of_places = partial(_under_way, length_s=60.0, drive=Drive(places_alone=True))
-_carried_off = partial(aid.carried_off, north_m_s=1.0)
+_carried_off = partial(measurement.carried_off, north_m_s=1.0)
 
 FAULTS: dict[str, Fault] = {
     "none": Fault(),
     # fixes of the receiver
-    "step_500m": Fault(aid.step, 20.0),
-    "position_0n_0e": Fault(aid.null_island, 20.0),
-    "fix_frozen": Fault(aid.frozen, 20.0),
-    "velocity_reversed": Fault(aid.velocity_reversed, 20.0),
-    "velocity_1s_old": Fault(aid.velocity_old, 60.0),
-    "drift_0.1_m_s": Fault(partial(aid.drift, north_m_s=0.1), 60.0, phases=UNDER_WAY),
-    "drift_0.2_m_s": Fault(partial(aid.drift, north_m_s=0.2), 60.0, phases=UNDER_WAY),
-    "drift_0.5_m_s": Fault(aid.drift, 60.0),
+    "step_500m": Fault(measurement.step, 20.0),
+    "position_0n_0e": Fault(measurement.null_island, 20.0),
+    "fix_frozen": Fault(measurement.frozen, 20.0),
+    "velocity_reversed": Fault(measurement.velocity_reversed, 20.0),
+    "velocity_1s_old": Fault(measurement.velocity_old, 60.0),
+    "drift_0.1_m_s": Fault(partial(measurement.drift, north_m_s=0.1), 60.0, phases=UNDER_WAY),
+    "drift_0.2_m_s": Fault(partial(measurement.drift, north_m_s=0.2), 60.0, phases=UNDER_WAY),
+    "drift_0.5_m_s": Fault(measurement.drift, 60.0),
     # In an outage it is within what the outage leaves open: nobody can tell.
-    "step_2m_to_the_end": Fault(partial(aid.step, north_m=2.0), phases=("navigating",)),
-    "step_10m_to_the_end": Fault(partial(aid.step, north_m=10.0), phases=UNDER_WAY),
-    "step_500m_to_the_end": Fault(aid.step, phases=UNDER_WAY),
-    "velocity_ramp_0.1_m_s2": Fault(aid.velocity_ramp, 60.0),
+    "step_2m_to_the_end": Fault(partial(measurement.step, north_m=2.0), phases=("navigating",)),
+    "step_10m_to_the_end": Fault(partial(measurement.step, north_m=10.0), phases=UNDER_WAY),
+    "step_500m_to_the_end": Fault(measurement.step, phases=UNDER_WAY),
+    "velocity_ramp_0.1_m_s2": Fault(measurement.velocity_ramp, 60.0),
     # In an outage a velocity is not known as well as that: nobody can tell.
-    "carried_off_0.5_m_s": Fault(aid.carried_off, 60.0, phases=("navigating",)),
+    "carried_off_0.5_m_s": Fault(measurement.carried_off, 60.0, phases=("navigating",)),
     # Of a receiver without velocities, which would tell.
-    "places_drift_0.5_m_s": _of_places(aid.drift),
-    "places_drift_2_m_s": _of_places(partial(aid.drift, north_m_s=2.0)),
-    "fixes_late_0.8s": Fault(aid.late, phases=UNDER_WAY),
-    "fixes_always_late_0.8s": _from_start(aid.late),
-    "false_burst_1khz": Fault(aid.false_burst, 0.5),
-    "sigma_1e-9": Fault(aid.tiny_sigma, 20.0),
-    "sigma_infinite": Fault(aid.infinite_sigma, 1.0),
-    "latitude_nan": Fault(aid.nan_latitude, 1.0),
-    "height_1e300": Fault(aid.huge_height, 0.4),
-    "speed_1e300": Fault(aid.huge_speed, 0.4),
-    "speed_2000_knots": Fault(aid.fast, 20.0),
-    "fixes_twice": Fault(aid.repeated, 20.0),
-    "fixes_from_future": Fault(aid.from_future, 20.0),
-    "multipath_tunnel_jump": _under_way(aid.multipath_tunnel_jump, 60.6),
-    "first_fixes_at_90s": _from_start(aid.no_fix_yet, 90.0, drive=Drive(_smooth)),
+    "places_drift_0.5_m_s": _of_places(measurement.drift),
+    "places_drift_2_m_s": _of_places(partial(measurement.drift, north_m_s=2.0)),
+    "fixes_late_0.8s": Fault(measurement.late, phases=UNDER_WAY),
+    "fixes_always_late_0.8s": _from_start(measurement.late),
+    "false_burst_1khz": Fault(measurement.false_burst, 0.5),
+    "sigma_1e-9": Fault(measurement.tiny_sigma, 20.0),
+    "sigma_infinite": Fault(measurement.infinite_sigma, 1.0),
+    "latitude_nan": Fault(measurement.nan_latitude, 1.0),
+    "height_1e300": Fault(measurement.huge_height, 0.4),
+    "speed_1e300": Fault(measurement.huge_speed, 0.4),
+    "speed_2000_knots": Fault(measurement.fast, 20.0),
+    "fixes_twice": Fault(measurement.repeated, 20.0),
+    "fixes_from_future": Fault(measurement.from_future, 20.0),
+    "multipath_tunnel_jump": _under_way(measurement.multipath_tunnel_jump, 60.6),
+    "first_fixes_at_90s": _from_start(measurement.no_fix_yet, 90.0, drive=Drive(_smooth)),
     # fixes of two receivers
-    "one_of_two_drifts_0.5_m_s": _of_two(aid.sparing(aid.drift, SECOND), 60.0),
-    "two_step_500m": _of_two(aid.step, 20.0),
-    "two_frozen": _of_two(aid.frozen, 20.0),
-    "two_carried_off_0.5_m_s": _of_two(aid.carried_off, 60.0, phases=("navigating",)),
+    "one_of_two_drifts_0.5_m_s": _of_two(measurement.sparing(measurement.drift, SECOND), 60.0),
+    "two_step_500m": _of_two(measurement.step, 20.0),
+    "two_frozen": _of_two(measurement.frozen, 20.0),
+    "two_carried_off_0.5_m_s": _of_two(measurement.carried_off, 60.0, phases=("navigating",)),
     # The IMU and the wheels alone can say so.
     "carried_off_1_m_s_wheels": _under_way(_carried_off, 60.0, drive=Drive(wheels=True)),
     "two_carried_off_1_m_s_wheels": _under_way(
         _carried_off, 60.0, drive=Drive(wheels=True, second=True)
     ),
     # RDSS
-    "rdss_step_500m": Fault(aid.rdss_step, 60.0),
-    "rdss_latitude_nan": Fault(aid.rdss_nan, 30.0),
+    "rdss_step_500m": Fault(measurement.rdss_step, 60.0),
+    "rdss_latitude_nan": Fault(measurement.rdss_nan, 30.0),
     # wheels
-    "wheels_frozen": _of_wheels(aid.wheels_frozen),
-    "wheels_scaled": _of_wheels(aid.wheels_scaled),
-    "wheels_reversed": _of_wheels(aid.wheels_reversed),
+    "wheels_frozen": _of_wheels(measurement.wheels_frozen),
+    "wheels_scaled": _of_wheels(measurement.wheels_scaled),
+    "wheels_reversed": _of_wheels(measurement.wheels_reversed),
     # samples of the IMU
     "imu_saturated_1s": _of_imu(imu.saturated, 1.0),
     "imu_stuck_15s": _of_imu(imu.stuck, 15.0),

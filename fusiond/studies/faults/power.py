@@ -17,12 +17,12 @@ from itertools import product
 from typing import Any
 
 from fusiond.configuration.settings import DEG
-from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
+from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S
 from fusiond.studies.faults.library import PHASES, Fault
 from fusiond.studies.faults.recording import Alter, Drive
-from fusiond.studies.faults.runs import run
+from fusiond.studies.faults.runs import run_fault
 
 LASTS_S = 60.0
 BEGINS = 10
@@ -43,28 +43,28 @@ SWEEPS: dict[str, Sweep] = {
     "position steps": Sweep(
         "m",
         (2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0),
-        lambda size: partial(aid.step, north_m=size),
+        lambda size: partial(measurement.step, north_m=size),
     ),
     "position runs away": Sweep(
         "m/s",
         (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
-        lambda size: partial(aid.drift, north_m_s=size),
+        lambda size: partial(measurement.drift, north_m_s=size),
     ),
     "velocity is off": Sweep(
         "m/s",
         (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
-        lambda size: partial(aid.velocity_bias, north_m_s=size),
+        lambda size: partial(measurement.velocity_bias, north_m_s=size),
     ),
-    "fix is frozen": Sweep("", (1.0,), lambda _: aid.frozen),
+    "fix is frozen": Sweep("", (1.0,), lambda _: measurement.frozen),
     "stated sigma too small": Sweep(
         "times",
         (1.5, 2.0, 3.0, 5.0, 10.0, 30.0),
-        lambda size: partial(aid.small_sigma, factor=size),
+        lambda size: partial(measurement.small_sigma, factor=size),
     ),
     "fixes late": Sweep(
         "s",
         (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 2.0, 3.0),
-        lambda size: partial(aid.late, late_s=size),
+        lambda size: partial(measurement.late, late_s=size),
     ),
     "yaw gyro off": Sweep(
         "deg/s",
@@ -96,7 +96,7 @@ def power_run(job: tuple[str, float, int]) -> dict[str, Any]:
     name, size, seed = job
     alter = SWEEPS[name].altered_by(size)
     begin_s = PHASES["navigating"].fix_s + seed % BEGINS
-    found = run(Fault(alter, LASTS_S, begin_s=begin_s, drive=DRIVE), "navigating", seed)
+    found = run_fault(Fault(alter, LASTS_S, begin_s=begin_s, drive=DRIVE), "navigating", seed)
     kept = ("verdict", "noticed_s", "largest_horizontal_m", "largest_ratio", "largest_ratio_of")
     return {
         "fault": name,

@@ -28,7 +28,7 @@ from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Config
 from fusiond.files.tables import TrajectoryTable, read_imu, read_truth
 from fusiond.navigator.navigator import Navigator
-from fusiond.offline.aid_files import READERS
+from fusiond.offline.measurement_files import READERS
 from fusiond.simulation.imu_truth import States
 from fusiond.studies.faults.hours import USUAL, named
 from fusiond.studies.faults.published import AXES, STEP_S, Bools, against, longest_s
@@ -48,8 +48,8 @@ PHASE = "steady"
 @dataclass(frozen=True, slots=True)
 class Drive:
     """A folder of recorded tables, what is known of the vehicle, and sets of outages as begin, from
-    the first sample on, and length (s). `truth` is a table that is no aid; without it the fixes
-    that are withheld are. `qualities` stand in the place of those that fixes state."""
+    the first sample on, and length (s). `truth` is a table that is no measurement; without it the
+    fixes that are withheld are. `qualities` stand in the place of those that fixes state."""
 
     folder: str
     settings: dict[str, Any]
@@ -238,8 +238,9 @@ def _of_quality(recording: Recording, qualities: Mapping[int, int]) -> Recording
 def _at_ticks(
     table: TrajectoryTable, begin_s: float, length_s: float
 ) -> tuple[States, Array, Bools]:
-    """The reference at each tick, its sigmas (n, 9), zero where it states none, and which ticks are
-    as near to it as that it holds."""
+    """Reference at each tick, its sigmas (n, 9), and the ticks at which it holds.
+
+    A sigma is zero where the reference states none; it holds near its own rows."""
     t_s = np.arange(1.0, math.floor(length_s * TICKS_PER_S) + 0.5) * STEP_S
     there_s = t_s + begin_s
 

@@ -34,8 +34,8 @@ from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.tables import TrajectoryTable, read_imu, read_solution
 from fusiond.navigation.solution import Solution
-from fusiond.offline.aid_files import READERS, Arrival, source_of
 from fusiond.offline.can_log import read_can_log
+from fusiond.offline.measurement_files import READERS, Arrival, source_of
 from fusiond.offline.process import process
 from fusiond.simulation.imu_truth import States
 from fusiond.studies.faults.judge import QUANTITIES, Course, Sample, judge
@@ -85,8 +85,8 @@ def smooth(place: Place) -> None:
         white = gnss.model_copy(update={"bias_sd_m": 0.0})
         config = config.model_copy(update={"aiding": {**config.aiding, "gnss": white}})
     if place.recording.is_dir():
-        aids, imu = _tables(place.recording), place.recording / "imu.csv"
-        process(config, imu, aids, out=place.smoothed, smooth=True)
+        measurements, imu = _tables(place.recording), place.recording / "imu.csv"
+        process(config, imu, measurements, out=place.smoothed, smooth=True)
     else:
         process(config, None, [], out=place.smoothed, can_log=place.recording, smooth=True)
 

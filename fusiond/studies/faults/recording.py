@@ -76,7 +76,8 @@ class Recording:
         )
 
     def withheld(self, begin_s: float, end_s: float) -> Recording:
-        """Without the aids that are valid from `begin_s` to before `end_s`; wheels go on."""
+        """Without the measurements that are valid from `begin_s` to before `end_s`; wheels go
+        on."""
         begin, end = round(begin_s * 1e9), round(end_s * 1e9)
         return replace(
             self,

@@ -86,7 +86,7 @@ def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
     return {
         "fault": row.fault,
         "phase": row.phase,
-        **run(placed(FAULTS[row.fault], drive), row.phase, seed),
+        **run_fault(placed(FAULTS[row.fault], drive), row.phase, seed),
     }
 
 
@@ -105,7 +105,7 @@ def placed(fault: Fault, drive: int | None) -> Fault:
     return replace(fault, drive=found)
 
 
-def run(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
+def run_fault(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
     """The figures of a fault in a phase."""
     begin_s = fault.begins_s(phase)
     harmless = fault.alter is None and fault.configure is None
@@ -169,11 +169,11 @@ def driven(
     events: list[Event] = []
     now_s = 0.0
 
-    def hear(code: str, text: str) -> None:
+    def receive(code: str, text: str) -> None:
         events.append(Event(now_s, code, text))
 
-    navigator = Navigator(config, on_event=hear)
-    units = _Units(config, recording, lambda source, code, text: hear(code, text))
+    navigator = Navigator(config, on_event=receive)
+    units = _Units(config, recording, lambda source, code, text: receive(code, text))
     taken = 0
     received = recording.received
     for tick in range(1, round(duration_s * TICKS_PER_S) + 1):

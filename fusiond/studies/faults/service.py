@@ -26,8 +26,8 @@ import numpy as np
 
 from drivers.measurements import PositionFix
 from fusiond.configuration.settings import DEG
-from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
+from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S
 from fusiond.studies.faults.published import (
     AXES,
@@ -98,20 +98,20 @@ FAULTS: dict[str, tuple[str, Alter]] = {
     "roll gyro off by 0.3 deg/s": (IMU, _gyro(0.3, 0)),
     "forward force off by 0.5 m/s^2": (IMU, _force(0.5, 3)),
     "sideways force off by 0.5 m/s^2": (IMU, _force(0.5, 4)),
-    "position off by 2 m": (POSITION, partial(aid.step, north_m=2.0)),
-    "position off by 10 m": (POSITION, partial(aid.step, north_m=10.0)),
-    "position off by 500 m": (POSITION, partial(aid.step, north_m=500.0)),
-    "position runs away, 0.1 m/s": (POSITION, partial(aid.drift, north_m_s=0.1)),
-    "position runs away, 0.2 m/s": (POSITION, partial(aid.drift, north_m_s=0.2)),
-    "position runs away, 0.5 m/s": (POSITION, partial(aid.drift, north_m_s=0.5)),
-    "position runs away, 2 m/s": (POSITION, partial(aid.drift, north_m_s=2.0)),
-    "velocity off by 0.5 m/s": (VELOCITY, partial(aid.velocity_bias, north_m_s=0.5)),
-    "velocity off by 2 m/s": (VELOCITY, partial(aid.velocity_bias, north_m_s=2.0)),
-    "velocity runs away, 0.1 m/s^2": (VELOCITY, aid.velocity_ramp),
+    "position off by 2 m": (POSITION, partial(measurement.step, north_m=2.0)),
+    "position off by 10 m": (POSITION, partial(measurement.step, north_m=10.0)),
+    "position off by 500 m": (POSITION, partial(measurement.step, north_m=500.0)),
+    "position runs away, 0.1 m/s": (POSITION, partial(measurement.drift, north_m_s=0.1)),
+    "position runs away, 0.2 m/s": (POSITION, partial(measurement.drift, north_m_s=0.2)),
+    "position runs away, 0.5 m/s": (POSITION, partial(measurement.drift, north_m_s=0.5)),
+    "position runs away, 2 m/s": (POSITION, partial(measurement.drift, north_m_s=2.0)),
+    "velocity off by 0.5 m/s": (VELOCITY, partial(measurement.velocity_bias, north_m_s=0.5)),
+    "velocity off by 2 m/s": (VELOCITY, partial(measurement.velocity_bias, north_m_s=2.0)),
+    "velocity runs away, 0.1 m/s^2": (VELOCITY, measurement.velocity_ramp),
     "fixes 1 s late": (POSITION, partial(old, age_s=1.0)),
     "fixes 3 s late": (POSITION, partial(old, age_s=3.0)),
-    "fixes frozen": (POSITION, aid.frozen),
-    "velocity reversed": (VELOCITY, aid.velocity_reversed),
+    "fixes frozen": (POSITION, measurement.frozen),
+    "velocity reversed": (VELOCITY, measurement.velocity_reversed),
 }
 """Group and alteration of each. Of receivers to the north."""
 RECEIVERS = {receiver.name: receiver for receiver in (CODE, SHARING)}

@@ -55,8 +55,10 @@ CONFIDENCE = 0.95
 
 
 def _cells() -> tuple[Vehicle, ...]:
-    """Those of which all is told, those of which the class alone is, and those of a unit whose axes
-    are square, by its data sheet."""
+    """Vehicles of the study.
+
+    Some whose noise is configured in full, some by their class alone, and a unit with square axes
+    by its data sheet."""
     told = [
         Vehicle(sensor, replace(receiver, rate_hz=rate), given)
         for sensor, receiver, rate, given in product(CLASSES, RECEIVERS, RATES_HZ, (True, False))

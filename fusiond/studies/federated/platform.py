@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 
 ACTIVE, PASSIVE = "rdss", "gnss"
 CLASS_M, HEIGHT_SD_M = 20, 10.0
-ACTIVE_EVERY_S, ACTIVE_LATE_S = 1.5, 1.5
+ACTIVE_EVERY_S, ACTIVE_DELAY_S = 1.5, 1.5
 PASSIVE_SD_M = (10.0, 10.0, 15.0)
-PASSIVE_LATE_S = 0.1
+PASSIVE_DELAY_S = 0.1
 COUNTED_FROM_S = 30.0
 FILTERS: dict[str, tuple[str, ...]] = {
     "federated": (ACTIVE, PASSIVE),
@@ -85,10 +85,10 @@ def arrivals(rng: np.random.Generator) -> tuple[list[Measurement], dict[str, Arr
             stamp = MonotonicStamp(round(t * 1e9))
             lat, lon, height = (float(x) for x in p)
             if source == ACTIVE:
-                seen = stamp.t_ns + round(ACTIVE_LATE_S * 1e9)
+                seen = stamp.t_ns + round(ACTIVE_DELAY_S * 1e9)
                 found.append(DelayedFix(source, seen, stamp, lat, lon, height, CLASS_M))
             else:
-                seen = stamp.t_ns + round(PASSIVE_LATE_S * 1e9)
+                seen = stamp.t_ns + round(PASSIVE_DELAY_S * 1e9)
                 found.append(
                     PositionFix(source, seen, stamp, lat, lon, height, sd_ned_m=PASSIVE_SD_M)
                 )
@@ -135,12 +135,12 @@ def _run(estimator: Estimator, samples: Array, fixes: list[Measurement]) -> Arra
             m = fixes[following]
             assert isinstance(m, PositionFix | DelayedFix)
             assert isinstance(m.stamp, MonotonicStamp)
-            aids = intake.aids(m, m.stamp.t_ns, 0.0, m.t_seen_ns)
-            assert not isinstance(aids, str)
-            for aid in aids:
-                timeline.insert(aid)
+            measurements = intake.measurements_of(m, m.stamp.t_ns, 0.0, m.t_seen_ns)
+            assert not isinstance(measurements, str)
+            for measurement in measurements:
+                timeline.insert(measurement)
             following += 1
-        timeline.run()
+        timeline.advance()
         if t >= COUNTED_FROM_S:
             errors.append(nav_error(estimator.nav, true[i])[6:8])
     return np.array(errors)

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
@@ -107,7 +107,7 @@ def grid() -> tuple[Array, Array]:
 
 def fixes(
     rng: np.random.Generator, fault: FaultKind, sd_m: tuple[float, ...] = EQUAL_M
-) -> list[PositionAid]:
+) -> list[PositionMeasurement]:
     """The fixes of all sources in order of validity; each once a second, one after the other."""
     count = len(SOURCES)
     t_s = np.arange(1.0, DURATION_S, 1.0 / count)
@@ -124,7 +124,7 @@ def fixes(
     if fault == "frozen":
         positions[faulty] = positions[np.flatnonzero(faulty)[0]]
     return [
-        PositionAid(
+        PositionMeasurement(
             SOURCES[k % count],
             round(t * 1e9),
             GATE,
@@ -165,11 +165,11 @@ def simulate(
     out = imu_output(STUDY_IMU, truth().gyro, truth().accel, rng)
     samples = np.hstack([out.gyro, out.accel])
     biases = np.hstack([out.gyro_bias, out.accel_bias])
-    aids = fixes(rng, fault, sd_m)
+    measurements = fixes(rng, fault, sd_m)
     model = make_model("ins15", imu_noise(STUDY_IMU))
     sd = initial_sd(model)
     start = with_error(true_nav(truth(), np.zeros(1))[0], rng.standard_normal(9) * sd[:9])
-    return {f.name: _run(f, model, samples, biases, aids, start, fault) for f in filters}
+    return {f.name: _run(f, model, samples, biases, measurements, start, fault) for f in filters}
 
 
 def _run(
@@ -177,7 +177,7 @@ def _run(
     model: Model,
     samples: Array,
     biases: Array,
-    aids: list[PositionAid],
+    measurements: list[PositionMeasurement],
     start: Array,
     fault: FaultKind,
 ) -> Trace:
@@ -192,17 +192,19 @@ def _run(
     timeline.start()
     t_s, true = grid()
     trace = Trace(np.empty((len(t_s), 9)))
-    given = next_aid = 0
+    given = next_measurement = 0
     known: set[str] = set()
     for i, t in enumerate(t_s):
         end = round(t * rate)
         times = np.arange(given + 1, end + 1, dtype=np.int64) * round(1e9 / rate)
         imu.append(times, samples[given:end])
         given = end
-        while next_aid < len(aids) and aids[next_aid].t_ns <= round(t * 1e9):
-            timeline.insert(aids[next_aid])
-            next_aid += 1
-        timeline.run()
+        while next_measurement < len(measurements) and measurements[next_measurement].t_ns <= round(
+            t * 1e9
+        ):
+            timeline.insert(measurements[next_measurement])
+            next_measurement += 1
+        timeline.advance()
         new = set(estimator.isolated) - known
         known = set(estimator.isolated)
         if new:

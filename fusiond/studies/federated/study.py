@@ -64,7 +64,9 @@ FAULT_FILTERS = (
 )
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 50) of everything. All repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
@@ -198,11 +200,22 @@ def _finding(result: dict[str, Any]) -> str:
 # --------------------------------------------------------------------------- for people
 
 
-def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+Table = tuple[str, list[str], list[list[str]]]
+
+
+def tables(result: dict[str, Any]) -> list[Table]:
     """Title, header and rows of each part, for `fusiond study`."""
-    e = result["experiments"]
+    return [
+        *_experiment_tables(result["experiments"]),
+        *(_live_table(name, live) for name, live in result["without_imu"].items()),
+        *(_honesty_table(name, honest) for name, honest in result["honesty"].items()),
+        *(_fault_table(name, fault) for name, fault in result["faults"].items()),
+    ]
+
+
+def _experiment_tables(e: dict[str, Any]) -> list[Table]:
     one, two = e["1_random_truth"], e["2_constant_truth"]
-    found = [
+    return [
         (
             "1 random truth, 2 constant truth",
             ["", "m"],
@@ -235,48 +248,42 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             ],
         ),
     ]
-    for name, live in result["without_imu"].items():
-        low, high = live["nees_interval"]
-        rows = [[f"{s} fixes", f"{rms:.2f}", "", ""] for s, rms in live["fixes_rms_m"].items()]
-        for label, f in live["estimates"].items():
-            values = (f[key] for key in ("rms_m", "sigma_m", "nees_mean"))
-            rows.append([label, *(f"{value:.2f}" for value in values)])
-        title = f"{name.replace('_', ' ')}, live, without an inertial unit; NEES of 4 within"
-        header = ["", "horizontal RMS m", "sigma m", "NEES (4)"]
-        found.append((f"{title} [{low:.2f}, {high:.2f}]", header, rows))
-    for name, honest in result["honesty"].items():
-        low, high = honest["nees_interval"]
-        found.append(
-            (
-                f"no fault, {name} sources; NEES of {honest['nees_dof']} within "
-                f"[{low:.2f}, {high:.2f}]",
-                ["", "horizontal RMS m", "NEES", "false alarms"],
-                [
-                    [
-                        n,
-                        f"{f['horizontal_rms_m']:.2f}",
-                        f"{f['nees_mean']:.2f}",
-                        str(f["false_alarms"]),
-                    ]
-                    for n, f in honest["filters"].items()
-                ],
-            )
-        )
-    for name, fault in result["faults"].items():
-        rows = [
-            [
-                mode,
-                "" if f["detected_after_s"] is None else f"{f['detected_after_s']:g}",
-                f"{f['rms_m']:.2f}",
-            ]
-            for mode, f in fault["modes"].items()
+
+
+def _live_table(name: str, live: dict[str, Any]) -> Table:
+    low, high = live["nees_interval"]
+    rows = [[f"{s} fixes", f"{rms:.2f}", "", ""] for s, rms in live["fixes_rms_m"].items()]
+    for label, f in live["estimates"].items():
+        values = (f[key] for key in ("rms_m", "sigma_m", "nees_mean"))
+        rows.append([label, *(f"{value:.2f}" for value in values)])
+    title = f"{name.replace('_', ' ')}, live, without an inertial unit; NEES of 4 within"
+    header = ["", "horizontal RMS m", "sigma m", "NEES (4)"]
+    return f"{title} [{low:.2f}, {high:.2f}]", header, rows
+
+
+def _honesty_table(name: str, honest: dict[str, Any]) -> Table:
+    low, high = honest["nees_interval"]
+    title = f"no fault, {name} sources; NEES of {honest['nees_dof']} within [{low:.2f}, {high:.2f}]"
+    rows = [
+        [n, f"{f['horizontal_rms_m']:.2f}", f"{f['nees_mean']:.2f}", str(f["false_alarms"])]
+        for n, f in honest["filters"].items()
+    ]
+    return title, ["", "horizontal RMS m", "NEES", "false alarms"], rows
+
+
+def _fault_table(name: str, fault: dict[str, Any]) -> Table:
+    rows = [
+        [
+            mode,
+            "" if f["detected_after_s"] is None else f"{f['detected_after_s']:g}",
+            f"{f['rms_m']:.2f}",
         ]
-        rows.append(["no isolation", "", f"{fault['rms_unisolated_m']:.2f}"])
-        rows.append(["centralised", "", f"{fault['rms_centralised_m']:.2f}"])
-        gate_only = fault["rms_centralised_gate_only_m"]
-        rows.append(["centralised, gate alone", "", f"{gate_only:.2f}"])
-        found.append((f"fault: {name}", ["", "isolated after s", "horizontal RMS m"], rows))
-    return found
+        for mode, f in fault["modes"].items()
+    ]
+    rows.append(["no isolation", "", f"{fault['rms_unisolated_m']:.2f}"])
+    rows.append(["centralised", "", f"{fault['rms_centralised_m']:.2f}"])
+    rows.append(["centralised, gate alone", "", f"{fault['rms_centralised_gate_only_m']:.2f}"])
+    return f"fault: {name}", ["", "isolated after s", "horizontal RMS m"], rows
 
 
 def _experiment(key: str) -> str:

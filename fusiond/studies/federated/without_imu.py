@@ -27,11 +27,11 @@ from fusiond.estimators.federated.fusion import fuse_uncorrelated
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import metres_to_geodetic
 from fusiond.studies.federated.platform import (
+    ACTIVE_DELAY_S,
     ACTIVE_EVERY_S,
-    ACTIVE_LATE_S,
     CLASS_M,
     HEIGHT_SD_M,
-    PASSIVE_LATE_S,
+    PASSIVE_DELAY_S,
     PASSIVE_SD_M,
     active_root,
 )
@@ -114,10 +114,10 @@ def arrivals(name: str, rng: np.random.Generator) -> tuple[list[Measurement], di
     rows: dict[str, Array] = {}
     seconds = np.arange(0.0, DURATION_S, 0.5)
     keeps = np.exp(-0.5 / SHARED_TAU_S)
-    wander = np.empty((len(seconds), 2))
+    drift = np.empty((len(seconds), 2))
     value = rng.standard_normal(2) * SHARED_SD_M
     for k in range(len(seconds)):
-        wander[k] = value
+        drift[k] = value
         value = keeps * value + rng.standard_normal(2) * SHARED_SD_M * np.sqrt(1.0 - keeps**2)
     for number, source in enumerate(EXPERIMENTS[name]):
         active = source != "gnss"
@@ -128,8 +128,8 @@ def arrivals(name: str, rng: np.random.Generator) -> tuple[list[Measurement], di
             error[:, :2] = error[:, :2] @ active_root().T
             error[:, 2] *= HEIGHT_SD_M
             if name.startswith("3"):
-                error[:, 0] += np.interp(t_s, seconds, wander[:, 0])
-                error[:, 1] += np.interp(t_s, seconds, wander[:, 1])
+                error[:, 0] += np.interp(t_s, seconds, drift[:, 0])
+                error[:, 1] += np.interp(t_s, seconds, drift[:, 1])
         else:
             error *= PASSIVE_SD_M
         true = truth().at(t_s).position
@@ -144,9 +144,9 @@ def _fix(source: str, active: bool, t_ns: int, position: Array) -> Measurement:
     lat, lon, height = (float(x) for x in position)
     stamp = MonotonicStamp(t_ns)
     if active:
-        seen = t_ns + round(ACTIVE_LATE_S * 1e9)
+        seen = t_ns + round(ACTIVE_DELAY_S * 1e9)
         return DelayedFix(source, seen, stamp, lat, lon, height, CLASS_M)
-    seen = t_ns + round(PASSIVE_LATE_S * 1e9)
+    seen = t_ns + round(PASSIVE_DELAY_S * 1e9)
     return PositionFix(source, seen, stamp, lat, lon, height, sd_ned_m=PASSIVE_SD_M)
 
 
@@ -179,7 +179,7 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
         navigator.tick(now_ns)
         if k % 10 or k * TICK_S < COUNTED_FROM_S:
             continue
-        e = navigator.serving
+        e = navigator.active_filter
         errors.append(nav_error(e.nav, true[k])[COUNTED])
         covariances.append(e.covariance[np.ix_(COUNTED, COUNTED)])
         places.append(way(e.nav[None, :3])[0])

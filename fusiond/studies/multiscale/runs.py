@@ -29,10 +29,10 @@ from itertools import chain, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.attitude import AttitudeAid
+from fusiond.aiding.attitude import AttitudeMeasurement
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
@@ -60,7 +60,7 @@ DURATION_S, COUNTED_FROM_S = 400.0, 60.0
 GPS_M, GPS_M_S, TRACKER_RAD = 8.0, 0.5, 200.0 / 3600.0 * DEG
 BIAS_MG = 1.0
 GATE = 1.0 - 1e-12
-"""So wide that no filter hides its errors by refusing aids."""
+"""So wide that no filter hides its errors by refusing measurements."""
 TIMED_S, TIMED_REPEATS = 60, 5
 NONE = 1e-9
 IMU = Imu(
@@ -105,8 +105,8 @@ class Case:
 
 @dataclass(slots=True)
 class Trace:
-    """One filter in one run, just after each second's aids (k): errors (k, 7) phi n e d, dv n e,
-    dr n e, the filter's sigma of each (k, 7), NEES (k,)."""
+    """One filter in one run, just after each second's measurements (k): errors (k, 7) phi n e d, dv
+    n e, dr n e, the filter's sigma of each (k, 7), NEES (k,)."""
 
     error: Array
     sigma: Array
@@ -137,14 +137,16 @@ def truth() -> Truth:
 
 @lru_cache(maxsize=1)
 def epochs() -> tuple[Array, Array, Array]:
-    """Instants (k,) of the aids, true navigation states (k, 10) and roll, pitch, yaw (k, 3)."""
+    """Instants (k,) of the measurements, true navigation states (k, 10) and roll, pitch, yaw (k,
+    3)."""
     t_s: Array = np.arange(PERIOD_S, DURATION_S + 1e-9, PERIOD_S)
     return t_s, true_nav(truth(), t_s), truth().at(t_s).rpy
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """One run's errors: IMU buffer, gyro drift (k, 3) at the epochs, aids by epoch, start."""
+    """One run's errors: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch,
+    start."""
 
     buffer: ImuBuffer
     drift: Array
@@ -180,9 +182,9 @@ def draw(case: Case, seed: int, number: int) -> Drawn:
         sd, sd_v, sd_a = (GPS_M,) * 3, (GPS_M_S,) * 2, (TRACKER_RAD,) * 3
         measurements.append(
             [
-                PositionAid("gps", t, GATE, lat, lon, None, sd, arm),
-                VelocityAid("gps_velocity", t, GATE, (n, e), sd_v, arm),
-                AttitudeAid("star_tracker", t, GATE, (roll, pitch, yaw), sd_a),
+                PositionMeasurement("gps", t, GATE, lat, lon, None, sd, arm),
+                VelocityMeasurement("gps_velocity", t, GATE, (n, e), sd_v, arm),
+                AttitudeMeasurement("star_tracker", t, GATE, (roll, pitch, yaw), sd_a),
             ]
         )
     model = make_model("planar10", imu_noise(IMU))
@@ -251,8 +253,8 @@ class Spent:
 
 
 def times_per_step_us(case: Case, seed: int) -> dict[str, Spent]:
-    """Processor time of one second by filter: its IMU samples propagated, its aids fused. The
-    filters take turns, so that what else runs falls on all of them."""
+    """Processor time of one second by filter: its IMU samples propagated, its measurements fused.
+    The filters take turns, so that what else runs falls on all of them."""
     drawn = draw(case, seed, 0)
     best: dict[str, Spent] = {}
     for _ in range(TIMED_REPEATS):

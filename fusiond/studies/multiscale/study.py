@@ -2,8 +2,9 @@ r"""Study `multiscale`: paper 001's block filter against federated and centralis
 
 Standard deviations are about the mean error over all runs and counted seconds, one axis: the root
 of the axes' mean square (position and velocity north and east, attitude n, e, d), just after each
-second's aids. `*_sigma_*` is what the filter states for the same. NEES (10 degrees of freedom) is
-averaged over runs and counted seconds; `nees_interval` is that of the average over the runs at
+second's measurements. `*_sigma_*` is what the filter states for the same. NEES (10 degrees of
+freedom) is averaged over runs and counted seconds; `nees_interval` is that of the average over the
+runs at
 *one* second, `nees_inside_rate` the share of seconds at which that average lies in it
 (Bar-Shalom, Li, Kirubarajan, 2001, section 5.4.2). `std_ratio` is to the centralised filter, paired
 run by run. What is simulated: `fusiond.studies.multiscale.runs`.
@@ -37,7 +38,7 @@ from fusiond.studies.multiscale.runs import (
     times_per_step_us,
 )
 
-__all__ = ["plot", "run", "tables"]
+__all__ = ["plot", "run_study", "tables"]
 
 
 DEFAULT_RUNS = 100
@@ -96,7 +97,9 @@ def _paper() -> dict[str, Any]:
     return out
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat."""
     count = runs or DEFAULT_RUNS
     if count < 2:

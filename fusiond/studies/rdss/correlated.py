@@ -15,7 +15,7 @@ from fusiond.studies.rdss.dynamic import level_drive
 from fusiond.studies.rdss.runs import Case, Filter
 from fusiond.studies.rdss.study import plot, run_cases, tables
 
-__all__ = ["CASES", "plot", "run", "tables"]
+__all__ = ["CASES", "plot", "run_study", "tables"]
 
 DEFAULT_RUNS = 100
 FILTERS = tuple(Filter(f"bias_{sd:g}_m", "rewind", sd) for sd in (0.0, 8.0, 15.0, 30.0))
@@ -33,7 +33,9 @@ CASES = tuple(
 )
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 100) of each case."""
     head, found = run_cases("rdss-correlated", CASES, runs or DEFAULT_RUNS, seed, progress)
     variants = {case["case"]: case for case in found[1:]}

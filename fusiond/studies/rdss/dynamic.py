@@ -19,7 +19,7 @@ from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.runs import Case
 from fusiond.studies.rdss.study import add_times, plot, run_cases, tables
 
-__all__ = ["CASES", "level_drive", "plot", "run", "tables"]
+__all__ = ["CASES", "level_drive", "plot", "run_study", "tables"]
 DEFAULT_RUNS = 100
 
 
@@ -43,7 +43,9 @@ def _away(case: Case, name: str, counted_s: float) -> Case:
 CASES = (_CYCLE, _SLOW, _away(_CYCLE, "away", 60.0), _away(_SLOW, "away_slow", 120.0))
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat
     exactly."""
     head, found = run_cases("rdss-dynamic", CASES, runs or DEFAULT_RUNS, seed, progress)

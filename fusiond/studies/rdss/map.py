@@ -56,7 +56,9 @@ CENTRE_DEG = (39.9, 116.4)
 """Any place that sees both satellites does: the centre's own legs are known and drop out."""
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The map, the places, and `runs` nonlinear solutions at each place (default 2000).
 
     Cells without a fix are None, with the reason under `outcome`. All lengths in m, one sigma.

@@ -244,19 +244,19 @@ class Navigation:
             times = np.arange(self._given + 1, end + 1, dtype=np.int64) * self._period_ns
             self.imu.append(times, self._samples[self._given : end])
             self._given = end
-        self.timeline.run()
+        self.timeline.advance()
 
     def arrive(self, fixes: Fixes, k: int) -> None:
         """Fix k arrives."""
         t_ns, seen_ns = (round(t[k] * 1e9) for t in (fixes.t_s, fixes.arrival_s))
         lat, lon = (float(x) for x in fixes.position[k])
         fix = DelayedFix("rdss", seen_ns, MonotonicStamp(t_ns), lat, lon, YANTAI_DEG_M[2], CLASS_M)
-        found = self._intake.aids(fix, t_ns, 0.0, seen_ns)
+        found = self._intake.measurements_of(fix, t_ns, 0.0, seen_ns)
         if isinstance(found, str):
             raise ValueError(f"fix refused: {found}")
         for measurement in found:
             self.timeline.insert(measurement)
-        self.timeline.run()
+        self.timeline.advance()
 
     def nees(self, true: Array, biases: Array) -> tuple[float, float]:
         """NEES of all errors (12,) and of the position (2,); true state (10,), biases (6,)."""

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
-from fusiond.aiding.bearing import BearingAid
-from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
+from fusiond.aiding.bearing import BearingMeasurement
+from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import ErrorStateFilter
@@ -164,7 +164,7 @@ class Scene(NamedTuple):
         return np.concatenate([drawn[self.at, 0], drawn[self.at, 1], drawn[-1]])
 
 
-Measurements = tuple[PseudorangeAid, BearingAid]
+Measurements = tuple[PseudorangeMeasurement, BearingMeasurement]
 DRAWN = len(list(beidou_slots())) + 1
 """Pairs of noise an epoch: range and rate of each satellite, then azimuth and elevation."""
 
@@ -202,9 +202,9 @@ def _point(nav: Array, k: int) -> Vector3:
 
 
 def measurements(scene: Scene, values: Array) -> Measurements:
-    """The epoch's aids with measured `values` (rows,): ranges, rates, azimuth, elevation."""
+    """Measurements of the epoch with `values` (rows,): ranges, rates, azimuth, elevation."""
     n = len(scene.names)
-    ranges = PseudorangeAid(
+    ranges = PseudorangeMeasurement(
         "gnss",
         scene.t_ns,
         GATE,
@@ -219,7 +219,7 @@ def measurements(scene: Scene, values: Array) -> Measurements:
         ),
         np.zeros(n, dtype=np.int64),
     )
-    bearing = BearingAid(
+    bearing = BearingMeasurement(
         "sar",
         scene.t_ns,
         GATE,
@@ -235,7 +235,7 @@ def measurements(scene: Scene, values: Array) -> Measurements:
 
 
 def rows(of: Measurements, state: State) -> Innovation:
-    """The rows of both aids, one below the other."""
+    """The rows of both measurements, one below the other."""
     found = [measurement.innovation(state) for measurement in of]
     refused = [f.outcome for f in found if isinstance(f, NotApplicable)]
     if refused:

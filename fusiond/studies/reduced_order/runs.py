@@ -114,8 +114,8 @@ def live(
 ) -> Iterator[int]:
     """Fly started filters on the daemon's timeline; yields the seconds flown, after each.
 
-    `samples` (n, 6) at `rate_hz`; `given` are the aids of each second. ValueError for an aid that
-    is not fused.
+    `samples` (n, 6) at `rate_hz`; `given` are the measurements of each second. ValueError for a
+    measurement that is not fused.
     """
     count = round(rate_hz)
     times = np.arange(1, len(samples) + 1, dtype=np.int64) * round(1e9 / rate_hz)
@@ -130,10 +130,10 @@ def live(
         for timeline in timelines:
             timeline.imu.append(times[second], samples[second])
             entries = [timeline.insert(measurement) for measurement in measurements]
-            timeline.run()
+            timeline.advance()
             for entry in entries:
                 if entry.outcome is None or entry.outcome.name != "fused":
-                    raise ValueError(f"{entry.aid.source} at {k + 1} s: {entry.outcome}")
+                    raise ValueError(f"{entry.measurement.source} at {k + 1} s: {entry.outcome}")
         yield k + 1
 
 

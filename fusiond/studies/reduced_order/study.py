@@ -59,7 +59,9 @@ CHECKED_S = 100
 """Errors of the live filters are taken at every 100th second."""
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study; `runs` (default 40) live flights of 600 s check the covariance analysis.
 
     All but times repeat exactly.
@@ -74,14 +76,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     advance()
     variants = {}
     for variant, (sd, tau_s) in VARIANTS.items():
-        of = flight.filters(sd, tau_s)
-        # How well a constant is known changes the start alone.
-        found = _analysis(of, systems if math.isinf(tau_s) else _systems(of))
-        variants[variant] = {
-            "sar_misalignment_sd_arcsec": sd / flight.ARC_SECOND,
-            "models": {name: _sigmas(found[name]) for name in of},
-            "observability": _observability(found["23"]),
-        }
+        variants[variant] = _variant(systems, sd, tau_s)
         advance()
     at_rest = rest.found()
     advance()
@@ -129,6 +124,19 @@ class Analysed:
     def __init__(self, of: Model, kept: NDArray[np.int64], systems: list[System]) -> None:
         self.model, self.kept, self.systems = of, kept, systems
         self.results: list[Result] = []
+
+
+def _variant(known: dict[str, list[System]], sd: float, tau_s: float) -> dict[str, Any]:
+    """Results with a SAR misalignment of `sd` (rad) that changes with `tau_s`; `known` are the
+    systems of a constant one."""
+    of = flight.filters(sd, tau_s)
+    # How well a constant is known changes the start alone.
+    found = _analysis(of, known if math.isinf(tau_s) else _systems(of))
+    return {
+        "sar_misalignment_sd_arcsec": sd / flight.ARC_SECOND,
+        "models": {name: _sigmas(found[name]) for name in of},
+        "observability": _observability(found["23"]),
+    }
 
 
 def _systems(models: dict[str, Model]) -> dict[str, list[System]]:

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from fusiond.aiding.base import Aid, NotApplicable
-from fusiond.aiding.height import HeightAid
-from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid, epoch_values
+from fusiond.aiding.base import AidingMeasurement, NotApplicable
+from fusiond.aiding.height import HeightMeasurement
+from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeMeasurement, epoch_values
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -121,7 +121,8 @@ PROBLEMS = (
 @dataclass(slots=True)
 class Trace:
     """One filter in one run: horizontal error (m) at each epoch, NEES after the first epoch and
-    every `NEES_EVERY_S` seconds, whether it has converged, and rows or aids that were refused.
+    every `NEES_EVERY_S` seconds, whether it has converged, and rows or measurements that were
+    refused.
 
     Converged: over the last `LAST_S` the horizontal RMS is at most one sigma of what a single
     epoch's measurements give without an INS."""
@@ -181,8 +182,8 @@ def _geostationary() -> Array:
 def _dop(position: Array) -> tuple[float, float]:
     """PDOP and HDOP of satellites (n, 3) with one clock, at the origin."""
     lat, lon, height = ORIGIN_DEG_M
-    apart = position - np.array(to_ecef(lat * DEG, lon * DEG, height))
-    unit = apart / np.linalg.norm(apart, axis=1)[:, None] @ ned_axes(lat * DEG, lon * DEG)
+    range_m = position - np.array(to_ecef(lat * DEG, lon * DEG, height))
+    unit = range_m / np.linalg.norm(range_m, axis=1)[:, None] @ ned_axes(lat * DEG, lon * DEG)
     g = np.column_stack([unit, np.ones(len(unit))])
     if np.linalg.cond(g) > 1e6:
         return math.inf, math.inf
@@ -215,22 +216,24 @@ def draw_clock(rng: np.random.Generator) -> tuple[Array, Array]:
     return offset, drift
 
 
-def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Aid]], float]:
+def _pseudoranges(
+    rng: np.random.Generator, number: int
+) -> tuple[list[list[AidingMeasurement]], float]:
     names, position, velocity = _satellites()
     chosen, hdop = draw_satellites(rng, number)
     offset, drift = draw_clock(rng)
     t_s = epochs(PROBLEMS[2])
     _, place, moving = _true_states(PROBLEMS[2].every_s)
     n = len(chosen)
-    found: list[list[Aid]] = []
+    found: list[list[AidingMeasurement]] = []
     for k, t in enumerate(t_s):
         sample = round(t * IMU.rate_hz) - 1
-        apart = position[k, chosen] - place[k + 1]
-        distance = np.linalg.norm(apart, axis=1)
-        along = (apart / distance[:, None] * (velocity[k, chosen] - moving[k + 1])).sum(axis=1)
+        range_m = position[k, chosen] - place[k + 1]
+        distance = np.linalg.norm(range_m, axis=1)
+        along = (range_m / distance[:, None] * (velocity[k, chosen] - moving[k + 1])).sum(axis=1)
         found.append(
             [
-                PseudorangeAid(
+                PseudorangeMeasurement(
                     "raw",
                     round(t * 1e9),
                     GATE,
@@ -251,13 +254,13 @@ def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Aid]
     return found, hdop * RANGE_SD_M
 
 
-def _double_star(rng: np.random.Generator) -> tuple[list[list[Aid]], float]:
+def _double_star(rng: np.random.Generator) -> tuple[list[list[AidingMeasurement]], float]:
     satellites, nothing = _geostationary(), np.full(2, np.nan)
     lat, lon, height = ORIGIN_DEG_M
     fix = RdssGeometry().covariance(lat * DEG, lon * DEG, height, SLANT_SD_M, HEIGHT_SD_M)
     assert not isinstance(fix, NotApplicable)
     nav, place, _ = _true_states(PROBLEMS[0].every_s)
-    found: list[list[Aid]] = []
+    found: list[list[AidingMeasurement]] = []
     for k, t in enumerate(epochs(PROBLEMS[0])):
         t_ns = round(t * 1e9)
         slant = np.linalg.norm(satellites - place[k + 1], axis=1)
@@ -266,7 +269,7 @@ def _double_star(rng: np.random.Generator) -> tuple[list[list[Aid]], float]:
         ranges = np.array([0.5 * paths[0], paths[1] - 0.5 * paths[0]])
         found.append(
             [
-                PseudorangeAid(
+                PseudorangeMeasurement(
                     "rdss",
                     t_ns,
                     GATE,
@@ -282,7 +285,7 @@ def _double_star(rng: np.random.Generator) -> tuple[list[list[Aid]], float]:
                     np.full(2, NO_CLOCK),
                     LEVER,
                 ),
-                HeightAid(
+                HeightMeasurement(
                     "height",
                     t_ns,
                     GATE,
@@ -340,7 +343,7 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
 
 
 def _refused(entry: Entry) -> int:
-    """Rows of an aid that was applied that were refused; all of an aid counts once."""
+    """Rows of an applied measurement that were refused; a whole measurement counts once."""
     outcome = entry.outcome
     if outcome is None or outcome.name != "fused":
         return 1

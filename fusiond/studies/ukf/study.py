@@ -45,7 +45,9 @@ PAPER = {
 }
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 50) of each problem. Repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:

@@ -27,8 +27,8 @@ from drivers.immutable import immutable
 from drivers.measurements import Height, MonotonicStamp, PositionFix, WheelSpeed
 from drivers.rounding import SHARED_SD, rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
-from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
+from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
 from fusiond.models.model import Model
@@ -99,13 +99,13 @@ def configuration(**imu: Any) -> Config:
 
 
 @immutable()
-class SlippingAid(NonHolonomicAid):
+class SlippingConstraint(NonHolonomicConstraint):
     """The constraint on a vehicle that slides by `slip` (right, down; m/s), drift and noise."""
 
     slip: tuple[float, float] = (0.0, 0.0)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        found = NonHolonomicAid.innovation(self, state)
+        found = NonHolonomicConstraint.innovation(self, state)
         if isinstance(found, NotApplicable):
             return found
         return found._replace(z=found.z + np.array(self.slip))
@@ -122,7 +122,7 @@ class Car:
 
     truth: Truth
     samples: Array
-    measurements: list[Aid]
+    measurements: list[AidingMeasurement]
     true: dict[str, Array]
     turn: Array
 
@@ -150,10 +150,10 @@ def draw_car(config: Config, path: Path, seconds: float, rng: np.random.Generato
     measured += _fixes(config, truth, turn, true, rng)
     measured += _speeds(wheel, truth, true, rng)
     measured += _pressures(config.aiding["barometer"], truth, true, rng)
-    measurements: list[Aid] = []
+    measurements: list[AidingMeasurement] = []
     for m in measured:
         assert isinstance(m.stamp, MonotonicStamp)
-        found = intake.aids(m, m.stamp.t_ns, 0.0)
+        found = intake.measurements_of(m, m.stamp.t_ns, 0.0)
         assert not isinstance(found, str), found
         measurements += found
     measurements += _slips(config, truth, true, rng)
@@ -178,11 +178,11 @@ def _fixes(
     t_s = np.arange(0.503, truth.duration_s - 0.5, 1.0)
     n = len(t_s)
     rest = rng.standard_normal(3) * o.lever_arm_sd_m
-    late, late_v = (_walk(n, 1.0, o.time_offset_sd_s, TIME_WALK_S_SQRT_S, rng) for _ in range(2))
-    true |= {ANTENNA_LEVER: rest, FIX_TIME: late[-1:], VELOCITY_TIME: late_v[-1:]}
+    delay, delay_v = (_walk(n, 1.0, o.time_offset_sd_s, TIME_WALK_S_SQRT_S, rng) for _ in range(2))
+    true |= {ANTENNA_LEVER: rest, FIX_TIME: delay[-1:], VELOCITY_TIME: delay_v[-1:]}
     x, y, z = (float(v) for v in turn @ (np.array(o.lever_arm_m) + rest))
-    place = truth.at(t_s + late, (x, y, z))
-    v = truth.at(t_s + late_v, (x, y, z)).v_ned
+    place = truth.at(t_s + delay, (x, y, z))
+    v = truth.at(t_s + delay_v, (x, y, z)).v_ned
     v = v + rng.standard_normal((n, 3)) * FIX_VELOCITY_SD_M_S
     found: list[Measured] = []
     noise = rng.standard_normal((n, 3)) * FIX_SD_M
@@ -213,17 +213,17 @@ def _speeds(
     t_s = np.arange(0.21, truth.duration_s - 0.5, 1.0 / WHEEL_HZ)
     n = len(t_s)
     scale, share = rng.standard_normal() * o.scale_sd, rng.standard_normal() * SHARED_SD
-    late = _walk(n, 1.0 / WHEEL_HZ, o.latency_sd_s, TIME_WALK_S_SQRT_S, rng)
+    delay = _walk(n, 1.0 / WHEEL_HZ, o.latency_sd_s, TIME_WALK_S_SQRT_S, rng)
     drift = gauss_markov(
         rng, (n, 1), step_s=1.0 / WHEEL_HZ, correlation_s=o.drift_s, sigma=o.drift_sd_m_s
     )[:, 0]
     true |= {
         WHEEL_SCALE: np.array([scale]),
         WHEEL_ROUNDING: np.array([share]),
-        WHEEL_LATENCY: late[-1:],
+        WHEEL_LATENCY: delay[-1:],
         WHEEL_DRIFT: drift[-1:],
     }
-    states = truth.at(t_s - late)
+    states = truth.at(t_s - delay)
     forward = np.einsum("nij,ni->nj", dcm_from_rpy(states.rpy), states.v_ned)[:, 0]
     says = (1.0 + scale) * forward + drift + rng.standard_normal(n) * o.sd_m_s
     says = np.where(forward > STANDS_M_S, says, 0.0)
@@ -263,7 +263,7 @@ def _pressures(
 
 def _slips(
     config: Config, truth: Truth, true: dict[str, Array], rng: np.random.Generator
-) -> list[Aid]:
+) -> list[AidingMeasurement]:
     o = config.constraints.non_holonomic
     t_s = np.arange(0.1, truth.duration_s - 0.1, 1.0 / SLIP_HZ)
     n = len(t_s)
@@ -274,7 +274,7 @@ def _slips(
     noise = rng.standard_normal((n, 2)) * (o.sd_m_s, o.sd_down_m_s)
     noise[:, :1] += drift
     return [
-        SlippingAid(
+        SlippingConstraint(
             "non_holonomic",
             round(t * 1e9),
             GATE,

@@ -46,7 +46,7 @@ PATHS = {"shown": (shown, SHOWN_S), "hidden": (hidden, HIDDEN_S)}
 
 
 def model_of(config: Config) -> Model:
-    """The error state, with the blocks of the vehicle and of its aids."""
+    """The error state, with the blocks of the vehicle and of its measurements."""
     blocks = vehicle_blocks(config.constraints.non_holonomic)
     blocks += Intake(config.aiding).extra_blocks()
     return make_model(config.estimator.model, imu_noise(config.imu), *blocks)
@@ -55,7 +55,7 @@ def model_of(config: Config) -> Model:
 @dataclass(frozen=True, slots=True)
 class Run:
     """At the end: by block its error (k,), one sigma and prior (k,), and the joint NEES; outcomes
-    of the aids."""
+    of the measurements."""
 
     errors: dict[str, Array]
     sigmas: dict[str, Array]

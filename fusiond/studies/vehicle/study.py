@@ -68,7 +68,9 @@ def rows_of(case: str, runs: list[Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def run_study(
+    runs: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
     """`runs` cars a case. The same arguments give the same result."""
     count = runs or DEFAULT_RUNS
     step = step_counter(progress, count * len(CASES))
@@ -76,13 +78,13 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     for case in CASES:
         blocks += rows_of(case, on_processes(partial(_one, case, seed), count, step))
     wrong = [f"{r['block']} ({r['case']}) {r['nees']:.1f}" for r in blocks if not r["honest"]]
-    told = f"outside: {', '.join(wrong)}" if wrong else "none outside"
+    verdict = f"outside: {', '.join(wrong)}" if wrong else "none outside"
     return {
         "study": "vehicle",
         "runs": count,
         "seed": seed,
         "blocks": blocks,
-        "finding": f"{len(blocks) - len(wrong)} of {len(blocks)} inside their 99 %; {told}",
+        "finding": f"{len(blocks) - len(wrong)} of {len(blocks)} inside their 99 %; {verdict}",
     }
 
 

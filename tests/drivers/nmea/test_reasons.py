@@ -253,7 +253,7 @@ def test_a_sentence_that_stands_in_for_one_with_a_bad_field_says_so() -> None:
 
 def test_names_of_nonsense_are_bounded() -> None:
     one = fed(wire(*(made(f"GP{a}{b}X,1") for a in "ABCDEFGH" for b in "ABCDEFGH")))
-    assert len(one.heard.unused) == MOST_NAMES
+    assert len(one.received.unused) == MOST_NAMES
     assert len(one.cause) < 200
 
 

@@ -392,8 +392,8 @@ def test_rtcm_without_any_date_is_refused_by_name() -> None:
     decoder = RawDecoder("gnss")
     frames = [f for f in StreamSplitter().feed(stream) if isinstance(f, Frame)]
     msm = [f for f in frames if int.from_bytes(f.raw[3:5], "big") >> 4 == 1127]
-    assert [event for f in msm for event in decoder.take(f, 0)] + decoder.flush() == []
+    assert [event for f in msm for event in decoder.decode(f, 0)] + decoder.flush() == []
     assert decoder.counters["week_unknown"] == 1
     decoder.note_utc(1_710_347_000_000_000_000)  # 2024-03-13
-    found = [event for f in msm for event in decoder.take(f, 0)] + decoder.flush()
+    found = [event for f in msm for event in decoder.decode(f, 0)] + decoder.flush()
     assert [e.week for e in found if isinstance(e, RawGnssEpoch)] == [2305]

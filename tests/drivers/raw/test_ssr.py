@@ -202,7 +202,7 @@ def test_a_casters_corrections_go_to_the_receiver_and_to_fusiond(tmp_path: Path)
     def keep(kind: str, t_ns: int, payload: Any) -> None:
         heard.append(input_record(0, kind, t_ns, payload))
 
-    driver.inputs.heard = keep
+    driver.inputs.on_input = keep
     driver.inputs.take("read", rawx(measurement(), week=2440, tow_s=TOW_S + 3.0))
     for each in (frame, station):
         assert driver._pass_on(each) is False  # the line is not open

@@ -16,7 +16,7 @@ from fusiond.simulation.scenarios import Scenario
 from fusiond.simulation.vehicle import Device, SimulatedVehicle
 
 
-class Pulled(NamedTuple):
+class Unplugged(NamedTuple):
     """A device without its plug, s since the start; every so many s again (0: once)."""
 
     device: Device
@@ -32,13 +32,13 @@ class Pulled(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Play:
+class DemoSetup:
     """A demo. `config` has all but devices and broker; `scenario` fits it; `paper`: of which."""
 
     config: Config
     scenario: Scenario
     devices: tuple[Device, ...]
-    pulled: Pulled | None = None
+    pulled: Unplugged | None = None
     raw: RawFormat | None = None
     aligning: str = "the car stands, then drives off: heading comes of the first motion"
     paper: dict[str, Any] = field(default_factory=dict)

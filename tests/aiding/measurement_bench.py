@@ -1,4 +1,5 @@
-"""What the tests of the aids share: a model, a state with rates and accelerations, two aids."""
+"""What the tests of the measurements share: a model, a state with rates and accelerations, two
+measurements."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, State
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
+from fusiond.aiding.position import PositionMeasurement
+from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.blocks import position_bias
@@ -28,7 +29,7 @@ from fusiond.models.vehicle import (
     antenna_lever,
     axle_lever,
     drift,
-    fix_wander,
+    fix_markov_block,
     mounting,
     time_offset,
     wheel_rounding,
@@ -43,18 +44,18 @@ Array = NDArray[np.float64]
 SOURCE = ("aid", 0, 0.99)
 LEVER = (1.3, -0.4, -2.1)
 FIX_BIAS = ("gnss_bias", "gnss_bias_down")
-FIX_WANDER = "gnss_wander"
+FIX_MARKOV = "gnss_wander"
 RATE_SENSED = np.array([0.05, -0.03, 0.4])
 VELOCITY = (12.0, -7.0, 0.8)
 RPY = (0.08, -0.12, 2.3)
 
 
-def aid_model(name: str) -> Model:
+def measurement_model(name: str) -> Model:
     biases = (
         position_bias(BIAS_BLOCK, 30.0, 600.0),
         position_bias(FIX_BIAS[0], 1.5, 1800.0),
         position_bias(FIX_BIAS[1], 5.0, 1800.0, "d"),
-        fix_wander(FIX_WANDER, 30.0),
+        fix_markov_block(FIX_MARKOV, 30.0),
     )
     return make_model(name, imu_noise(Imu()), *biases)
 
@@ -101,18 +102,22 @@ def state_of(model: Model, nav: Array, xi: Array) -> State:
     return State(nav, xi, step, model)
 
 
-def innovation_of(aid: Linearised, state: State) -> Innovation:
-    found = aid.innovation(state)
+def innovation_of(measurement: Linearised, state: State) -> Innovation:
+    found = measurement.innovation(state)
     assert isinstance(found, Innovation)
     return found
 
 
-def position_aid(nav: Array, height: bool = True) -> PositionAid:
+def position_measurement(nav: Array, height: bool = True) -> PositionMeasurement:
     lat, lon, up = (float(x) for x in nav[:3])
     sd = (1.0, 2.0, 3.0)
-    return PositionAid(*SOURCE, lat + 1e-6, lon - 2e-6, up + 3.0 if height else None, sd, LEVER)
+    return PositionMeasurement(
+        *SOURCE, lat + 1e-6, lon - 2e-6, up + 3.0 if height else None, sd, LEVER
+    )
 
 
-def rdss_aid(nav: Array, moved_s: float = 0.0) -> RdssPositionAid:
+def rdss_measurement(nav: Array, moved_s: float = 0.0) -> RdssPositionMeasurement:
     lat, lon = float(nav[0]) + 1e-6, float(nav[1]) - 2e-6
-    return RdssPositionAid(*SOURCE, lat, lon, (400.0, -150.0, 200.0), LEVER, moved_s=moved_s)
+    return RdssPositionMeasurement(
+        *SOURCE, lat, lon, (400.0, -150.0, 200.0), LEVER, moved_s=moved_s
+    )

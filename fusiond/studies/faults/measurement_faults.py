@@ -1,4 +1,4 @@
-"""Faults of what aids the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
+"""Faults of what measurements the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
 
 from __future__ import annotations
 
@@ -169,8 +169,9 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def late(r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S) -> Recording:
-    """Fixes that are older than their stamps, as of a line that is slow from its first byte on and
-    a receiver whose time nobody knows."""
+    """Fixes that are older than their stamps.
+
+    As of a line that is slow from its first byte on, and a receiver whose time nobody knows."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
     ns = round(late_s * 1e9)
     return r.with_received(
@@ -299,7 +300,7 @@ def rdss_step(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def rdss_nan(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The latitude of RDSS fixes is not a number."""
+    """RDSS fixes whose latitude is not a number."""
     return _changed(r, begin_s, length_s, DelayedFix, lambda fix, _: replace(fix, lat_rad=math.nan))
 
 
@@ -332,7 +333,7 @@ def wheels_locked(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _wheels_times(r, begin_s, length_s, 0.0)
 
 
-def wheels_late(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
+def wheels_delayed(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
     """Speeds that are older than their stamps."""
     ns = round(late_s * 1e9)
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9

@@ -150,8 +150,8 @@ def test_the_order_in_which_headings_and_speeds_come_leaves_no_trace() -> None:
             if m.t_seen_ns <= said[-1].t_ns:
                 navigator.add(m, m.t_seen_ns, 0.0, said[-1].t_ns)
         navigator.tick(said[-1].t_ns)
-        serving = navigator.serving
-        ends.append((serving.nav.copy(), serving.covariance.copy()))
+        active_filter = navigator.active_filter
+        ends.append((active_filter.nav.copy(), active_filter.covariance.copy()))
     # But for the Coriolis force of samples that were made before a heading came.
     assert np.abs(runs.nav_error(ends[0][0], ends[1][0])[3:]).max() < 5e-3
     assert np.allclose(ends[0][1], ends[1][1], rtol=1e-4, atol=1e-9)

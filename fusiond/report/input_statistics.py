@@ -37,7 +37,7 @@ from fusiond.recording.records import (
     input_of,
     tick_of,
 )
-from fusiond.report.run import ImuLook
+from fusiond.report.run import ImuStatistics
 
 WHOLE_S, EVERY_S, STRETCH_S = 60.0, 60.0, 10.0
 _SEGMENT_S = 4.0
@@ -46,7 +46,7 @@ _TRIAL = 200
 """Inputs after which a driver that has given no inertial sample is none of an inertial unit."""
 
 
-class InputLook:
+class InputStatistics:
     """Takes the input's records in order; `folder` is for the log's DBC files while it does."""
 
     def __init__(self, about: About, folder: Path) -> None:
@@ -75,7 +75,7 @@ class InputLook:
         table = np.array(self._tick_delays, dtype=np.int64)
         return (table[:, 0] + self._epoch_ns) / SECOND_NS, table[:, 1] / MILLISECOND_NS
 
-    def imu(self) -> ImuLook | None:
+    def imu(self) -> ImuStatistics | None:
         """The source with the most inertial samples; None where there is none."""
         return self._units.look(self._epoch_ns)
 
@@ -132,7 +132,7 @@ class _Units:
         if isinstance(item, ImuSample):
             self._samples.setdefault(item.source, []).append((self._stretch, item))
 
-    def look(self, epoch_ns: int) -> ImuLook | None:
+    def look(self, epoch_ns: int) -> ImuStatistics | None:
         if not self._samples:
             return None
         source, found = max(self._samples.items(), key=lambda pair: len(pair[1]))
@@ -146,7 +146,7 @@ class _Units:
         stamped_ms = np.diff(stamps_ns) / MILLISECOND_NS
         step_s = float(np.median(stamped_ms[same])) * 1e-3
         frequency, density = spectrum(values, stretch, step_s)
-        return ImuLook(
+        return ImuStatistics(
             source=source,
             t_s=(seen_ns[1:] + epoch_ns) / SECOND_NS,
             stamped_ms=np.where(same, stamped_ms, np.nan),
@@ -160,7 +160,7 @@ class _Units:
 
 
 def _instant_ns(stamp: Stamp, t_seen_ns: int) -> int:
-    """The stamp on its own time axis: only differences are looked at."""
+    """Stamp on its own time axis, of which only differences count."""
     match stamp:
         case DeviceStamp():
             return stamp.ticks_ns

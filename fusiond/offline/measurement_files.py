@@ -1,4 +1,4 @@
-"""Files of aids as measurements with their arrivals: `fusiond process --aid KIND=FILE`."""
+"""Files of measurements with their arrivals: `fusiond process --aid KIND=FILE`."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
     The kind of the file (`gnss` for those of a receiver, `sar` for `bearing`), or else the first
-    section of that kind of aid in the configuration; an attitude is a star tracker's where there is
-    one and no [aiding.attitude], raw data are of the section of kind `raw`.
+    section of that kind of measurement in the configuration; an attitude is a star tracker's where
+    there is one and no [aiding.attitude], raw data are of the section of kind `raw`.
     """
     name = "gnss" if kind in OF_A_RECEIVER else {"bearing": "sar"}.get(kind, kind)
     if name in config.aiding or kind in config.aiding:
@@ -255,8 +255,8 @@ def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     posix = len(imu.t_s) and not of_week
     imu_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if posix else None
-    heard, refused = read_nmea(path, imu_s, by)
-    return [Arrival(each.t_ns, each.measurement, utc_ns=each.utc_ns) for each in heard], refused
+    received, refused = read_nmea(path, imu_s, by)
+    return [Arrival(each.t_ns, each.measurement, utc_ns=each.utc_ns) for each in received], refused
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def story(
+def outage_report(
     t_s: Array, error_m: Array, sigma_m: Array, outages: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
-    """One sentence an outage that the solution lived through.
+    """One sentence for each outage that the solution bridged.
 
     `t_s`, `error_m` and `sigma_m` (n,): instants, true horizontal errors, and their stated one
     sigma (root of the sum of both variances). `outages` begin and end on the same clock.
