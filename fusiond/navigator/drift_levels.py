@@ -45,7 +45,7 @@ from fusiond.navigator.noise_share import COUNTS_NS, EVERY_NS
 Array = NDArray[np.float64]
 
 TYPED = (SIDE_DRIFT, WHEEL_DRIFT, DISTURBANCE)
-"""What the names of their blocks begin with."""
+"""Beginnings of the names of their blocks."""
 GRID: Final = 4.0 ** np.arange(-3.0, 0.1, 0.25)
 """Levels: all of the variance, down to an eighth of the sigma."""
 FIRST = 2.0

@@ -57,7 +57,7 @@ class Sections:
         self.fixes_shown: Mapping[str, tuple[float, ...]] = {}
         """The same of another drive, by `shown_as`."""
         self.drifts: DriftLevels | None = None
-        """How much of typed drifts counts; without it all does."""
+        """Levels of typed drifts; without them all of each counts."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
@@ -68,7 +68,7 @@ class Sections:
         """By source and maker: what the sections alone say of it, for all that comes of it."""
 
     def drift_counts(self, block: str, t_ns: int) -> float:
-        """How much of a typed drift counts for a measurement of `t_ns`."""
+        """Factor of a typed drift that counts for a measurement of `t_ns`."""
         return 1.0 if self.drifts is None else self.drifts.counts(block, t_ns)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
