@@ -5,18 +5,19 @@ vehicle's by the mounting m:
 
     u = exp[m x] (C^T v + w x l),     l = l_0 + (l_x, 0, 0)
 
-    no slip:      0 = u_right - s,   0 = u_down
-    wheel speed:  y = (1 + k) (u_forward - a_forward tau) + s_w - q sign(y) p
+    no slip:      0 = u_right - c s,   0 = u_down
+    wheel speed:  y = (1 + k) (u_forward - a_forward tau) + c s_w - q sign(y) p
 
 m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
 seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the share p of a
 step q that its rounding takes off are estimated where the model has their blocks
-(fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed minus true, parameters true
-minus estimated, and e_i the axis's unit vector:
+(fusiond.models.vehicle). c is what share of a typed drift counts, as the vehicle has shown
+(fusiond.navigator.drift_levels). With z = h(x^) - y, navigation errors computed minus true,
+parameters true minus estimated, and e_i the axis's unit vector:
 
-    z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
+    z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
-        - tau e_i exp[m x] (e - C^T [g x] phi)) - ds_w + q sign(y) dp + v                 (wheel)
+        - tau e_i exp[m x] (e - C^T [g x] phi)) - c ds_w + q sign(y) dp + v               (wheel)
 
 a_forward = f + C^T g is smoothed, e what its force is wrong by (fusiond.aiding.preintegration): one
 sample of a shaken sensor would make the latency look smaller than it is.
@@ -73,7 +74,7 @@ FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
 _UNKNOWN = np.zeros((0, 0))
-_NO_SLIP_BODY, _SPEED_BODY = Struct("<6d6q"), Struct("<6d9q")
+_NO_SLIP_BODY, _SPEED_BODY = Struct("<7d6q"), Struct("<7d9q")
 
 
 @lru_cache(maxsize=64)
@@ -93,7 +94,7 @@ def _estimate(xi: Array, slot: int) -> float:
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], i8, f8[::1], f8[:, ::1])",
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, i8, f8[::1],f8[:, ::1])",
     allocates=True,
 )
 def _rows(
@@ -106,6 +107,7 @@ def _rows(
     l1: float,
     l2: float,
     slot: Indices,
+    drifts: float,
     first: int,
     z: Array,
     h: Array,
@@ -171,8 +173,8 @@ def _rows(
         if slot[LEVER] >= 0:
             h[i, slot[LEVER]] = t2 * turning(step, 1) - t1 * turning(step, 2)
         if axis == RIGHT and slot[DRIFT] >= 0:
-            z[i] -= xi[slot[DRIFT]]
-            h[i, slot[DRIFT]] = 1.0
+            z[i] -= drifts * xi[slot[DRIFT]]
+            h[i, slot[DRIFT]] = drifts
         if axis == FORWARD:
             z[i] -= delay_s * a0
             h[i, 0] += delay_s * b * g
@@ -187,12 +189,12 @@ def _rows(
                 h[i, slot[SCALE]] = -z[i]
             z[i] *= gain
             if slot[DRIFT] >= 0:
-                z[i] += xi[slot[DRIFT]]
-                h[i, slot[DRIFT]] = -1.0
+                z[i] += drifts * xi[slot[DRIFT]]
+                h[i, slot[DRIFT]] = -drifts
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8, i8[::1],"
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8, f8, i8[::1],"
     "f8[::1], f8[::1], f8[:, ::1], f8[::1])",
     allocates=True,
 )
@@ -206,6 +208,7 @@ def speed_rows(
     l1: float,
     l2: float,
     slot: Indices,
+    drifts: float,
     speed: float,
     variance: float,
     rounded: float,
@@ -218,7 +221,7 @@ def speed_rows(
     """Write z (1,), H (1, n) and r (1,) of a wheel's `speed` with that variance. `rounding` (0 or
     1,): the slot of the share of a step `rounded` (m/s; 0: none) that its rounding takes off, of
     whose sigma at the start, `initial` (n,), the variance is rid."""
-    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, FORWARD, z, h)
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, FORWARD, z, h)
     z[0] -= speed
     r[0] = variance
     if rounded != 0.0:
@@ -230,7 +233,8 @@ def speed_rows(
 
 
 @compiled(
-    "f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[:, :], f8[::1],f8[:, ::1])"
+    "f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8[:, :], f8[::1],"
+    "f8[:, ::1])"
 )
 def direction_of(
     nav: Array,
@@ -242,13 +246,14 @@ def direction_of(
     l1: float,
     l2: float,
     slot: Indices,
+    drifts: float,
     p: Array,
     z: Array,
     h: Array,
 ) -> float:
     """Sign of the forward velocity of a filter with P (n, n), or (0, 0) where none is known; 0
     where it is not beyond `SIGN_SIGMAS` of its sigma. z (1,) and H (1, n) are used up."""
-    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, FORWARD, z, h)
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, FORWARD, z, h)
     variance = 0.0
     for i in range(p.shape[0]):
         if h[0, i] != 0.0:
@@ -260,7 +265,7 @@ def direction_of(
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8[::1],"
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8, f8[::1],"
     "f8[:, ::1], f8[::1])"
 )
 def no_slip_rows(
@@ -273,6 +278,7 @@ def no_slip_rows(
     l1: float,
     l2: float,
     slot: Indices,
+    drifts: float,
     sd: float,
     sd_down: float,
     z: Array,
@@ -280,7 +286,7 @@ def no_slip_rows(
     r: Array,
 ) -> None:
     """Write z (m,), H (m, n) and r (m,) of no velocity to the right, and down."""
-    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, RIGHT, z, h)
     r[0] = sd * sd
     if r.shape[0] > 1:
         r[1] = sd_down * sd_down
@@ -289,7 +295,7 @@ def no_slip_rows(
 @immutable()
 class NonHolonomicConstraint(AidingMeasurement):
     """No sideways (sigma `sd_m_s`) or vertical velocity (`sd_down_m_s`) at `lever`, above
-    `min_speed_m_s`."""
+    `min_speed_m_s`; the side drift of the model counts `drift_counts` times."""
 
     constraint: ClassVar[bool] = True
     no_slip: ClassVar[bool] = True
@@ -298,6 +304,7 @@ class NonHolonomicConstraint(AidingMeasurement):
     sd_down_m_s: float
     min_speed_m_s: float
     lever: Vector3
+    drift_counts: float = 1.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
@@ -306,13 +313,14 @@ class NonHolonomicConstraint(AidingMeasurement):
         at = state.nav, state.step, state.xi, model.column_of, model.hold_height
         m = 1 if model.hold_height else 2  # right, down
         rows = state.lent.get(m) or Innovation.unwritten(m, model.size)
-        no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
+        noise = self.drift_counts, self.sd_m_s, self.sd_down_m_s
+        no_slip_rows(*at, *self.lever, slots, *noise, *rows)
         return rows
 
     def packed(self, model: Model) -> Packed | None:
         slots = _slots(model, SIDE_DRIFT).tolist()
         sd = self.sd_m_s, self.sd_down_m_s, self.min_speed_m_s
-        body = _NO_SLIP_BODY.pack(*self.lever, *sd, *slots)
+        body = _NO_SLIP_BODY.pack(*self.lever, *sd, self.drift_counts, *slots)
         return Packed(NO_SLIP, 1 if model.hold_height else 2, body)
 
 
@@ -321,7 +329,8 @@ class WheelSpeedMeasurement(AidingMeasurement):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
     `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says
     of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not. `drifts`: sigma (m/s)
-    and correlation time (s) of what the block `drift` estimates, for tests without a filter.
+    and correlation time (s) of what the block `drift` estimates, for tests without a filter; that
+    counts `drift_counts` times.
 
     Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
     is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
@@ -341,6 +350,7 @@ class WheelSpeedMeasurement(AidingMeasurement):
     rounding: str = ""
     shared_step_m_s: float = 0.0
     drifts: tuple[float, float] = STEADY
+    drift_counts: float = 1.0
 
     def without_attitude(self, way: HeadingHistory) -> GroundSpeed:
         return GroundSpeed(
@@ -353,7 +363,8 @@ class WheelSpeedMeasurement(AidingMeasurement):
         nav, xi, step, model, p, lent = state
         slots = _slots(model, self.drift, self.scale, self.latency)
         speed = self.speed_m_s
-        at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
+        known = model.column_of, model.hold_height, *self.lever, slots, self.drift_counts
+        at = nav, step, xi, *known
         rows = lent.get(1) or Innovation.unwritten(1, model.size)
         if not self.signed:
             z, h, _ = rows
@@ -367,7 +378,7 @@ class WheelSpeedMeasurement(AidingMeasurement):
 
     def packed(self, model: Model) -> Packed | None:
         slots = _slots(model, self.drift, self.scale, self.latency).tolist()
-        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
+        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s, self.drift_counts
         names = (self.rounding,)
         rounding = model.listed.get(names) or model.list_slots(names, (1,))
         body = _SPEED_BODY.pack(*self.lever, *measured, bool(self.signed), *slots, *rounding)

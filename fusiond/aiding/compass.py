@@ -5,7 +5,8 @@ r"""Heading of a compass: magnetic, and bent by the vehicle it is in.
 D is the declination where the vehicle is. a (mounting, and what the field's model is wrong by) and
 b, c (the vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d is
 what lasts for some seconds (bridges, vehicles beside, currents of the own), a first-order
-Gauss-Markov process; v is white. The measurement is psi_m + D:
+Gauss-Markov process, of which as much counts as the compass has shown
+(fusiond.navigator.drift_levels); v is white. The measurement is psi_m + D:
 
     z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev
 
@@ -48,16 +49,22 @@ def disturbance(name: str, sd_rad: float, lasts_s: float) -> Block:
 class CompassMeasurement(HeadingMeasurement):
     """A compass's heading with the declination added (rad), `sd_rad` of its white noise;
     `deviation` and `disturbance` name the model's blocks of the rest, of which one sigma in all is
-    `lasting_sd_rad`."""
+    `lasting_sd_rad`; the latter counts `disturbed` times."""
 
     deviation: str
     disturbance: str
     lasting_sd_rad: float
+    disturbed: float = 1.0
+
+    @property
+    def _by(self) -> tuple[float, float, float, float]:
+        """By how much each state turns it."""
+        return lasting(self.yaw_rad, self.disturbed)
 
     def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
         own = self.source, self.t_ns, self.gate, self.yaw_rad, self.sd_rad, way.slips_m_s
-        blocks, by = (self.deviation, self.disturbance), lasting(self.yaw_rad)
-        return CourseMeasurement(*own, blocks, by, robust=self.robust) if way.known else None
+        blocks = self.deviation, self.disturbance
+        return CourseMeasurement(*own, blocks, self._by, robust=self.robust) if way.known else None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         found = HeadingMeasurement.innovation(self, state)  # super() knows no dataclass with slots
@@ -65,7 +72,7 @@ class CompassMeasurement(HeadingMeasurement):
             return found
         yaw = rpy_from_dcm(state.dcm)[2]
         slots = [*state.model.slots_of(self.deviation), *state.model.slots_of(self.disturbance)]
-        by = np.array(lasting(yaw))
+        by = np.array(lasting(yaw, self.disturbed))
         of = state.xi[slots]
         # What turns the compass turns the iron with it.
         turned = 1.0 + of[1] * math.cos(yaw) - of[2] * math.sin(yaw)
@@ -75,12 +82,12 @@ class CompassMeasurement(HeadingMeasurement):
 
     def candidates(self) -> tuple[HeadingCandidate, ...]:
         """A claim: how wrong it is, the deviation shares."""
-        by = lasting(self.yaw_rad)
+        by = self._by
         shared = ((self.deviation, by[:3]), (self.disturbance, by[3:]))
         sd = math.hypot(self.sd_rad, self.lasting_sd_rad)
         return (HeadingCandidate(self.t_ns, self.yaw_rad, sd, "compass", self.sd_rad, shared),)
 
 
-def lasting(yaw: float) -> tuple[float, float, float, float]:
+def lasting(yaw: float, disturbed: float) -> tuple[float, float, float, float]:
     """By how much a, b, c and d turn the compass of a vehicle that heads `yaw`."""
-    return 1.0, math.sin(yaw), math.cos(yaw), 1.0
+    return 1.0, math.sin(yaw), math.cos(yaw), disturbed

@@ -90,15 +90,15 @@ def packed_rows(
             return TOO_SLOW
         no_slip_rows(
             *(nav, step, xi, column_of, hold_height, x[a], x[a + 1], x[a + 2]),
-            *(ints[a + 6 : a + 12], x[a + 3], x[a + 4], z, h, r),
+            *(ints[a + 7 : a + 13], x[a + 6], x[a + 3], x[a + 4], z, h, r),
         )
     else:
-        slots, speed = ints[a + 7 : a + 13], x[a + 3]
-        at = nav, step, xi, column_of, hold_height, x[a], x[a + 1], x[a + 2], slots
-        if ints[a + 6] == 0:
+        slots, speed = ints[a + 8 : a + 14], x[a + 3]
+        at = nav, step, xi, column_of, hold_height, x[a], x[a + 1], x[a + 2], slots, x[a + 6]
+        if ints[a + 7] == 0:
             direction = direction_of(*at, p, z, h)
             if direction == 0.0:
                 return NO_DIRECTION
             speed = math.copysign(speed, direction)
-        speed_rows(*at, speed, x[a + 4], x[a + 5], _slots(ints, a + 13), initial, z, h, r)
+        speed_rows(*at, speed, x[a + 4], x[a + 5], _slots(ints, a + 14), initial, z, h, r)
     return APPLIES

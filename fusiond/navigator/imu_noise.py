@@ -19,6 +19,7 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.drift_levels import DriftLevels
 from fusiond.navigator.noise_share import COUNTS_NS, EVERY_NS, NoiseShares
 from fusiond.navigator.timeline import Timeline
 from fusiond.navigator.unit_grade import UnitGrade
@@ -28,9 +29,10 @@ STEP_NS = 1_000_000_000
 
 
 class ImuNoise:
-    """Watches the filter of a configuration."""
+    """Watches the filter of a configuration; so do the vehicle's `drifts`, at the same instants."""
 
-    def __init__(self, model: Model, imu: Imu) -> None:
+    def __init__(self, model: Model, imu: Imu, drifts: DriftLevels) -> None:
+        self._drifts = drifts
         self._shares = NoiseShares(model, imu.gap_s)
         of_class = imu.sensor_class is not None and imu.misalignment_deg > 0.0
         self._unit = UnitGrade(model) if of_class else None
@@ -88,6 +90,7 @@ class ImuNoise:
         with timeline.past(at_ns):
             e = timeline.estimator
             shares = self._shares.end(e)
+            self._drifts.look(e)
             grade = 1.0 if self._grade is None else self._grade.of(e.xi, e.covariance)
             if vibration.shaken:
                 self._shares.begin(e)

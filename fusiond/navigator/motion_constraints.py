@@ -15,6 +15,7 @@ from fusiond.models.blocks import Block, ImuNoise
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
+from fusiond.navigator.drift_levels import DriftLevels
 
 GATE = 0.9999
 """Gate probability, as the measured measurements' default."""
@@ -44,11 +45,12 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
 class ConstraintMaker:
     """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
 
-    `noise` is the IMU's; `rest_evidence` hears of what is measured.
+    `noise` is the IMU's; `rest_evidence` hears of what is measured; `drifts` say how much of the
+    typed side drift counts.
     """
 
-    def __init__(self, options: Constraints, noise: ImuNoise) -> None:
-        self._options, self._rate_noise = options, noise.rate_noise
+    def __init__(self, options: Constraints, noise: ImuNoise, drifts: DriftLevels) -> None:
+        self._options, self._rate_noise, self._drifts = options, noise.rate_noise, drifts
         self.rest_evidence = RestEvidence()
         self._detector = StandstillDetector(quiet_limits(options.zero_velocity, noise))
         self._last_cell = -1
@@ -100,6 +102,7 @@ class ConstraintMaker:
                 o.sd_down_m_s,
                 o.min_speed_m_s,
                 o.lever_arm_m,
+                self._drifts.counts(SIDE_DRIFT, int(imu.times[row])),
             )
             for row in rows
         ]

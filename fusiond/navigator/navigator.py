@@ -36,6 +36,7 @@ from fusiond.navigator.assembly import (
     verdicts_of,
 )
 from fusiond.navigator.calibration import CalibrationWatch
+from fusiond.navigator.drift_levels import DriftLevels
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_noise import ImuNoise
@@ -105,13 +106,15 @@ class Navigator:
             kinds if self.estimator.hypotheses is not None else (),
         )
         self._on_outcome = on_outcome
-        self._constraints = ConstraintMaker(config.constraints, self._noise)
+        self._drifts = DriftLevels(self.model)
+        self._intake.count_drifts(self._drifts)
+        self._constraints = ConstraintMaker(config.constraints, self._noise, self._drifts)
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedMeasurements(self._event)
         self._service_events = ServiceEvents(self.timeline, self._event)
         self.service = SourceService(self.timeline, names)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
-        self._imu_noise = ImuNoise(self.model, imu)
+        self._imu_noise = ImuNoise(self.model, imu, self._drifts)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self.without_imu = WithoutImu(
@@ -150,10 +153,12 @@ class Navigator:
         if saved is not None and (noise := saved.noise) is not None:
             self._intake.take_up(noise.fixes)
             self._imu_noise.take_up(self.imu, noise.predictions, noise.shares)
+            self._drifts.take_up(noise.drifts)
 
     def shown_noise(self, utc_s: float | None) -> SavedNoise:
-        """Noise of receivers and inertial unit as shown until that time (POSIX)."""
-        return SavedNoise(utc_s, self._intake.fixes_shown, *self._imu_noise.shown)
+        """Noise of receivers, inertial unit and vehicle as shown until that time (POSIX)."""
+        of_samples = self._imu_noise.shown
+        return SavedNoise(utc_s, self._intake.fixes_shown, *of_samples, self._drifts.shown)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""

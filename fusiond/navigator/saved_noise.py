@@ -1,8 +1,9 @@
 """Noise that a drive has shown, for the next start: it counts less then, and less with age.
 
 Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
-divide (fusiond.aiding.fix_errors), and which share of what the samples show is noise
-(fusiond.navigator.noise_share). The next drive is through other streets, so no more than `CARRIED`
+divide (fusiond.aiding.fix_errors), which share of what the samples show is noise
+(fusiond.navigator.noise_share), and how much of typed drifts there is
+(fusiond.navigator.drift_levels). The next drive is through other streets, so no more than `CARRIED`
 of it counts: two of ten minutes, which two minutes of it outweigh. A week on, antenna and load may
 be others: less by e.
 """
@@ -10,13 +11,14 @@ be others: less by e.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fusiond.aiding.fix_errors import MOST_SHOWN, SHOWN
+from fusiond.navigator.drift_levels import GRID as LEVELS
 from fusiond.navigator.noise_share import GRID
 from fusiond.navigator.saved_state import STRICT
 
@@ -28,17 +30,20 @@ Sum = Annotated[float, Field(ge=-MOST_SHOWN, le=MOST_SHOWN)]
 Sums = Annotated[tuple[Sum, ...], Field(min_length=SHOWN, max_length=SHOWN)]
 Shown = Annotated[tuple[Sum, ...], Field(min_length=3 * len(GRID), max_length=3 * len(GRID))]
 
+Level = Annotated[tuple[Sum, ...], Field(min_length=1 + len(LEVELS), max_length=1 + len(LEVELS))]
+
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedNoise:
     """Sums of each receiver's fixes by name; log likelihoods of shares of the samples' noise, of
-    how many predictions; POSIX time (s), where it was known. Raises pydantic's `ValidationError`
-    for what is none."""
+    how many predictions; of levels of drifts by block, after the number of instants; POSIX time
+    (s), where it was known. Raises pydantic's `ValidationError` for what is none."""
 
     utc_s: Annotated[float, Field(ge=0.0, le=1e11)] | None
     fixes: Annotated[dict[Name, Sums], Field(max_length=64)]
     predictions: Annotated[float, Field(ge=0.0, le=1e3)]
     shares: Shown
+    drifts: Annotated[dict[Name, Level], Field(max_length=64)] = field(default_factory=dict)
 
     def at(self, now_utc_s: float | None) -> SavedNoise:
         """The part that counts for a start at that time; where nobody knows how old it is, as of a
@@ -49,4 +54,6 @@ class SavedNoise:
         weight = CARRIED * math.exp(-age_s / FADES_S)
         fixes = {name: tuple(weight * x for x in sums) for name, sums in self.fixes.items()}
         shares = tuple(weight * x for x in self.shares)
-        return replace(self, fixes=fixes, predictions=weight * self.predictions, shares=shares)
+        drifts = {name: tuple(weight * x for x in level) for name, level in self.drifts.items()}
+        known = weight * self.predictions
+        return replace(self, fixes=fixes, predictions=known, shares=shares, drifts=drifts)

@@ -14,6 +14,7 @@ from fusiond.aiding.fix_errors import SHOWN
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
+from fusiond.navigator.drift_levels import GRID as LEVELS
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.noise_share import GRID
 from fusiond.navigator.saved_calibration import (
@@ -97,7 +98,8 @@ def test_noise_counts_a_fifth_at_the_next_start_and_fades(
 ) -> None:
     config = vehicle(tmp_path)
     fixes = {"gnss by code": (1.0,) * SHOWN}
-    noise = SavedNoise(time.time() - age_s, fixes, 30.0, (-5.0,) * 3 * len(GRID))
+    drifts = {"side_drift": (30.0, *(-5.0,) * len(LEVELS))}
+    noise = SavedNoise(time.time() - age_s, fixes, 30.0, (-5.0,) * 3 * len(GRID), drifts)
     saved = SavedCalibration(mounting_digest(config), VALUES, noise)
     save_calibration(tmp_path / "truck.calibration.json", saved)
     found, events = offered(config)
@@ -105,6 +107,8 @@ def test_noise_counts_a_fifth_at_the_next_start_and_fades(
     assert found is not None
     assert found.noise is not None
     assert found.noise.predictions == pytest.approx(30.0 * kept, rel=1e-3)
+    level = (30.0 * kept, *(-5.0 * kept,) * len(LEVELS))
+    assert found.noise.drifts["side_drift"] == pytest.approx(level, rel=1e-3)
     assert found.noise.fixes["gnss by code"] == pytest.approx((kept,) * SHOWN, rel=1e-3)
     navigator = Navigator(config)
     navigator.calibration = found

@@ -105,7 +105,7 @@ def test_a_start_by_compass_knows_what_the_deviation_shares() -> None:
         by = rng.standard_normal(3) * FIXED.deviation_sd_deg / math.sqrt(2.0)
 
         def bent(t_s: float, yaw: float, by: Any = by) -> float:
-            return float(np.dot(by, lasting(yaw)[:3]))
+            return float(np.dot(by, lasting(yaw, 1.0)[:3]))
 
         navigator, _ = told(("compass",), bent, seed)
         start = navigator.started

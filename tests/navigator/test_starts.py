@@ -51,12 +51,26 @@ class Case(NamedTuple):
 
 
 TURN_OFF = Leg(8, speed_m_s=9.0, turn_deg=90.0)
+RAMP = (Leg(10, turn_deg=300.0), Leg(10, turn_deg=300.0), Leg(10, turn_deg=300.0), Leg(30))
+"""Of a multi-storey car park: full turns of 10 m radius, one after another."""
 CASES = {
     "straight": Case((Leg(8), Leg(8, speed_m_s=12.0), Leg(30)), FORWARD),
     "in a bend with a long lever": Case((Leg(8), TURN_OFF, Leg(30)), FORWARD, lever=LEVER),
     "backward": Case((Leg(8), Leg(6, speed_m_s=-4.5), Leg(30)), BACKWARD),
     "on a slope": Case(
         (Leg(1, climb_deg=6.0), Leg(8), Leg(8, speed_m_s=10.0), Leg(30)), FORWARD, from_s=2.0
+    ),
+    "backward up a slope": Case(
+        (Leg(1, climb_deg=-6.0), Leg(8), Leg(6, speed_m_s=-4.5), Leg(30)), BACKWARD, from_s=2.0
+    ),
+    "off into a spiral": Case(
+        (Leg(8), Leg(4, speed_m_s=5.0, climb_deg=5.0, turn_deg=90.0), *RAMP), FORWARD, lever=LEVER
+    ),
+    "in a spiral": Case(
+        (Leg(1, climb_deg=5.0), Leg(4, speed_m_s=5.0), Leg(3), *RAMP), MOVING, 9.0, lever=LEVER
+    ),
+    "down a spiral": Case(
+        (Leg(1, climb_deg=-5.0), Leg(4, speed_m_s=5.0), Leg(3), *RAMP), MOVING, 9.0, lever=LEVER
     ),
     "on the move": Case((Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER),
     "on the move, velocities late": Case(
@@ -100,7 +114,12 @@ def _fix(case: Case, row: int, rng: np.random.Generator) -> PositionFix:
 
 
 def _feed(
-    navigator: Navigator, case: Case, samples: Array, rows: range, rng: np.random.Generator
+    navigator: Navigator,
+    case: Case,
+    samples: Array,
+    rows: range,
+    rng: np.random.Generator,
+    velocities: bool = True,
 ) -> Iterator[None]:
     """Samples and a fix at a time; the fixes begin at `fixes_from_s`. Yields after each."""
     times = runs.sample_times(_truth(case))
@@ -109,6 +128,8 @@ def _feed(
         navigator.add_imu(times[part], samples[part])
         if times[part][-1] >= case.fixes_from_s * 1e9:
             fix = _fix(case, row, rng)
+            if not velocities:
+                fix = replace(fix, v_ned_m_s=None, sd_v_ned_m_s=None)
             navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
         navigator.advance()
         yield
@@ -122,20 +143,24 @@ def _run(case: Case, seed: int, imu: dict[str, Any] = SHEET) -> runs.ImuRun:
 
 
 def _started(
-    case: Case, seed: int, until_s: float = 60.0, imu: dict[str, Any] = SHEET
+    case: Case,
+    seed: int,
+    until_s: float = 60.0,
+    imu: dict[str, Any] = SHEET,
+    velocities: bool = True,
 ) -> Navigator:
     """Run until the start, or to `until_s`."""
     config = Config.model_validate(
         {
             "imu": imu,
             "aiding": {"gnss": {"lever_arm_m": case.lever}},
-            "alignment": {"heading": ["gnss_course"]},
+            "alignment": {"heading": ["gnss_course", "positions"]},
         }
     )
     samples = _run(case, seed, imu).samples
     navigator = Navigator(config)
     rows = range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), EVERY)
-    for _ in _feed(navigator, case, samples, rows, np.random.default_rng(seed)):
+    for _ in _feed(navigator, case, samples, rows, np.random.default_rng(seed), velocities):
         if navigator.started is not None:
             break
     return navigator
@@ -171,6 +196,27 @@ def test_sigma_of_a_start_is_honest(name: str) -> None:
     assert np.mean(velocity) < HIGH
     assert np.mean(tilt_and_force) < HIGH_5
     assert np.mean(yaw_sd) < 10.0
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.late_s])
+def test_a_receiver_without_velocity_starts_by_its_positions(name: str) -> None:
+    """Forward, reversing, on a slope and in a spiral, from rest and met on the move."""
+    case = CASES[name]
+    truth = _truth(case)
+    squares, yaws, after_s = [], [], []
+    for seed in range(4):
+        start = _started(case, seed, velocities=False).started
+        assert start is not None, f"seed {seed}"
+        assert start.how == "positions on the way", f"seed {seed}"
+        true = runs.true_nav(truth, np.array([start.t_ns * 1e-9]))[0]
+        error, p = runs.nav_error(start.nav, true)[:9], start.covariance[:9, :9]
+        squares.append(error @ np.linalg.solve(p, error))
+        yaws.append(math.sqrt(p[2, 2]) / DEG)
+        after_s.append(start.t_ns * 1e-9 - case.from_s)
+        assert abs(error[2]) < 4.0 * math.sqrt(p[2, 2]), f"seed {seed}: yaw"
+    print(f"{name}: NEES {np.mean(squares):.1f} of 9, yaw {np.mean(yaws):.1f} deg, after {after_s}")
+    assert np.mean(squares) < float(chi2.ppf(0.999, 9 * len(squares))) / len(squares)
+    assert max(yaws) < 10.1
 
 
 def test_what_a_start_was_made_of_is_not_told_once_more() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from drivers.measurements import DelayedFix, Measurement, PositionFix, UtcStamp
 from drivers.raw.messages import RawGnssEpoch
@@ -31,6 +32,9 @@ from fusiond.navigator.intake import (
 from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
 from fusiond.navigator.intake.pace import Pace
 from fusiond.navigator.intake.plausible import refusal
+
+if TYPE_CHECKING:
+    from fusiond.navigator.drift_levels import DriftLevels
 
 KINDS: tuple[Kind, ...] = (
     gnss.KIND,
@@ -98,6 +102,10 @@ class Intake:
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
         """Start receivers without a fix so far from these sums."""
         self._sections.fixes_shown = fixes_shown
+
+    def count_drifts(self, drifts: DriftLevels) -> None:
+        """From now on typed drifts count as much as they say."""
+        self._sections.drifts = drifts
 
     def extra_blocks(self) -> list[Block]:
         """Blocks that the measurements need in the model beside its own blocks: errors that

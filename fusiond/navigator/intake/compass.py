@@ -46,11 +46,11 @@ def measurements_of(
         return found
     sd_rad = math.hypot(o.sd_deg * DEG * o.sigma_scale, m.rounding_sd_rad)
     names = _names(m.source, o, sections)
-    lasting = math.hypot(o.deviation_sd_deg, o.disturbance_sd_deg) * DEG
+    counts = sections.drift_counts(names[1], when.t_ns)
+    lasting = math.hypot(o.deviation_sd_deg, o.disturbance_sd_deg * counts) * DEG
     yaw = math.remainder(m.yaw_rad + found, math.tau)
-    return [
-        CompassMeasurement(m.source, when.t_ns, o.gate_probability, yaw, sd_rad, *names, lasting)
-    ]
+    own = m.source, when.t_ns, o.gate_probability, yaw, sd_rad
+    return [CompassMeasurement(*own, *names, lasting, counts)]
 
 
 def _declination(o: CompassAiding, sections: Sections) -> float | str:

@@ -12,6 +12,7 @@ from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 
 if TYPE_CHECKING:
+    from fusiond.navigator.drift_levels import DriftLevels
     from fusiond.navigator.raw_gnss import RawGnss
 
 S = TypeVar("S", bound=Aiding)
@@ -55,6 +56,8 @@ class Sections:
         """Of each receiver whose fixes share an error, by code or by phase."""
         self.fixes_shown: Mapping[str, tuple[float, ...]] = {}
         """The same of another drive, by `shown_as`."""
+        self.drifts: DriftLevels | None = None
+        """Levels of typed drifts; without them all of each counts."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
@@ -63,6 +66,10 @@ class Sections:
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
         self.made: dict[tuple[str, object], Any] = {}
         """By source and maker: what the sections alone say of it, for all that comes of it."""
+
+    def drift_counts(self, block: str, t_ns: int) -> float:
+        """Factor of a typed drift that counts for a measurement of `t_ns`."""
+        return 1.0 if self.drifts is None else self.drifts.counts(block, t_ns)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section, of what comes from now on."""

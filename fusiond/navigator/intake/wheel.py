@@ -31,10 +31,12 @@ def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[A
     o = sections.of(m.source, WheelAiding)
     sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
     drift, scale, latency, rounding = sections.each_own(_ERRORS, m.source, o)
+    t_ns = when.t_ns - round(o.latency_s * 1e9)
+    counts = sections.drift_counts(drift, t_ns)
     return [
         WheelSpeedMeasurement(
             m.source,
-            when.t_ns - round(o.latency_s * 1e9),
+            t_ns,
             o.gate_probability,
             m.speed_m_s / o.scale,
             sd_m_s,
@@ -46,7 +48,8 @@ def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[A
             latency,
             rounding,
             m.shared_step_m_s,
-            (o.drift_sd_m_s, o.drift_s),
+            (o.drift_sd_m_s * counts, o.drift_s),
+            counts,
         )
     ]
 

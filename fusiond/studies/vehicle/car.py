@@ -282,7 +282,7 @@ def _slips(
             o.sd_down_m_s,
             o.min_speed_m_s,
             o.lever_arm_m,
-            (float(right), float(down)),
+            slip=(float(right), float(down)),
         )
         for t, (right, down) in zip(t_s.tolist(), noise, strict=True)
     ]
