@@ -30,6 +30,7 @@ from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
+from fusiond.live.standard_error import StandardErrorHandler
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
@@ -281,13 +282,16 @@ def run(
     """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
     gives then. The `missing` kernels are compiled first. Exits 78 if the configuration leaves
     nothing to run."""
-    logging.basicConfig(level=logging.INFO, handlers=[handler()])
+    written = handler()
+    logging.basicConfig(level=logging.INFO, handlers=[written])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
     sys.setswitchinterval(SWITCH_S)
 
     async def main(compiling: Forked | None) -> None:
+        if isinstance(written, StandardErrorHandler):
+            written.begin_thread()
         stop, again = asyncio.Event(), asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -321,3 +325,5 @@ def run(
     except ConfigError as error:
         log.error("%s: %s", config_path, error)
         sys.exit(EXIT_CONFIG)
+    finally:
+        written.close()
