@@ -1,9 +1,9 @@
 """A CAN bus under asyncio that is there when the interface is, and comes back when it comes back.
 
 python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
-descriptor and its `AsyncBufferedReader` has no bound. A bus with a socket (`socketcan`, `udp_multicast`) is read off
-that in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn. A bus without one
-(`virtual`) is read by a thread into a ring of `RING_FRAMES`.
+descriptor and its `AsyncBufferedReader` has no bound. What has a socket (`socketcan`,
+`udp_multicast`) is read off it in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a
+turn. What has none (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
 
 Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
 """
