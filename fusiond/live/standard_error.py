@@ -1,8 +1,7 @@
-"""Standard error as a log, written by a thread: a disk that flushes, or a pipe that nobody empties,
-holds up no tick.
+"""Standard error as a log, written by a thread: a pipe that nobody empties holds up no tick.
 
-A write to a file may wait for the disk (some 0.2 s while another file of it is synced), one to a
-pipe waits for its reader for ever. The queue is bounded; what it does not take is lost and counted.
+A write to a pipe waits for its reader, for ever if need be, one to a file for a disk that is slow.
+The queue is bounded; what it does not take is lost and counted.
 """
 
 from __future__ import annotations
