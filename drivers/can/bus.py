@@ -1,9 +1,9 @@
 """A CAN bus under asyncio that is there when the interface is, and comes back when it comes back.
 
 python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
-descriptor and its `AsyncBufferedReader` has no bound. What has a socket (`socketcan`,
-`udp_multicast`) is read off it in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a
-turn. What has none (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
+descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descriptor (`socketcan`,
+`udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn. A bus
+without one (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
 
 Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
 """
@@ -23,7 +23,6 @@ from functools import partial
 from typing import Literal, NamedTuple, TypedDict
 
 from drivers.base import Backoff, Now, monotonic_ns
-from drivers.can.datagrams import LONGEST, BadDatagramError, fields_of
 from drivers.can.errors import ControllerState, controller_state, error_names
 from drivers.can.python_can import can
 
@@ -206,18 +205,17 @@ class CanBus:
             fd = -1
         if fd < 0:
             return await _ThreadReader(self, bus, gone).run()
-        sock = socket.socket(fileno=os.dup(fd))
-        multicast = self.interface == "udp_multicast"
-        read = partial(self._read_datagram if multicast else self._read_frame, sock)
+        sock: socket.socket | None = getattr(bus, "socket", None)
+        read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
         loop.add_reader(fd, self._readable, fd, read, gone)
         try:
             while not gone.done():
                 await asyncio.wait([gone], timeout=CHECK_S)
-                self._count_drops(sock)
+                if sock is not None:
+                    self._count_drops(sock)
             return gone.result()
         finally:
             loop.remove_reader(fd)
-            sock.close()
 
     def _readable(self, fd: int, read: Read, gone: asyncio.Future[str]) -> None:
         """Callback of the loop: drain the socket, bounded; a fault ends the watch at once."""
@@ -234,29 +232,22 @@ class CanBus:
             asyncio.get_running_loop().remove_reader(fd)
             gone.set_exception(defect)
 
-    def _received(self, sock: socket.socket, size: int) -> tuple[bytes, int | None] | None:
-        """What the socket has next, and the kernel's stamp of it (ns); None when there is nothing.
+    def _read_socket(self, sock: socket.socket) -> CanFrame | None:
+        """One frame off a raw CAN socket with its kernel stamp, None when there is none.
 
         A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds.
         """
         try:
-            raw, control, _, _ = sock.recvmsg(size, 64, socket.MSG_DONTWAIT)
+            raw, control, _, _ = sock.recvmsg(_CANFD_MTU, 64, socket.MSG_DONTWAIT)
         except (BlockingIOError, InterruptedError):
             return None
         except OSError as error:
             raise _BusFaultError(self._explain(error)) from error
+        realtime_ns = None
         for level, kind, value in control:
             if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(value)
-                return raw, seconds * 1_000_000_000 + nanoseconds
-        return raw, None
-
-    def _read_frame(self, sock: socket.socket) -> CanFrame | None:
-        """One frame off a raw CAN socket, None when there is none."""
-        received = self._received(sock, _CANFD_MTU)
-        if received is None:
-            return None
-        raw, realtime_ns = received
+                realtime_ns = seconds * 1_000_000_000 + nanoseconds
         can_id, length = _FRAME.unpack_from(raw)
         extended = bool(can_id & EXTENDED_FLAG)
         return CanFrame(
@@ -269,26 +260,21 @@ class CanBus:
             bool(can_id & ERROR_FLAG),
         )
 
-    def _read_datagram(self, sock: socket.socket) -> CanFrame | None:
-        """One frame of `udp_multicast`, None when there is none, or a datagram that is no frame,
-        which is counted."""
-        received = self._received(sock, LONGEST)
-        if received is None:
-            return None
-        raw, realtime_ns = received
-        try:
-            can_id, extended, data, remote, error = fields_of(raw)
-        except BadDatagramError:
-            self.counters["bad_datagrams"] += 1
-            return None
-        return CanFrame(can_id, extended, data, self._now_ns(), realtime_ns, remote, error)
-
     def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
-        """One frame by python-can, None when there is none."""
+        """One frame by python-can, None when there is none.
+
+        A datagram on `udp_multicast` that is no CAN frame is counted and passed over.
+        """
         try:
             message = bus.recv(timeout_s)
-        except (OSError, can.CanError) as error:
+        except OSError as error:
             raise _BusFaultError(self._explain(error)) from error
+        except can.CanError as error:
+            cause = error.__cause__
+            if self.interface != "udp_multicast" or cause is None or isinstance(cause, OSError):
+                raise _BusFaultError(self._explain(error)) from error
+            self.counters["bad_datagrams"] += 1
+            return None
         if message is None:
             return None
         return CanFrame(

@@ -228,16 +228,16 @@ async def test_a_bus_that_dies_is_closed_and_opened_again(monkeypatch: pytest.Mo
     readable: the reader must be taken off the loop, not called for ever."""
     dead = threading.Event()
     calls = 0
-    whole = can_bus.CanBus._read_datagram
+    whole = can_bus.CanBus.read_message
 
-    def failing(self: CanBus, sock: socket.socket) -> CanFrame | None:
+    def failing(self: CanBus, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
         nonlocal calls
         if dead.is_set():
             calls += 1
             raise can_bus._BusFaultError(self._explain(OSError(errno.ENETDOWN, "down")))
-        return whole(self, sock)
+        return whole(self, bus, timeout_s)
 
-    monkeypatch.setattr(can_bus.CanBus, "_read_datagram", failing)
+    monkeypatch.setattr(can_bus.CanBus, "read_message", failing)
     async with Running(interface="udp_multicast", channel=GROUP).run() as imu:
         with can.Bus(interface="udp_multicast", channel=GROUP, ignore_config=True) as sender:
             for message in sample_frames(1):
