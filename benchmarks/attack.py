@@ -1,6 +1,7 @@
 """The daemon while guests attack its servers, a row for each attack:
 
     python benchmarks/attack.py [--seconds S] [--rest S] [--ahead] [--only NAME ...] [--json F]
+                                [--probe]
     python benchmarks/attack.py --kill TIMES [--ahead] [--json F]
 
 The daemon's own process, all its servers on, records a simulated vehicle in another: IMU 200 Hz,
@@ -18,6 +19,10 @@ listens to. One daemon takes all attacks (`benchmarks/attackers.py`) one after a
 * `fds`: descriptors before, at most and after;
 * `log`: lines of the cause that has most of them, a minute; all causes that have more than one
   line are in the JSON.
+
+With `--probe` the daemon's loop is watched (`benchmarks/loop_probe.py`), and below each row stand
+the three longest of the turns and waits that held it up meanwhile, those of the start below the
+first: what they spent their time on. The JSON has all of them.
 
 With `--kill` the daemon is killed (SIGKILL) so many times while three attacks go on, and a row says
 what its recording lacks.
@@ -62,7 +67,7 @@ from benchmarks.probes import gap_ms, probing
 from fusiond.recording.reader import Log
 from tests.broker import listening
 from tests.hil.heard import Heard
-from tests.hil.processes import DaemonProcess
+from tests.hil.processes import FUSIOND, DaemonProcess
 from tests.live.rig import network_of_its_own
 
 NAV = "fusiond/load/nav"
@@ -177,6 +182,26 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
     return found
 
 
+class LoopLog:
+    """What the probe in the daemon's loop writes, where there is one."""
+
+    def __init__(self, folder: Path, wanted: bool) -> None:
+        self._path = folder / "loop.jsonl"
+        self.program: tuple[str | Path, ...] = (FUSIOND,)
+        self._read = 0
+        if wanted:
+            probe = Path(__file__).with_name("loop_probe.py")
+            self.program = (sys.executable, probe, self._path)
+
+    def news(self) -> list[dict[str, Any]]:
+        """Whole lines since the last call."""
+        if not self._path.exists():
+            return []
+        lines, _, _ = self._path.read_text()[self._read :].rpartition("\n")
+        self._read += len(lines) + bool(lines)
+        return [json.loads(line) for line in lines.splitlines() if line]
+
+
 async def _row(
     name: str, daemon: DaemonProcess, heard: Heard, ports: Ports, args: Any
 ) -> dict[str, Any]:
@@ -218,7 +243,11 @@ async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     names = args.only or ("peace", *ATTACKS)
     lasts_s = 120.0 + len(names) * (args.seconds + args.rest + BETWEEN_S)
-    async with _bench(folder, lasts_s) as (bench, ports), DaemonProcess(bench.config) as daemon:
+    loop_log = LoopLog(folder, args.probe)
+    async with (
+        _bench(folder, lasts_s) as (bench, ports),
+        DaemonProcess(bench.config, loop_log.program) as daemon,
+    ):
         await daemon.start()
         await daemon.ready()
         async with listening(bench.broker, "fusiond/load/+") as (listener, _):
@@ -227,12 +256,17 @@ async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
             await asyncio.sleep(SETTLE_S)
             for name in names:
                 row = await _row(name, daemon, heard, ports, args)
+                row["loop"] = loop_log.news()
                 if not rows:
                     print("".join(title.rjust(width) for title, _, width in COLUMNS))
                 print("".join(str(row[key]).rjust(width) for _, key, width in COLUMNS))
+                for held in sorted(row["loop"], key=lambda held: -float(held["wall_ms"]))[:3]:
+                    print("   ", json.dumps(held))
                 sys.stdout.flush()
                 rows.append(row)
         await daemon.terminate()
+        if args.probe:
+            print("   ", json.dumps(loop_log.news()[-1]))
     return rows
 
 
@@ -286,6 +320,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=("peace", *ATTACKS))
     parser.add_argument("--kill", type=int, default=0)
     parser.add_argument("--ahead", action="store_true")
+    parser.add_argument("--probe", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     with contextlib.suppress(PermissionError):

@@ -25,11 +25,12 @@ from fusiond.live.chain import Chain
 from fusiond.live.front import Front
 from fusiond.live.journal import handler
 from fusiond.live.message_keeper import MessageKeeper
-from fusiond.live.process_usage import release_compiler_memory
+from fusiond.live.process_usage import release_start_memory, share_one_heap
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
+from fusiond.live.standard_error import StandardErrorHandler
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
@@ -84,8 +85,9 @@ class Daemon:
         self.recorder = Recorder(config, self.clock, recording_event)
         saved = self._state.load()
         self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
-        load_kernels()  # none is linked inside a tick
-        self.navigator = self._chain.navigator
+        self.navigator = navigator = self._chain.navigator
+        # None is linked inside a tick. Of those by the width of a covariance 10 MB are for others.
+        load_kernels({navigator.model.width, navigator.without_imu.model.width})
         self.navigator.timeline.keeps_raw = config.recording.directory is not None
         self.sources = self._chain.sources
         self._calibration.restore_into(self.navigator)
@@ -281,13 +283,17 @@ def run_daemon(
     """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
     gives then. The `missing` kernels are compiled first. Exits 78 if the configuration leaves
     nothing to run."""
-    logging.basicConfig(level=logging.INFO, handlers=[handler()])
+    written = handler()
+    logging.basicConfig(level=logging.INFO, handlers=[written])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
     sys.setswitchinterval(SWITCH_S)
+    share_one_heap()
 
     async def main(compiling: Forked | None) -> None:
+        if isinstance(written, StandardErrorHandler):
+            written.begin_thread()
         stop, again = asyncio.Event(), asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -302,7 +308,7 @@ def run_daemon(
             for load in missing:  # links them; compiles here what could not be kept on disk
                 load()
         daemon = Daemon(config, front=front)
-        release_compiler_memory()
+        release_start_memory()
         reloading = asyncio.create_task(daemon.reload_when(again, read), name="reload")
         await daemon.run(stop)
         await _cancel(reloading)
@@ -321,3 +327,5 @@ def run_daemon(
     except ConfigError as error:
         log.error("%s: %s", config_path, error)
         sys.exit(EXIT_CONFIG)
+    finally:
+        written.close()

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fusiond.live.log_limit import LogLimit
+from fusiond.live.standard_error import StandardErrorHandler
 
 SOCKET = Path("/run/systemd/journal/socket")
 PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
@@ -84,6 +85,4 @@ def _handler(environ: Mapping[str, str]) -> logging.Handler:
         journal = False
     if journal:
         return JournalHandler()
-    written = logging.StreamHandler(sys.stderr)
-    written.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
-    return written
+    return StandardErrorHandler()

@@ -58,6 +58,8 @@ class Messaging:
         self._terminals: dict[str, RdssDriver] = {
             name: driver for name, driver in drivers.items() if hasattr(driver, "post_text")
         }
+        if self._terminals:  # 10 ms that no tick has to spare when the first message comes
+            import fusiond.live.stored_messages  # noqa: F401, PLC0415
         self._waiting: deque[tuple[Topic, Message]] = deque()
         self._unconfirmed: OrderedDict[int, ShortMessage] = OrderedDict()
         self._serial = 0

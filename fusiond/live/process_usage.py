@@ -34,17 +34,27 @@ class ProcessUsage:
 
 
 _MADV_DONTNEED = 4
+_M_ARENA_MAX = -8
 
 
-def release_compiler_memory() -> None:
-    """Let go of what compiling and linking needed: LLVM's code and constants, 45 MB resident once
-    it has loaded the kernels and is called no more; their bitcode, 7 MB; freed memory, 1 MB.
+def share_one_heap() -> None:
+    """Let all threads allocate from one heap, before there are any: each of glibc's own keeps a
+    megabyte and more for a thread that writes ten times a second (mallopt(3), M_ARENA_MAX)."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none
+    if mallopt is not None:
+        mallopt(_M_ARENA_MAX, 1)
+
+
+def release_start_memory() -> None:
+    """Let go of what the start alone needed: pages of libraries, among them LLVM's, 45 MB, once it
+    has loaded the kernels and is called no more, and 13 MB of the others; bitcode, 7 MB; freed
+    memory, 1 MB.
 
     madvise(2), MADV_DONTNEED: pages of a mapping that nobody wrote to are clean copies of the
-    library's file; should LLVM run again, they are read again. malloc_trim(3) is glibc's.
+    file, and those that are used are read again. malloc_trim(3) is glibc's.
     """
     libc = ctypes.CDLL(None)
-    for start, end in _clean_mappings("libllvmlite"):
+    for start, end in _clean_mappings():
         libc.madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
     release_bitcode()
     trim = getattr(libc, "malloc_trim", None)  # musl has none
@@ -52,8 +62,8 @@ def release_compiler_memory() -> None:
         trim(0)
 
 
-def _clean_mappings(library: str) -> Iterator[tuple[int, int]]:
-    """First and last address of a library's read-only mappings without a written page.
+def _clean_mappings() -> Iterator[tuple[int, int]]:
+    """First and last address of read-only mappings of libraries without a written page.
 
     The linker writes to a page when it resolves addresses; the file has no copy of that."""
     try:
@@ -64,7 +74,7 @@ def _clean_mappings(library: str) -> Iterator[tuple[int, int]]:
     for line in lines:
         fields = line.split(maxsplit=5)
         if not fields[0].endswith(":"):
-            mine = len(fields) > 5 and library in fields[5] and "w" not in fields[1]
+            mine = len(fields) > 5 and ".so" in fields[5] and "w" not in fields[1]
             addresses = fields[0] if mine else None
         elif addresses is not None and line.startswith("Private_Dirty:") and fields[1] == "0":
             start, end = (int(address, 16) for address in addresses.split("-"))

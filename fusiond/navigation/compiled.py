@@ -3,8 +3,8 @@
 With an explicit signature numba compiles when the module is imported and never again: no
 compilation can happen inside the navigation loop. A kernel that is in the cache already is linked
 when it is first called, or when one that is being compiled calls it; `load_kernels` does that for
-all at once, before a loop that keeps time. Where somebody waits for the imports, `gathered` lists
-what is to be compiled: for other processes, that end and give their memory back.
+all that a loop which keeps time may call, before it. Where somebody waits for the imports,
+`gathered` lists what is to be compiled: for other processes, that end and give their memory back.
 `error_model="numpy"` drops the zero-division checks that would keep loops from being vectorised;
 `fastmath` stays off because it would let results depend on the order that the compiler picks.
 References are counted where a kernel makes arrays and nowhere else (`_nrt`): a count is atomic, a
@@ -30,7 +30,7 @@ import itertools
 import os
 import secrets
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -78,6 +78,7 @@ def _cache_folder() -> Path:
 
 FOLDER = _cache_folder()
 _names: set[str] = set()
+_variants: dict[str, int] = {}
 _in_cache = kept_in(FOLDER)
 _shipped = shipped_in(Path(__file__).with_name("prebuilt") / FOLDER.name)
 _waiting: dict[str, Callable[[], None]] = {}
@@ -112,6 +113,8 @@ def compiled(
         if name in _names:
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         _names.add(name)
+        if variant is not None:
+            _variants[name] = variant
         options.update(error_model="numpy", _nrt=allocates)
         setattr(function, "__signature__", inspect.signature(function))  # noqa: B010 - asked twice
         kernel = numba.njit(**options)(function)
@@ -155,12 +158,14 @@ def load_compiler() -> None:
     numba.njit("f8(f8)")(lambda x: x)
 
 
-def load_kernels() -> None:
+def load_kernels(variants: Collection[int]) -> None:
     """Link every kernel that has been imported and not been called yet, before a loop that keeps
-    time."""
+    time; of those that one piece of source makes, these `variants`. One that is called all the same
+    is linked then."""
     with global_compiler_lock:
-        for load in [*_waiting.values()]:
-            load()
+        for name, load in [*_waiting.items()]:
+            if name not in _variants or _variants[name] in variants:
+                load()
 
 
 def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], None]:

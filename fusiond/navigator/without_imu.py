@@ -37,6 +37,7 @@ from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.models.blocks import Block
 from fusiond.models.constant_velocity import constant_velocity
+from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity, meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Bound, Mode, Solution
@@ -114,6 +115,11 @@ class WithoutImu:
         self._silent_ns = 0
         self._located_ns = 0
         self._max_speed_m_s = config.plausibility.max_speed_m_s
+
+    @property
+    def model(self) -> Model:
+        """Error model of a vehicle without an inertial unit."""
+        return constant_velocity(self._config.plausibility.manoeuvre, self._blocks)
 
     @property
     def active(self) -> bool:
@@ -219,7 +225,7 @@ class WithoutImu:
         if fix is None:
             return
         config = self._config
-        model = constant_velocity(config.plausibility.manoeuvre, self._blocks)
+        model = self.model
         estimator = estimator_without_imu(config, model, GAP_S)
         self._imu = ImuBuffer(1e9 / STEP_NS, config.estimator.buffer_s, np.eye(3), 0.0, GAP_S)
         self._timeline = Timeline(

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -38,10 +39,12 @@ device_time = "SIM_TIME.TIME"
 class DaemonProcess:
     """`fusiond run CONFIG` with a service manager that listens; `log` is its standard error.
 
-    `async with` starts nothing; it sees to it that nothing is left running."""
+    `async with` starts nothing; it sees to it that nothing is left running. `program` is another
+    that takes the same arguments."""
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, program: Sequence[str | Path] = (FUSIOND,)) -> None:
         self._config = config
+        self._program = program
         self._log = config.with_suffix(".log")
         self._notify = config.with_suffix(".notify")
         self._socket: socket.socket | None = None
@@ -68,7 +71,7 @@ class DaemonProcess:
         environment = {**os.environ, "NOTIFY_SOCKET": str(self._notify)}
         with self._log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
-                FUSIOND, "run", self._config, env=environment, stdout=log, stderr=log
+                *self._program, "run", self._config, env=environment, stdout=log, stderr=log
             )
 
     def _hear(self, notifications: socket.socket) -> None:

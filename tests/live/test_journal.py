@@ -8,6 +8,7 @@ import socket
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import ClockOptions
 from fusiond.live.events import Events
 from fusiond.live.journal import JournalHandler, handler
+from fusiond.live.standard_error import StandardErrorHandler
 
 
 @pytest.fixture
@@ -79,3 +81,59 @@ def test_standard_error_where_that_is_not_the_journal(monkeypatch: pytest.Monkey
         made = handler({"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
         assert isinstance(made, JournalHandler)
         made.close()
+
+
+@contextmanager
+def standard_error_in_a_pipe() -> Iterator[int]:
+    """Nobody else reads it."""
+    ours, theirs = os.pipe()
+    with open(theirs, "w") as err, redirect_stderr(err):
+        yield ours
+    os.close(ours)
+
+
+def _read_lines(pipe: int, last: str) -> list[str]:
+    text = ""
+    while last not in text:
+        text += os.read(pipe, 65536).decode()
+    return text.splitlines()
+
+
+def test_standard_error_that_nobody_reads_costs_lines_and_no_time() -> None:
+    """More than the pipe and the queue hold: whoever logs would wait for ever."""
+    log = logging.getLogger("fusiond.unread")
+    log.propagate = False
+    with standard_error_in_a_pipe() as pipe:
+        made = StandardErrorHandler()
+        log.addHandler(made)
+        made.begin_thread()
+        while made.lost < 10:
+            log.error("x" * 1000)
+        os.read(pipe, 65536)
+        while made.lost:
+            log.error("again")
+        lines = _read_lines(pipe, "were lost)")
+        assert "lines before it were lost" in lines[-1]
+        made.close()
+    log.removeHandler(made)
+
+
+def test_the_last_lines_are_written_at_the_end() -> None:
+    log = logging.getLogger("fusiond.last")
+    log.propagate = False
+    with standard_error_in_a_pipe() as pipe:
+        made = StandardErrorHandler()
+        log.addHandler(made)
+        log.error("before the loop")
+        made.begin_thread()
+        for number in range(100):
+            log.error("in the loop %d", number)
+        made.close()
+        log.error("after the loop")
+        lines = _read_lines(pipe, "after the loop")
+    log.removeHandler(made)
+    assert lines == [
+        "ERROR before the loop",
+        *(f"ERROR in the loop {number}" for number in range(100)),
+        "ERROR after the loop",
+    ]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.live import process_usage
-from fusiond.live.process_usage import ProcessUsage, release_compiler_memory
+from fusiond.live.process_usage import ProcessUsage, release_start_memory
 
 
 def test_process_usage() -> None:
@@ -34,19 +34,19 @@ def test_a_figure_that_the_kernel_does_not_show_is_missing(
     percent, resident_mb = ProcessUsage().sample()
     assert math.isfinite(percent)
     assert resident_mb is None
-    release_compiler_memory()
+    release_start_memory()
 
 
-def test_the_compiler_gives_its_memory_back_and_still_works() -> None:
+def test_what_the_start_needed_is_given_back_and_still_works() -> None:
     """In a process of its own, since this one may have compiled anything. A kernel whose bitcode
     went is inlined into one that is compiled afterwards."""
     script = """
 import numba
 from fusiond.navigation.rotation import rotation_vector_to_quaternion as turned
-from fusiond.live.process_usage import ProcessUsage, release_compiler_memory
+from fusiond.live.process_usage import ProcessUsage, release_start_memory
 turned(0.1, 0.2, 0.3)  # links it
 before = ProcessUsage().sample()[1]
-release_compiler_memory()
+release_start_memory()
 after = ProcessUsage().sample()[1]
 assert after < before - 30.0, (before, after)
 assert abs(turned(0.0, 0.0, 0.0)[0] - 1.0) < 1e-15

@@ -26,7 +26,7 @@ import asyncio, json, logging, signal, sys
 from pathlib import Path
 from fusiond.configuration.load import load_config
 from fusiond.live.daemon import Daemon
-from fusiond.live.process_usage import release_compiler_memory
+from fusiond.live.process_usage import release_start_memory
 
 every, ticks = int(sys.argv[2]), 0
 
@@ -43,7 +43,7 @@ async def main():
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     daemon = Daemon(load_config(Path(sys.argv[1])), on_solution=say)
-    release_compiler_memory()
+    release_start_memory()
     await daemon.run(stop)
 
 logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")

@@ -4,6 +4,7 @@ links in them. A recording ends by its own name, and what was synced reads back.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,17 +20,23 @@ from tests.recording.test_recorder import Bench
 from tests.unprivileged import as_a_user_without_rights
 
 FULL = """
-import json, random, resource, sys
+import json, random, resource, shutil, subprocess, sys
 from pathlib import Path
 from fusiond.recording.channels import CHANNELS
 from fusiond.recording.log_file import About, LogFile
 
-folder, about = Path(sys.argv[1]), json.loads(sys.argv[2])
+folder, about, limits, kind = Path(sys.argv[1]), *map(json.loads, sys.argv[2:4]), sys.argv[4]
+disk = folder / "disk"
+disk.mkdir()
 told = {}
-for number, most in enumerate(json.loads(sys.argv[3])):
+for most in limits:
     random.seed(1)
-    path = folder / f"{most}.mcap"
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+    path = disk / f"{most}.mcap"
+    if kind == "disk":
+        size = f"size={most // 4096 * 4096}"
+        subprocess.run(["mount", "-t", "tmpfs", "-o", size, "full", disk], check=True)
+    else:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
     synced = why = 0
     try:
         file = LogFile(path, About(about), 1)
@@ -43,21 +50,35 @@ for number, most in enumerate(json.loads(sys.argv[3])):
         why = error.strerror
         file.abandon()
     told[path.name] = [synced, why]
-resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    shutil.copy(path, folder)
+    if kind == "disk":
+        subprocess.run(["umount", disk], check=True)
 print(json.dumps(told))
 """
 LIMITS = [*range(30_000, 60_000, 1_777), 150_000, 200_001, 400_000, 1_200_000]
 """Bytes a file may have, at all places of a chunk of 25 messages (11 kB) and beyond the buffer."""
+MOUNTS = ("unshare", "--mount", *(() if os.geteuid() == 0 else ("--user", "--map-root-user")))
+"""unshare(1): what is mounted goes with the process."""
 
 
-def test_a_file_that_may_grow_no_more_is_read_up_to_what_was_synced(tmp_path: Path) -> None:
-    """The limit of a file's size fails a write as a full disk does: in part, then with an error."""
-    command = (sys.executable, "-c", FULL, tmp_path, json.dumps(ABOUT), json.dumps(LIMITS))
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+@pytest.mark.parametrize(
+    ("kind", "reason"), [("limit", "File too large"), ("disk", "No space left on device")]
+)
+def test_a_file_that_may_grow_no_more_is_read_up_to_what_was_synced(
+    tmp_path: Path, kind: str, reason: str
+) -> None:
+    """A limit of the file's size, and a disk (tmpfs) that is full: a write fails in part, then with
+    an error, in the middle of a chunk."""
+    command = (sys.executable, "-c", FULL, tmp_path, json.dumps(ABOUT), json.dumps(LIMITS), kind)
+    within = MOUNTS if kind == "disk" else ()
+    done = subprocess.run((*within, *command), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
+    assert len(told) == len(LIMITS)
     cut = 0
     for name, (synced, why) in told.items():
-        assert why == "File too large"
+        assert why == reason
         assert synced > 0
         log = Log([tmp_path / name])
         found = [message.json()["k"] for message in log.messages()]

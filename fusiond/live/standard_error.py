@@ -1,0 +1,82 @@
+"""Standard error as a log, written by a thread: a pipe that nobody empties holds up no tick.
+
+A write to a pipe waits for its reader, for ever if need be, one to a file for a disk that is slow.
+The queue is bounded; what it does not take is lost and counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+from collections import deque
+from typing import TextIO
+
+MOST_LINES = 1000
+"""Lines that may wait, tracebacks among them: a minute of a hundred causes (`LogLimit`)."""
+FAREWELL_S = 1.0
+"""Time for the last lines at the end, a fifth of what systemd allows a stop."""
+
+
+class StandardErrorHandler(logging.StreamHandler[TextIO]):
+    """Writes at once until `begin_thread`, so that processes can be forked before it. `lost` counts
+    lines since the last that was taken, which says how many."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+        self.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+        self.lost = 0
+        self._waiting: deque[str] = deque()
+        self._news = threading.Event()
+        self._ending = False
+        self._thread: threading.Thread | None = None
+
+    def begin_thread(self) -> None:
+        """From now on nobody who logs waits."""
+        self._thread = threading.Thread(target=self._write_waiting, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self._thread is None:
+            super().emit(record)
+            return
+        if len(self._waiting) >= MOST_LINES:
+            self.lost += 1
+            return
+        text = self.format(record)
+        if self.lost:
+            text, self.lost = f"{text} ({self.lost} lines before it were lost)", 0
+        self._waiting.append(text + self.terminator)
+        self._news.set()
+
+    def flush(self) -> None:
+        """Write what waits, as far as it is taken."""
+        if self._thread is None:
+            super().flush()
+
+    def close(self) -> None:
+        """Write what waits, a second at most; later lines are written at once."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            self._ending = True
+            self._news.set()
+            thread.join(FAREWELL_S)
+        super().close()
+
+    def _write_waiting(self) -> None:
+        """By the descriptor: what is stuck in a write would hold the lock of Python's own buffer,
+        which the interpreter takes at its end."""
+        descriptor = self.stream.fileno()
+        while True:
+            self._news.wait()
+            self._news.clear()
+            while self._waiting:
+                data = self._waiting.popleft().encode(errors="replace")
+                try:
+                    while data:
+                        data = data[os.write(descriptor, data) :]
+                except OSError:  # the disk is full, the pipe closed
+                    self.lost += 1
+            if self._ending:
+                return
