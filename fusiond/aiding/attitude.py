@@ -45,7 +45,7 @@ from fusiond.aiding.base import (
 )
 from fusiond.aiding.candidates import HeadingCandidate
 from fusiond.aiding.over_ground import CourseMeasurement
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.way_faced import Oriented, WayFaced
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,
@@ -71,6 +71,13 @@ class AttitudeAid(Aid):
     sd: Vector3
     sd_time_s: float = 0.0
     block: str = ""
+
+    @property
+    def orientation(self) -> Oriented | None:
+        known = all(math.isfinite(x) for x in (*self.rpy, *self.sd))
+        if not known or abs(self.rpy[1]) > STEEPEST_PITCH_RAD:
+            return None
+        return Oriented(self.t_ns, self.rpy, self.sd, self.block)
 
     def unturned(self, way: WayFaced) -> CourseMeasurement | None:
         if not way.known or self.block or math.isnan(self.rpy[2]):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.candidates import Candidate
-from fusiond.aiding.way_faced import WayFaced
+from fusiond.aiding.way_faced import Oriented, WayFaced
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -188,6 +188,11 @@ class Aid:
     @property
     def renewal(self) -> Renewal | None:
         """Change of the errors that successive ones share, at its instant."""
+        return None
+
+    @property
+    def orientation(self) -> Oriented | None:
+        """Attitude that it measures, all three angles; None where it measures none."""
         return None
 
     @property

@@ -23,6 +23,16 @@ The angles are taken as linear in the errors. A displacement s across a distance
 (s / rho)^2, so a point nearer than `least_range_m` is `too_close`; beyond `STEEPEST_ELEVATION_RAD`
 azimuth loses its meaning: `too_steep`.
 
+Without an inertial unit nothing estimates C. One bearing has two angles and an attitude three, and
+each later point meets another attitude: bearings alone say nothing of the position, however many.
+With an attitude that another sensor has measured at about that instant they do,
+
+    C^ = C_y exp[s^ x]^T,   phi = theta - C (s - s^),   cov(theta) = J diag(sd^2) J^T
+
+C_y measured, J as in fusiond.aiding.attitude, s the misalignment of its sensor, a block of the
+model. theta is noise beside the angles' own, cov = dA/dphi cov(theta) dA/dphi^T, and both rows are
+whitened. Of a vehicle on a road a heading will do (fusiond.aiding.way_faced).
+
 Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checked numerically.
 """
 
@@ -43,11 +53,20 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
+from fusiond.aiding.way_faced import Oriented, WayFaced
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.models.blocks import SAR_MISALIGNMENT
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.rotation import skew, wrap_angle
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    dcm_from_rpy,
+    quaternion_from_rpy,
+    rotation_vector_to_quaternion,
+    rpy_from_dcm,
+    skew,
+    wrap_angle,
+)
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 SAR_BLOCK = SAR_MISALIGNMENT
 STEEPEST_ELEVATION_RAD = math.radians(80.0)
@@ -78,7 +97,21 @@ class BearingAid(Aid):
     sd_time_s: float = 0.0
     block: str = ""
 
+    def unturned(self, way: WayFaced) -> OrientedBearing | None:
+        attitude = way.oriented_at(self.t_ns)
+        if attitude is None:
+            return None
+        own = self.source, self.t_ns, self.gate, self, attitude
+        return OrientedBearing(*own, robust=self.robust)
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
+        found = self.linearised(state)
+        if isinstance(found, Innovation):
+            found.h[:, :9][:, ~state.model.active[:9]] = 0.0
+        return found
+
+    def linearised(self, state: State) -> Innovation | NotApplicable:
+        """The innovation with its slopes in all of the navigation errors, estimated or held."""
         nav = state.nav
         lat, lon, height = float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT])
         to_ned, slots = misaligned_axes(state, self.block)
@@ -105,7 +138,6 @@ class BearingAid(Aid):
         h[:, 6:9] = in_ned @ (skew(sight) @ turn - np.eye(3))
         if slots:
             h[:, slots] = -angles @ skew(u)
-        h[:, :9][:, ~state.model.active[:9]] = 0.0
         innovation = np.array(
             [
                 wrap_angle(math.atan2(y, x) - self.azimuth_rad),
@@ -116,3 +148,34 @@ class BearingAid(Aid):
         rate = angles @ (-np.cross(state.rate_b, u)) - in_ned @ nav[VN : VN + 3]
         r = np.square(self.sd) + np.square(rate * self.sd_time_s)
         return Innovation(innovation, h, r)
+
+
+@immutable()
+class OrientedBearing(Aid):
+    """A bearing of a vehicle whose attitude is not estimated but was measured."""
+
+    bearing: BearingAid
+    attitude: Oriented
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        model, of = state.model, self.attitude
+        measured = dcm_from_rpy(*of.rpy)
+        slots = model.slots_of(of.block) if of.block else []
+        x, y, z = (float(state.xi[slot]) for slot in slots) if slots else (0.0, 0.0, 0.0)
+        dcm = measured @ dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z))).T
+        nav = state.nav.copy()
+        nav[Q0:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
+        found = self.bearing.linearised(state._replace(nav=nav))
+        if isinstance(found, NotApplicable):
+            return found
+        yaw, h = of.rpy[2], found.h
+        axes = np.column_stack(
+            [measured[:, 0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+        )
+        turned = h[:, :3] @ (axes * np.array(of.sd))
+        if slots:
+            h[:, slots] -= h[:, :3] @ dcm
+        h[:, :9][:, ~model.active[:9]] = 0.0
+        root = np.linalg.cholesky(np.diag(found.r) + turned @ turned.T)
+        z_and_h = np.linalg.solve(root, np.column_stack([found.z, h]))
+        return Innovation(z_and_h[:, 0].copy(), z_and_h[:, 1:].copy(), np.ones(2))
