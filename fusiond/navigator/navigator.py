@@ -93,7 +93,7 @@ class Navigator:
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         of_aids = self._intake.extra_blocks()
         self.model = model_of(config, *of_vehicle, *of_aids)
-        self.imu = imu_buffer_of(config)
+        self.imu = imu_buffer_of(config, self.model)
         self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         kinds = kinds_of_config(config, self.model)
