@@ -30,13 +30,14 @@ from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
 from fusiond.demo.page import DemoPage
-from fusiond.demo.papers import paper_play, town
+from fusiond.demo.papers import paper_play
 from fusiond.demo.play import Play, Pulled
 from fusiond.demo.story import story
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.simulation.papers import town
 from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -63,7 +64,7 @@ def demo(
 ) -> dict[str, Any]:
     """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`; with
     `dashboard` there is a page to open, whose address the view says. `paper`: of
-    `fusiond.demo.papers`, whose number, filter and model the summary then begins with.
+    `fusiond.simulation.papers`, whose number, filter and model the summary then begins with.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the

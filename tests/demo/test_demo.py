@@ -27,11 +27,11 @@ from fusiond.demo.demo import (
     ned_error,
     wrapped,
 )
-from fusiond.demo.papers import REST_S
 from fusiond.demo.story import story
 from fusiond.demo.view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.replay.run import Wish, replay
+from fusiond.simulation.papers import REST_S
 from tests.patience import PATIENCE_S
 
 KEYS = [
