@@ -4,12 +4,13 @@ r"""Scale factors that a model has no states for: what of them is noise, while t
 
 of gyros and accelerometers. A bend of angle Theta about an axis leaves s Theta of attitude about
 it, a change V of the velocity along an axis k V; the bend back, or the stop, takes it away again. A
-filter without states for them takes it for white noise that adds as much in a bend, or in a stop:
+filter without states for them takes it for white noise that adds as much in a bend, or in that part
+V' of a stop that a filter which gets fixes takes together:
 
-    density of e_i = s^2 Theta |w_i|,   of d_i = k^2 V |f_i|
+    density of e_i = s^2 Theta |w_i|,   of d_i = k^2 V' |f_i|
 
 w and f smoothed, and less their mean of a minute, which are biases and gravity: what k makes of
-gravity is a bias. Theta and V are those of `fusiond.navigation.crosstalk`. As of axes out of square
+gravity is a bias. Theta and V' are those of `fusiond.navigation.crosstalk`. As of axes out of square
 bends the same way round add up to more than this says, and there and back to less.
 
 Source: Groves, 2nd ed., section 4.4.2 (scale factor errors).
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.crosstalk import BEND_RAD, MEAN_S, SMOOTH_S, STOP_M_S, Crosstalk
+from fusiond.navigation.crosstalk import BEND_RAD, MEAN_S, SMOOTH_S, WITHIN_FIXES_M_S, Crosstalk
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -60,7 +61,7 @@ class ScaleNoise(Crosstalk):
     ) -> None:
         super().__init__(period_s, misalignment_rad)
         self._gains = 1.0 - math.exp(-period_s / SMOOTH_S), 1.0 - math.exp(-period_s / MEAN_S)
-        self._factors = rate_scale**2 * BEND_RAD, force_scale**2 * STOP_M_S
+        self._factors = rate_scale**2 * BEND_RAD, force_scale**2 * WITHIN_FIXES_M_S
         self._seen = np.zeros(13)
 
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:

@@ -8,8 +8,10 @@ after the start on, and for each group g of the navigation errors
     nees_g = x_g^T P_gg^-1 x_g / dim(x_g)
 
 x the error, P the serving filter's covariance, and what axes out of square turn the attitude by. 1
-is honest, and `HONEST` what is asked of the mean over runs. Beside it the root mean squares of the
-errors and of the published sigmas, which have what faults may have left as well.
+is honest, and `HONEST` what is asked of the mean over runs. An attitude in error stays so for a
+run, which then counts as one draw: `nees_error` is one sigma of the mean by the scatter of the
+runs. Beside it the root mean squares of the errors and of the published sigmas, which have what
+faults may have left as well.
 
 A model of a paper that has no states for scale factors flies a unit without them, as the paper's;
 the car's unit has all that its class has.
@@ -232,6 +234,7 @@ def _mean(rows: list[dict[str, float]], group: str) -> dict[str, Any]:
     nees = np.array([row[f"{group}_nees"] for row in rows])
     return {
         "nees": float(nees.mean()),
+        "nees_error": float(nees.std(ddof=1) / math.sqrt(len(nees))),
         "nees_of_runs": nees.tolist(),
         **{
             key: float(np.sqrt(np.mean([row[f"{group}_{key}"] ** 2 for row in rows])))
@@ -266,13 +269,16 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             [
                 name,
                 case["with"],
-                *(f"{of[g]['nees']:.2f}" if g in of else "" for g in GROUPS),
+                *(
+                    f"{of[g]['nees']:.2f} +- {of[g]['nees_error']:.2f}" if g in of else ""
+                    for g in GROUPS
+                ),
                 *(f"{of[g]['rms']:.3g}/{of[g]['sigma']:.3g}" if g in of else "" for g in GROUPS),
             ]
         )
     title = (
         f"{result['runs']} runs of each, from {result['settled_s']:g} s after the start on: NEES a "
-        "degree, RMS error / RMS sigma"
+        "degree and one sigma of that mean, RMS error / RMS sigma"
     )
     return [(title, header, rows)]
 

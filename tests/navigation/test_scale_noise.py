@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.navigation.crosstalk import STOP_M_S
+from fusiond.navigation.crosstalk import STOP_M_S, WITHIN_FIXES_M_S
 from fusiond.navigation.scale_noise import ScaleNoise
 from fusiond.navigator.navigator import Navigator
 
@@ -45,10 +45,11 @@ def test_a_corner_leaves_its_share_of_the_turn_about_its_axis(axis: int) -> None
     assert found[others].max() < 0.05 * found[axis]
 
 
-def test_a_stop_leaves_its_share_of_the_speed() -> None:
+def test_a_stop_leaves_its_share_of_what_counts_between_fixes() -> None:
     stop = bend(0, 0.0, 2.5)
     stop[: round(2.5 / PERIOD_S), 3] -= STOP_M_S / 2.5
-    assert left(stop)[3] == pytest.approx(FORCE_SCALE * STOP_M_S, rel=0.15)
+    counts = math.sqrt(STOP_M_S * WITHIN_FIXES_M_S)
+    assert left(stop)[3] == pytest.approx(FORCE_SCALE * counts, rel=0.15)
 
 
 def test_biases_and_gravity_are_none_of_it_and_chunks_do_not_count() -> None:
