@@ -97,6 +97,6 @@ ABOUT = {
     ),
     "papers": About(
         "Every paper's model live: is its sigma honest, group by group?",
-        4,
+        12,
     ),
 }

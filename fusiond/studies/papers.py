@@ -43,7 +43,7 @@ from fusiond.studies.navigation_error import nav_error, true_nav
 
 Array = NDArray[np.float64]
 
-DEFAULT_RUNS = 4
+DEFAULT_RUNS = 12
 SETTLED_S, EVERY_S = 30.0, 1.0
 HONEST = (0.7, 1.4)
 GROUPS = {"position": slice(6, 9), "velocity": slice(3, 6), "attitude": slice(0, 3)}
