@@ -39,6 +39,7 @@ Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checke
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -84,6 +85,7 @@ class BearingAid(Aid):
     """Azimuth and elevation (rad) with `sd` of `point` (lat, lon in rad, height in m).
 
     `block` names the model's block of the sensor's misalignment; a model without it has none.
+    `attitude` is that of a vehicle whose own is not estimated but was measured.
     """
 
     period: ClassVar[float] = 2.0 * math.pi
@@ -96,21 +98,44 @@ class BearingAid(Aid):
     least_range_m: float
     sd_time_s: float = 0.0
     block: str = ""
+    attitude: Oriented | None = None
 
-    def unturned(self, way: WayFaced) -> OrientedBearing | None:
+    def unturned(self, way: WayFaced) -> BearingAid | None:
         attitude = way.oriented_at(self.t_ns)
-        if attitude is None:
-            return None
-        own = self.source, self.t_ns, self.gate, self, attitude
-        return OrientedBearing(*own, robust=self.robust)
+        return None if attitude is None else replace(self, attitude=attitude)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        found = self.linearised(state)
+        if self.attitude is not None:
+            return self._oriented(state, self.attitude)
+        found = self._linearised(state)
         if isinstance(found, Innovation):
             found.h[:, :9][:, ~state.model.active[:9]] = 0.0
         return found
 
-    def linearised(self, state: State) -> Innovation | NotApplicable:
+    def _oriented(self, state: State, of: Oriented) -> Innovation | NotApplicable:
+        """The innovation at a measured attitude, whose noise is the rows' as well."""
+        model, measured = state.model, dcm_from_rpy(*of.rpy)
+        slots = model.slots_of(of.block) if of.block else []
+        x, y, z = (float(state.xi[slot]) for slot in slots) if slots else (0.0, 0.0, 0.0)
+        dcm = measured @ dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z))).T
+        nav = state.nav.copy()
+        nav[Q0:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
+        found = self._linearised(state._replace(nav=nav))
+        if isinstance(found, NotApplicable):
+            return found
+        yaw, h = of.rpy[2], found.h
+        axes = np.column_stack(
+            [measured[:, 0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+        )
+        turned = h[:, :3] @ (axes * np.array(of.sd))
+        if slots:
+            h[:, slots] -= h[:, :3] @ dcm
+        h[:, :9][:, ~model.active[:9]] = 0.0
+        root = np.linalg.cholesky(np.diag(found.r) + turned @ turned.T)
+        z_and_h = np.linalg.solve(root, np.column_stack([found.z, h]))
+        return Innovation(z_and_h[:, 0].copy(), z_and_h[:, 1:].copy(), np.ones(2))
+
+    def _linearised(self, state: State) -> Innovation | NotApplicable:
         """The innovation with its slopes in all of the navigation errors, estimated or held."""
         nav = state.nav
         lat, lon, height = float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT])
@@ -148,34 +173,3 @@ class BearingAid(Aid):
         rate = angles @ (-np.cross(state.rate_b, u)) - in_ned @ nav[VN : VN + 3]
         r = np.square(self.sd) + np.square(rate * self.sd_time_s)
         return Innovation(innovation, h, r)
-
-
-@immutable()
-class OrientedBearing(Aid):
-    """A bearing of a vehicle whose attitude is not estimated but was measured."""
-
-    bearing: BearingAid
-    attitude: Oriented
-
-    def innovation(self, state: State) -> Innovation | NotApplicable:
-        model, of = state.model, self.attitude
-        measured = dcm_from_rpy(*of.rpy)
-        slots = model.slots_of(of.block) if of.block else []
-        x, y, z = (float(state.xi[slot]) for slot in slots) if slots else (0.0, 0.0, 0.0)
-        dcm = measured @ dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z))).T
-        nav = state.nav.copy()
-        nav[Q0:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
-        found = self.bearing.linearised(state._replace(nav=nav))
-        if isinstance(found, NotApplicable):
-            return found
-        yaw, h = of.rpy[2], found.h
-        axes = np.column_stack(
-            [measured[:, 0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
-        )
-        turned = h[:, :3] @ (axes * np.array(of.sd))
-        if slots:
-            h[:, slots] -= h[:, :3] @ dcm
-        h[:, :9][:, ~model.active[:9]] = 0.0
-        root = np.linalg.cholesky(np.diag(found.r) + turned @ turned.T)
-        z_and_h = np.linalg.solve(root, np.column_stack([found.z, h]))
-        return Innovation(z_and_h[:, 0].copy(), z_and_h[:, 1:].copy(), np.ones(2))

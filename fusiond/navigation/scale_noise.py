@@ -10,8 +10,8 @@ V' of a stop that a filter which gets fixes takes together:
     density of e_i = s^2 Theta |w_i|,   of d_i = k^2 V' |f_i|
 
 w and f smoothed, and less their mean of a minute, which are biases and gravity: what k makes of
-gravity is a bias. Theta and V' are those of `fusiond.navigation.crosstalk`. As of axes out of square
-bends the same way round add up to more than this says, and there and back to less.
+gravity is a bias. Theta and V' are those of `fusiond.navigation.crosstalk`. As of axes out of
+square bends the same way round add up to more than this says, and there and back to less.
 
 Source: Groves, 2nd ed., section 4.4.2 (scale factor errors).
 """

@@ -101,8 +101,10 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
 
 
 def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
-    """The buffer of IMU samples, with what they say of vibration, of axes out of square, and of
-    scale factors that the model has no states for."""
+    """The buffer of IMU samples, with the noise that they show.
+
+    That is of vibration, of axes out of square, and of scale factors that the model has no states
+    for."""
     imu, noise = config.imu, imu_noise(config.imu)
     period_s, misalignment = 1.0 / imu.rate_hz, imu.misalignment_deg * DEG
     crosstalk = Crosstalk(period_s, misalignment) if misalignment else None

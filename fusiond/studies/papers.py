@@ -28,7 +28,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
 from fusiond.navigator.navigator import Navigator
@@ -40,8 +39,6 @@ from fusiond.studies.federated import without_imu
 from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, of_run, on_processes, step_counter
 from fusiond.studies.navigation_error import nav_error, true_nav
-
-Array = NDArray[np.float64]
 
 DEFAULT_RUNS = 12
 SETTLED_S, EVERY_S = 30.0, 1.0
@@ -152,12 +149,12 @@ def flown(case: str, seed: int, number: int) -> dict[str, float]:
         devices = PAPERS[of.paper].devices
         raw = PAPERS[of.paper].raw if of.raw else None
         made = simulate(scenario, Path(folder), draws, of.seconds, gnss_raw=raw)
-        aids = [
+        files = [
             ("raw", made.files["raw"]) if of.raw and source == "gnss" else (kind, made.files[kind])
             for source, kind in KIND_OF.items()
             if source in devices and kind in made.files
         ]
-        process(config, made.files["imu"], aids, watch=watch)
+        process(config, made.files["imu"], files, watch=watch)
     return _row(watch.nees, watch.squares)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid, OrientedBearing
+from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.aiding.way_faced import (
     CORNER_RAD_S,
     HOLDS_NS,
@@ -47,7 +47,7 @@ def exact(block: str = "") -> Oriented:
     return Oriented(AT_NS, RPY, (0.0, 0.0, 0.0), block)
 
 
-def asked(aid: OrientedBearing, at: State) -> Innovation:
+def asked(aid: BearingAid, at: State) -> Innovation:
     found = aid.innovation(at)
     assert isinstance(found, Innovation)
     return found
@@ -56,7 +56,7 @@ def asked(aid: OrientedBearing, at: State) -> Innovation:
 def test_slopes_are_those_of_the_angles() -> None:
     # Of noise that is the same everywhere: whitening then changes nothing.
     bearing = replace(BEARING, sd=(1.0, 1.0))
-    aid = OrientedBearing("sar", AT_NS, 0.999, bearing, exact(STAR_BLOCK))
+    aid = replace(bearing, attitude=exact(STAR_BLOCK))
     xi = np.zeros(MODEL.size)
     xi[9:15] = 2e-4, -1e-4, 3e-4, 1e-4, 2e-4, -2e-4
     base = state(xi=xi)
@@ -85,12 +85,12 @@ def test_noise_is_that_of_angles_and_attitude_together() -> None:
     rng = np.random.default_rng(3)
     still = state(runs.level_nav((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     exact = replace(BEARING, sd=(1e-9, 1e-9))
-    at_true = asked(OrientedBearing("sar", AT_NS, 0.999, exact, Oriented(AT_NS, RPY, SD)), still)
+    at_true = asked(replace(exact, attitude=Oriented(AT_NS, RPY, SD)), still)
     z = []
     for _ in range(1000):
         roll, pitch, yaw = (np.array(RPY) + np.array(SD) * rng.standard_normal(3)).tolist()
         of = Oriented(AT_NS, (roll, pitch, yaw), SD)
-        z.append(asked(OrientedBearing("sar", AT_NS, 0.999, exact, of), still).z - at_true.z)
+        z.append(asked(replace(exact, attitude=of), still).z - at_true.z)
     assert np.cov(np.array(z).T) == pytest.approx(np.eye(2), abs=0.15)
     assert at_true.r.tolist() == [1.0, 1.0]
 

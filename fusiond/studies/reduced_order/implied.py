@@ -90,7 +90,7 @@ def level_axis(tilt_arcsec: float, velocity_m_s: float) -> LevelAxis:
 
 
 def azimuth_ratio(of_17_arcsec: float, of_23_arcsec: float) -> float:
-    """How many times its noise a gyro has to the 17, of a radar without misalignment."""
+    """Ratio of a gyro's noise to the 17 to its own, by azimuths of a radar without misalignment."""
     half = (of_17_arcsec / of_23_arcsec) ** 2
     return half + math.sqrt(half**2 - 1.0)
 
