@@ -37,8 +37,8 @@ class Inbox:
         self._session = session
         self.seen: OrderedDict[Seen, None] = OrderedDict()
 
-    def take(self, message: Text, t_ns: int) -> MailReady:
-        """A message that the terminal has handed over."""
+    def mail_of(self, message: Text, t_ns: int) -> MailReady:
+        """Mail that a message becomes which the terminal has handed over."""
         session = self._session
         session.counters["messages_received"] += 1
         wording = Wording(message.payload, message.encoding, message.odd)

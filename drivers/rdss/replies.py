@@ -82,7 +82,7 @@ class Replies:
             case Fix():
                 self._on_fix(message, t_ns, actions)
             case Text():
-                actions.append(self.inbox.take(message, t_ns))
+                actions.append(self.inbox.mail_of(message, t_ns))
             case _:
                 pass
         return actions

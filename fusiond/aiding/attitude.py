@@ -44,7 +44,7 @@ from fusiond.aiding.base import (
     misaligned_axes,
 )
 from fusiond.aiding.candidates import HeadingCandidate
-from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.heading_history import HeadingHistory, Oriented
 from fusiond.aiding.over_ground import CourseMeasurement
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
@@ -71,6 +71,13 @@ class AttitudeMeasurement(AidingMeasurement):
     sd: Vector3
     sd_time_s: float = 0.0
     block: str = ""
+
+    @property
+    def orientation(self) -> Oriented | None:
+        known = all(math.isfinite(x) for x in (*self.rpy, *self.sd))
+        if not known or abs(self.rpy[1]) > STEEPEST_PITCH_RAD:
+            return None
+        return Oriented(self.t_ns, self.rpy, self.sd, self.block)
 
     def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
         if not way.known or self.block or math.isnan(self.rpy[2]):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.candidates import Candidate
-from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.heading_history import HeadingHistory, Oriented
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -190,6 +190,11 @@ class AidingMeasurement:
     @property
     def renewal(self) -> Renewal | None:
         """Change of the errors that successive ones share, at its instant."""
+        return None
+
+    @property
+    def orientation(self) -> Oriented | None:
+        """Attitude that it measures, all three angles; None where it measures none."""
         return None
 
     @property

@@ -23,12 +23,23 @@ The angles are taken as linear in the errors. A displacement s across a distance
 (s / rho)^2, so a point nearer than `least_range_m` is `too_close`; beyond `STEEPEST_ELEVATION_RAD`
 azimuth loses its meaning: `too_steep`.
 
+Without an inertial unit nothing estimates C. One bearing has two angles and an attitude three, and
+each later point meets another attitude: bearings alone say nothing of the position, however many.
+With an attitude that another sensor has measured at about that instant they do,
+
+    C^ = C_y exp[s^ x]^T,   phi = theta - C (s - s^),   cov(theta) = J diag(sd^2) J^T
+
+C_y measured, J as in fusiond.aiding.attitude, s the misalignment of its sensor, a block of the
+model. theta is noise beside the angles' own, cov = dA/dphi cov(theta) dA/dphi^T, and both rows are
+whitened. Of a vehicle on a road a heading will do (fusiond.aiding.heading_history).
+
 Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checked numerically.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -43,11 +54,20 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
+from fusiond.aiding.heading_history import HeadingHistory, Oriented
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.models.blocks import SAR_MISALIGNMENT
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.rotation import skew, wrap_angle
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    dcm_from_rpy,
+    quaternion_from_rpy,
+    rotation_vector_to_quaternion,
+    rpy_from_dcm,
+    skew,
+    wrap_angle,
+)
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 SAR_BLOCK = SAR_MISALIGNMENT
 STEEPEST_ELEVATION_RAD = math.radians(80.0)
@@ -65,6 +85,7 @@ class BearingMeasurement(AidingMeasurement):
     """Azimuth and elevation (rad) with `sd` of `point` (lat, lon in rad, height in m).
 
     `block` names the model's block of the sensor's misalignment; a model without it has none.
+    `attitude` is that of a vehicle whose own is not estimated but was measured.
     """
 
     period: ClassVar[float] = 2.0 * math.pi
@@ -77,8 +98,45 @@ class BearingMeasurement(AidingMeasurement):
     least_range_m: float
     sd_time_s: float = 0.0
     block: str = ""
+    attitude: Oriented | None = None
+
+    def without_attitude(self, way: HeadingHistory) -> BearingMeasurement | None:
+        attitude = way.oriented_at(self.t_ns)
+        return None if attitude is None else replace(self, attitude=attitude)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
+        if self.attitude is not None:
+            return self._oriented(state, self.attitude)
+        found = self._linearised(state)
+        if isinstance(found, Innovation):
+            found.h[:, :9][:, ~state.model.active[:9]] = 0.0
+        return found
+
+    def _oriented(self, state: State, of: Oriented) -> Innovation | NotApplicable:
+        """The innovation at a measured attitude, whose noise is the rows' as well."""
+        model, measured = state.model, dcm_from_rpy(*of.rpy)
+        slots = model.slots_of(of.block) if of.block else []
+        x, y, z = (float(state.xi[slot]) for slot in slots) if slots else (0.0, 0.0, 0.0)
+        dcm = measured @ dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z))).T
+        nav = state.nav.copy()
+        nav[Q0:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
+        found = self._linearised(state._replace(nav=nav))
+        if isinstance(found, NotApplicable):
+            return found
+        yaw, h = of.rpy[2], found.h
+        axes = np.column_stack(
+            [measured[:, 0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+        )
+        turned = h[:, :3] @ (axes * np.array(of.sd))
+        if slots:
+            h[:, slots] -= h[:, :3] @ dcm
+        h[:, :9][:, ~model.active[:9]] = 0.0
+        root = np.linalg.cholesky(np.diag(found.r) + turned @ turned.T)
+        z_and_h = np.linalg.solve(root, np.column_stack([found.z, h]))
+        return Innovation(z_and_h[:, 0].copy(), z_and_h[:, 1:].copy(), np.ones(2))
+
+    def _linearised(self, state: State) -> Innovation | NotApplicable:
+        """The innovation with its slopes in all of the navigation errors, estimated or held."""
         nav = state.nav
         lat, lon, height = float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT])
         to_ned, slots = misaligned_axes(state, self.block)
@@ -105,7 +163,6 @@ class BearingMeasurement(AidingMeasurement):
         h[:, 6:9] = in_ned @ (skew(sight) @ turn - np.eye(3))
         if slots:
             h[:, slots] = -angles @ skew(u)
-        h[:, :9][:, ~state.model.active[:9]] = 0.0
         innovation = np.array(
             [
                 wrap_angle(math.atan2(y, x) - self.azimuth_rad),

@@ -70,7 +70,7 @@ def demo(
 
     with compiling():
         from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
-        from fusiond.demo.papers import PAPERS  # noqa: PLC0415
+        from fusiond.simulation.papers import PAPERS  # noqa: PLC0415
 
     if paper is not None and paper not in PAPERS:
         raise typer.BadParameter(f"--paper {paper}: there are {', '.join(PAPERS)}")

@@ -1,17 +1,19 @@
 r"""Fit of the model to the inertial sensor's errors.
 
-An accelerometer's bias that a model has no state for is noise to it
-(`fusiond.models.missing_states`), so that it stays honest, at the price of its sigma. The measure
-is a minute without measurements, t = 60 s, one sigma of the displacement:
+What a model has no state for is noise to it, so that it stays honest, at the price of its sigma:
+an accelerometer's bias (`fusiond.models.missing_states`), scale factors while the vehicle turns and
+speeds up (`fusiond.navigation.scale_noise`). The measure is a minute without measurements, t =
+60 s, one sigma of the displacement; of scale factors a quarter turn, one sigma of the heading:
 
     an accelerometer bias b       b t^2 / 2
     what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
+    a gyro's scale factor s       s pi / 2
+    what a minute makes of it     n sqrt(t)
 
 N and n the densities of velocity and attitude in the model, which is where such a bias is. Every
-shipped model has gyro states. Scale factors do less than the gyro's noise in the classes that there
-are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that class 11 m.
+shipped model has gyro states. Said is what is more than `MATTERS` times the other.
 
-Source: Groves, 2nd ed., section 5.7 (short-term straight-line error propagation).
+Source: Groves, 2nd ed., sections 4.4.2 and 5.7 (short-term straight-line error propagation).
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR
 
 MINUTE_S = 60.0
+MATTERS = 2.0
+"""Beside twice as much the lesser of two errors makes their sum an eighth larger, which nobody
+sees."""
 
 
 def after_a_minute(force_noise: float, rate_noise: float) -> float:
@@ -35,7 +40,8 @@ def after_a_minute(force_noise: float, rate_noise: float) -> float:
 
 
 def model_doubts(config: Config) -> Iterator[str]:
-    """A sentence where the model takes the accelerometer's bias for noise."""
+    """A sentence where the model takes the accelerometer's bias for noise, and one where it takes
+    scale factors for it."""
     name, noise = config.estimator.model, imu_noise(config.imu)
     model = make_model(name, noise)
     velocity = math.sqrt(next(b.white for b in model.blocks if b.name == "velocity"))
@@ -50,13 +56,21 @@ def model_doubts(config: Config) -> Iterator[str]:
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     moved_m = 0.5 * force * MINUTE_S**2
     lacks = not all(model.parameters(FORCE_ERROR + axis) for axis in range(2 if planar else 3))
-    if lacks and velocity > 2.0 * noise.force_noise:
+    if lacks and velocity > MATTERS * noise.force_noise:
         yield (
             f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
             f"{force / MILLI_G:.3g} mg, one sigma, which is noise to it: sigma grows by "
             f"{_metres(known_m)} in a minute without measurements, where the bias does "
             f"{_metres(moved_m)}, and the level is off by {math.atan(force / g) / DEG:.2g} deg; "
             f"{instead}"
+        )
+    turned, drifts = 0.5 * math.pi * noise.rate_scale, noise.rate_noise * math.sqrt(MINUTE_S)
+    if not model.scale_factors and turned > MATTERS * drifts:
+        yield (
+            f"estimator.model = {name!r} has no scale factors, and {of} has "
+            f"{noise.rate_scale * 1e6:,.0f} ppm of the gyros, one sigma, which are noise to it: "
+            f"sigma of the heading grows by {turned / DEG:.2g} deg in a quarter turn, where a "
+            f"minute of the gyros' own noise makes {drifts / DEG:.2g} deg of it; choose 'ins21'"
         )
 
 

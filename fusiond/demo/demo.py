@@ -31,13 +31,14 @@ from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
 from fusiond.demo.outage_report import outage_report
 from fusiond.demo.page import DemoPage
-from fusiond.demo.papers import paper_setup, town
+from fusiond.demo.papers import paper_setup
 from fusiond.demo.setup import DemoSetup, Unplugged
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.simulation.papers import town
 from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -64,7 +65,7 @@ def demo(
 ) -> dict[str, Any]:
     """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`; with
     `dashboard` there is a page to open, whose address the view says. `paper`: of
-    `fusiond.demo.papers`, whose number, filter and model the summary then begins with.
+    `fusiond.simulation.papers`, whose number, filter and model the summary then begins with.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the

@@ -1,180 +1,18 @@
-"""The papers' models in the running daemon: `fusiond demo --paper 000` to `004`.
-
-A paper is a configuration that ships with fusiond and the lines that make it the paper's
-(docs/papers.md prints them). The simulated vehicle has the paper's devices; what the paper leaves
-open is the shipped configuration's.
-"""
+"""The papers' models in the running daemon: `fusiond demo --paper 000` to `004`."""
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain, cycle
-from typing import Any
-
-from drivers.shipped import shipped
-from fusiond.configuration.schema import Config
 from fusiond.demo.setup import DemoSetup, Unplugged
-from fusiond.simulation.gnss.raw_stream import RawFormat
-from fusiond.simulation.scenarios import SCENARIOS, Scenario
-from fusiond.simulation.trajectories import Leg, Path, flight, follow, level_flight
-from fusiond.simulation.vehicle import Device
-
-REST_S = 8.0
-COURSE_DEG = 40.0
-"""In which the car stands, and of which the start of paper 000 knows as much as the paper's."""
-IMU_COMES_S = 25.0
-TOWN = (
-    Leg(9, speed_m_s=14.0),
-    Leg(3),
-    Leg(6, turn_deg=60.0),
-    Leg(6, speed_m_s=9.0),
-    Leg(6, turn_deg=-90.0),
-    Leg(8, speed_m_s=18.0),
-    Leg(8, turn_deg=30.0, climb_deg=2.0),
-    Leg(6, climb_deg=0.0),
-    Leg(8, speed_m_s=0.0),
-    Leg(5),
-)
-
-
-def town(duration_s: float) -> Path:
-    """A short rest, then town streets over and over."""
-    legs = chain([Leg(REST_S)], cycle(TOWN))
-    return follow(legs, duration_s, course_deg=COURSE_DEG, bank_ratio=-0.08)
-
-
-def level_town(duration_s: float) -> Path:
-    """The same without hills, for a filter that holds its height."""
-    legs = chain([Leg(REST_S)], cycle(replace(leg, climb_deg=None) for leg in TOWN))
-    return follow(legs, duration_s, course_deg=COURSE_DEG, bank_ratio=-0.08)
-
-
-@dataclass(frozen=True)
-class Paper:
-    """`lines` are the paper's own, `start` what makes a demo short; both by section."""
-
-    title: str
-    config: str
-    lines: dict[str, Any]
-    devices: tuple[Device, ...]
-    scenario: Callable[[], Scenario]
-    start: dict[str, Any]
-    pulled: Unplugged | None = None
-    raw: RawFormat | None = None
-
-
-def _with_white_receiver() -> dict[str, Any]:
-    """The simulated receiver's errors are white, and the papers' models have no others."""
-    return {"bias_sd_m": 0.0, "time_offset_sd_s": 0.0, "lever_arm_sd_m": 0.0}
-
-
-PAPERS: dict[str, Paper] = {
-    "000": Paper(
-        "double-star positioning and SINS with optimal prediction, 15 states",
-        "tactical.toml",
-        {
-            "estimator": {"model": "planar15"},
-            "aiding": {"rdss": {"strategy": "optimal_prediction"}},
-        },
-        ("imu", "rdss"),
-        lambda: replace(
-            SCENARIOS["drive"],
-            path=level_town,
-            rdss=replace(SCENARIOS["drive"].rdss, service_frequency_s=1),
-        ),
-        {
-            "vehicle_class": "road",
-            # 15 states hold no scale factors, and the paper's sensor has none.
-            "imu": {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9},
-            # As the paper starts: 30 arc seconds.
-            "alignment": {
-                "heading": ["config"],
-                "heading_deg": COURSE_DEG,
-                "heading_sd_deg": 30.0 / 3600.0,
-            },
-            "aiding": {"rdss": {"bias_sd_m": 0.0}},
-        },
-    ),
-    "001": Paper(
-        "GPS, star tracker and SINS of a micro air vehicle, 10 states",
-        "flight_star.toml",
-        {"estimator": {"model": "planar10", "filter": "multiscale"}},
-        ("imu", "gnss", "star_tracker"),
-        lambda: replace(SCENARIOS["flight-star"], path=partial(level_flight, rest_s=REST_S)),
-        {},
-    ),
-    "002": Paper(
-        "INS, GNSS ranges, SAR and star tracker, 23 states",
-        "flight_sar.toml",
-        {"estimator": {"model": "ins23"}, "aiding": {"gnss": {"kind": "raw"}}},
-        ("imu", "gnss", "star_tracker", "sar"),
-        lambda: replace(SCENARIOS["flight-sar"], path=partial(flight, rest_s=REST_S)),
-        {"alignment": {"heading": ["gnss_course"]}},
-        raw="ubx",
-    ),
-    "003": Paper(
-        "BeiDou ranges and INS, 20 states, Markov clock drift",
-        "vehicle.toml",
-        {
-            "estimator": {"model": "ins20"},
-            "aiding": {"gnss": {"kind": "raw", "systems": ["C"], "clock_drift_tau_s": 300.0}},
-        },
-        ("imu", "gnss"),
-        lambda: replace(SCENARIOS["drive"], path=town),
-        {"imu": {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}},  # 20 states hold none
-        raw="ubx",
-    ),
-    "004": Paper(
-        "active and passive receiver, federated; the inertial unit comes later",
-        "vehicle.toml",
-        {"estimator": {"filter": "federated", "federated": {"fusion": "correlated"}}},
-        ("imu", "gnss", "rdss"),
-        lambda: replace(
-            SCENARIOS["drive"],
-            path=town,
-            rdss=replace(SCENARIOS["drive"].rdss, service_frequency_s=1),
-        ),
-        {"aiding": {"gnss": _with_white_receiver()}},
-        pulled=Unplugged("imu", 0.0, IMU_COMES_S),
-    ),
-}
-
-
-def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the keys of `over`, section by section."""
-    found = dict(base)
-    for key, value in over.items():
-        both = isinstance(value, dict) and isinstance(found.get(key), dict)
-        found[key] = merged(found[key], value) if both else value
-    return found
-
-
-def settings(number: str) -> dict[str, Any]:
-    """A paper's configuration as it would stand in a file: the shipped one with its lines, without
-    devices."""
-    paper = PAPERS[number]
-    base = tomllib.loads(shipped(paper.config).read_text(encoding="utf-8"))
-    base.pop("sources")
-    changed: dict[str, Any] = paper.lines.get("aiding", {})
-    for name, section in changed.items():
-        kind = section.get("kind")
-        if kind and kind != base["aiding"][name].get("kind", name):
-            # Another kind has other keys; the lever arm is the antenna's.
-            base["aiding"][name] = {"lever_arm_m": base["aiding"][name]["lever_arm_m"]}
-    return merged(base, paper.lines)
+from fusiond.simulation.papers import PAPERS, configured
 
 
 def paper_setup(number: str) -> DemoSetup:
     """The demo of a paper, of `PAPERS`."""
     paper = PAPERS[number]
-    found = merged(settings(number), {**paper.start, "vehicle": "demo"})
-    config = Config.model_validate(found)
-    scenario = paper.scenario().fitted(config)
+    config, scenario = configured(number)
     estimator = config.estimator
     about = {"paper": number, "filter": estimator.filter, "model": estimator.model}
+    unplugged = Unplugged("imu", 0.0, paper.imu_comes_s) if paper.imu_comes_s else None
     return DemoSetup(
-        config, scenario, paper.devices, paper.pulled, paper.raw, f"{paper.title}: aligning", about
+        config, scenario, paper.devices, unplugged, paper.raw, f"{paper.title}: aligning", about
     )

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from fusiond.models.blocks import Block
 from fusiond.models.vehicle import FIX_TIME
-from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR, RATE_SCALE, WIDTHS
+from fusiond.navigation.error_model import (
+    CORE_SIZE,
+    FORCE_ERROR,
+    FORCE_SCALE,
+    RATE_ERROR,
+    RATE_SCALE,
+    WIDTHS,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -199,6 +206,11 @@ class Model:
     def sensor_errors(self) -> bool:
         """True if the model has states for the errors of every gyro and accelerometer."""
         return all(self.parameters(axis) for axis in range(RATE_ERROR, FORCE_ERROR + 3))
+
+    @cached_property
+    def scale_factors(self) -> bool:
+        """True if it has states for the scale factor of each gyro and each accelerometer."""
+        return all(self.parameters(axis) for axis in range(RATE_SCALE, FORCE_SCALE + 3))
 
     def parameters(self, column: int) -> list[int]:
         """Slots of the parameters of one column (constant and Markov gyro drift share one)."""

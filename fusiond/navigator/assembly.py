@@ -25,6 +25,7 @@ from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.scale_noise import ScaleNoise
 from fusiond.navigation.vibration import Vibration
 
 if TYPE_CHECKING:
@@ -100,10 +101,16 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
             return _federated(config, model, names, config.imu.gap_s)
 
 
-def imu_buffer_of(config: Config) -> ImuBuffer:
-    """The buffer of IMU samples, with what they say of vibration and of axes out of square."""
+def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
+    """The buffer of IMU samples, with the noise that they show.
+
+    That is of vibration, of axes out of square, and of scale factors that the model has no states
+    for."""
     imu, noise = config.imu, imu_noise(config.imu)
     period_s, misalignment = 1.0 / imu.rate_hz, imu.misalignment_deg * DEG
+    crosstalk = Crosstalk(period_s, misalignment) if misalignment else None
+    if not model.scale_factors:
+        crosstalk = ScaleNoise(period_s, misalignment, noise.rate_scale, noise.force_scale)
     return ImuBuffer(
         imu.rate_hz,
         config.estimator.buffer_s,
@@ -111,7 +118,7 @@ def imu_buffer_of(config: Config) -> ImuBuffer:
         imu.time_offset_s,
         imu.gap_s,
         Vibration(period_s, noise.rate_noise, noise.force_noise),
-        Crosstalk(period_s, misalignment) if misalignment else None,
+        crosstalk,
     )
 
 

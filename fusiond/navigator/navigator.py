@@ -94,7 +94,7 @@ class Navigator:
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         shared_blocks = self._intake.extra_blocks()
         self.model = model_of(config, *of_vehicle, *shared_blocks)
-        self.imu = imu_buffer_of(config)
+        self.imu = imu_buffer_of(config, self.model)
         self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         kinds = kinds_of_config(config, self.model)

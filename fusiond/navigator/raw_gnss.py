@@ -170,7 +170,7 @@ class RawEpochMeasurement(AidingMeasurement):
 
 @immutable(eq=False)
 class LevelEpoch(AidingMeasurement):
-    """An epoch for a vehicle whose attitude nobody knows (`AidingMeasurement.unturned`)."""
+    """An epoch for a vehicle whose attitude nobody knows (`AidingMeasurement.without_attitude`)."""
 
     screened: ClassVar[bool] = True
     locates: ClassVar[bool] = True

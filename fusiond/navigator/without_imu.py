@@ -7,15 +7,15 @@ a vehicle would feel which is level, faces north and goes on as it goes:
     w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
 
 so that velocity changes by the model's noise and by what is measured alone. Attitude is not known
-and not published; a lever arm counts by its upward part (`AidingMeasurement.unturned`). Of a
-vehicle that does not slide a heading says which way it goes, and a wheel how fast: both together
-carry the position on where no fix comes. Bearings say nothing without an attitude and are left out.
+and not published; a lever arm counts by its upward part (`AidingMeasurement.without_attitude`). Of
+a vehicle that does not slide a heading says which way it goes, and a wheel how fast: both together
+carry the position on where no fix comes. Bearings count with the attitude of a star tracker or
+another sensor, and on a road with a heading (`fusiond.aiding.bearing`); alone they say nothing.
 With `[estimator] filter = "federated"` the receivers have a local filter each, as in experiments 3
 and 4 of paper 004; every other filter is here the Kalman filter.
 
-The first fix, or an operator's position, makes a start that knows next to nothing, and is then an
-measurement like any other. When the
-inertial unit has aligned, its navigation takes over.
+The first fix, or an operator's position, makes a start that knows next to nothing, and is then a
+measurement like any other. When the inertial unit has aligned, its navigation takes over.
 """
 
 from __future__ import annotations
@@ -131,10 +131,13 @@ class WithoutImu:
         self._recent.extend(map(_Received, measurements))
         if self._first_ns is None and measurements:
             self._first_ns = seen_ns or measurements[0].t_ns
-        for one in measurements if self._way.known else ():
-            for candidate in one.candidates() if not one.locates else ():
+        for one in measurements:
+            if (attitude := one.orientation) is not None:
+                self._way.orient(attitude)
+            for candidate in one.candidates() if self._way.known and not one.locates else ():
                 if isinstance(candidate, HeadingCandidate):
-                    self._way.add(KnownHeading(candidate.t_ns, candidate.yaw_rad, candidate.sd_rad))
+                    own = candidate.t_ns, candidate.yaw_rad, candidate.sd_rad
+                    self._way.add(KnownHeading(*own, lasts=bool(candidate.shared)))
         if self.estimator is not None:
             for one in measurements:
                 self._insert(one)
@@ -254,7 +257,10 @@ class WithoutImu:
 
     def _insert(self, measurement: AidingMeasurement) -> Entry | None:
         level = measurement.without_attitude(self._way)
-        return None if level is None else self._timeline.insert(level)
+        if level is None:
+            self._ended.setdefault(measurement.source, Counter())["no_attitude"] += 1
+            return None
+        return self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:
         """Samples until now, and all that has come."""

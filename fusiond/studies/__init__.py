@@ -23,6 +23,7 @@ STUDIES = {
     "vehicle": "fusiond.studies.vehicle.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
     "drives": "fusiond.studies.drives",
+    "papers": "fusiond.studies.papers",
 }
 
 
@@ -93,5 +94,9 @@ ABOUT = {
     "drives": About(
         "Drives of a minute drawn at random, a row of figures each.",
         200,
+    ),
+    "papers": About(
+        "Every paper's model live: is its sigma honest, group by group?",
+        12,
     ),
 }

@@ -22,6 +22,7 @@ from fusiond.simulation.trajectories import static
 from tests import runs
 
 FULL = ("ins15", "ins20", "ins21", "ins23", "planar15")
+"""Models with states for the accelerometers' biases; `ins21` alone has some for scale factors."""
 
 
 def configured(model: str, **imu: object) -> Config:
@@ -30,17 +31,30 @@ def configured(model: str, **imu: object) -> Config:
 
 @pytest.mark.parametrize("kind", [None, *CLASSES])
 @pytest.mark.parametrize("name", MODELS)
-def test_models_with_the_states_leave_no_doubt(name: str, kind: str | None) -> None:
-    said = list(model_doubts(configured(name, **({} if kind is None else {"sensor_class": kind}))))
-    assert len(said) == (0 if name in FULL else 1)
+def test_each_model_with_each_class_says_what_it_lacks(name: str, kind: str | None) -> None:
+    config = configured(name, **({} if kind is None else {"sensor_class": kind}))
+    said, noise = list(model_doubts(config)), imu_noise(config.imu)
+    biases = [text for text in said if "has no accelerometer bias" in text]
+    scales = [text for text in said if "has no scale factors" in text]
+    assert len(biases) == (0 if name in FULL else 1)
+    assert len(scales) == (0 if name == "ins21" else 1)
+    assert len(said) == len(biases) + len(scales)
+    of = "[imu]" if kind is None else f"sensor class {kind!r}"
+    assert all(of in text and "choose" in text for text in said)
+    # With the number: what a bias does in a minute, and what a corner makes of the heading.
+    bias = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    assert all(f"the bias does {0.5 * bias * 3600.0:,.0f} m" in text for text in biases)
+    degrees = 90.0 * noise.rate_scale
+    assert all(f"by {degrees:.2g} deg in a quarter turn" in text for text in scales)
 
 
-def test_an_accelerometer_without_bias_needs_no_state() -> None:
+def test_a_unit_without_bias_and_scale_factors_needs_no_state() -> None:
     """That of paper 001, whose 1e-3 g is white."""
     white = {
         "accel_noise_m_s_sqrt_h": 0.083,
         "accel_bias_initial_mg": 1e-9,
         "accel_bias_instability_mg": 1e-9,
+        "gyro_scale_ppm": 1e-9,
     }
     for name in ("planar10", "ins17"):
         assert list(model_doubts(configured(name, **white))) == []
@@ -76,8 +90,9 @@ def test_the_daemon_says_it_once() -> None:
     events = Events(clock)
     events.listen(heard.append)
     Chain(configured("planar10"), clock, events)
-    (said,) = [e for e in heard if e.code == "states_absent"]
+    said, scales = [e for e in heard if e.code == "states_absent"]
     assert (said.source, said.level) == ("navigator", "warning")
     assert "the bias does 177 m" in said.text
+    assert "2,000 ppm of the gyros" in scales.text
     Chain(configured("ins21"), clock, events)
-    assert [e.code for e in heard].count("states_absent") == 1
+    assert [e.code for e in heard].count("states_absent") == 2

@@ -17,11 +17,12 @@ import pytest
 
 from fusiond.configuration.load import load_config
 from fusiond.demo.demo import ned_error
-from fusiond.demo.papers import PAPERS, paper_setup, settings
+from fusiond.demo.papers import paper_setup
 from fusiond.demo.setup import Unplugged
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth
+from fusiond.simulation.papers import PAPERS, settings
 from tests.live.daemon_bench import running
 from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY

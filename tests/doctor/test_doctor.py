@@ -109,6 +109,7 @@ async def test_all_is_well(tmp_path: Path) -> None:
     assert "PositionFix: " in text
     assert "gnss: nmea on " in text
     assert "rdss_card: family 4.0" in text
+    assert "beams 0 3 4 0 2 0: beam 3 serves" in text
     assert "system clock minus GNSS" in text
     assert "connected" in text
 

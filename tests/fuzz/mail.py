@@ -31,7 +31,7 @@ def rdss_mail(data: bytes) -> None:
     inbox = Inbox(session)
     user = OTHER if choice & 4 else OWN
     text = Text(OTHER, payload, ENCODINGS[choice & 3], user, odd=bool(choice & 128 and payload))
-    first, again = (inbox.take(text, t_ns).mail for t_ns in (1, 2))
+    first, again = (inbox.mail_of(text, t_ns).mail for t_ns in (1, 2))
     assert isinstance(first, MessageReceived)
     assert isinstance(again, MessageReceived)
     assert (first.payload, first.sender, first.repeated) == (payload, OTHER, False)

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusiond.configuration.schema import Config
-from fusiond.demo.papers import PAPERS, settings
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.gnss.atmosphere import slant, zenith_delays
 from fusiond.gnss.climbing import take_off_climb
 from fusiond.gnss.range_kernel import CARRIER_RATE, RANGE_VALUES, TROPOSPHERE_SIGMA
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
+from fusiond.simulation.papers import configured
 
 LAT_RAD, HEIGHT_M, CLIMB_M_S, SPAN_S = 0.53, 1200.0, 12.0, 0.2
 
@@ -45,10 +44,7 @@ def test_a_rate_that_was_not_measured_stays_so() -> None:
 
 def test_an_aircraft_that_climbs_knows_its_vertical_velocity(tmp_path: Path) -> None:
     """Paper 002 by ranges: 15 mm/s off, at a sigma of 6, where the delay's rate is left in."""
-    paper = PAPERS["002"]
-    found = settings("002") | {"alignment": paper.start["alignment"]}
-    config = Config.model_validate(found)
-    scenario = paper.scenario().fitted(config)
+    config, scenario = configured("002")
     files = simulate(scenario, tmp_path, seed=1, duration_s=110.0, gnss_raw="ubx").files
     measurements = [
         ("raw", files["raw"]),

@@ -25,6 +25,8 @@ from tests.patience import until
 
 REPORTS = f"[position_reports]\ncard = {ConvoyVehicle.CARD}\ninterval_s = 2.0\n"
 CONVOY = replace(REST, rdss=replace(REST.rdss, service_frequency_s=1, convoy=True))
+COMMAND = replace(REST, rdss=replace(REST.rdss, service_frequency_s=1, foreign_probability=1.0))
+"""A command terminal, to which the centre passes on the fixes of its subordinates."""
 
 
 class Spy:
@@ -90,6 +92,33 @@ async def test_a_vehicle_reports_what_it_knows_and_hears_of_the_other(bench: Ben
     assert place.lat_deg == pytest.approx(np.degrees(lat), abs=1e-4)
     assert beams is not None
     assert (beams.levels, beams.serving) == ((0, 3, 4, 0, 2, 0), 3)
+
+
+async def test_a_subordinates_fix_is_a_place_and_none_of_ones_own(bench: Bench) -> None:
+    vehicle = bench.vehicle(
+        COMMAND, gnss_link=bench.folder / "gnss", rdss_link=bench.folder / "rdss"
+    )
+    daemon = bench.daemon(RDSS, NO_MQTT)
+    spy = Spy()
+    daemon.outputs["spy"] = spy
+
+    def places() -> list[FleetMessage]:
+        return [
+            m for path, m in spy.taken if path.startswith("fleet/") and isinstance(m, FleetMessage)
+        ]
+
+    async with running(daemon, vehicle):
+        await bench.mode(PARKED)
+        await until(lambda: len(places()) >= 2)
+        health = bench.health["rdss"]
+    lat, lon, _ = vehicle.truth.at(np.zeros(1)).position[0]
+    for place in places():
+        assert place.by == "centre"
+        # It is driven a tenth of a degree to the north.
+        assert place.lat_deg == pytest.approx(np.degrees(lat) + 0.1, abs=0.01)
+        assert place.lon_deg == pytest.approx(np.degrees(lon), abs=0.01)
+    assert health.counters["foreign_fix"] >= 2
+    assert abs(bench.seen[-1].lat_rad - lat) < 1e-5
 
 
 def reported(message: TextRequest) -> PositionReport:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drivers.measurements import MagneticHeading, MonotonicStamp, WheelSpeed
-from fusiond.aiding.body_velocity import WheelSpeedAid
-from fusiond.aiding.compass import CompassAid
+from fusiond.aiding.body_velocity import WheelSpeedMeasurement
+from fusiond.aiding.compass import CompassMeasurement
 from fusiond.configuration.aiding import CompassAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.kalman import KalmanEstimator
@@ -108,10 +108,10 @@ def test_wheel_and_compass_count_their_drifts() -> None:
     wheel = WheelSpeed("wheel", 5, stamp, 10.0)
     compass = MagneticHeading("compass", 5, stamp, 1.0)
 
-    def made() -> tuple[WheelSpeedAid, CompassAid]:
+    def made() -> tuple[WheelSpeedMeasurement, CompassMeasurement]:
         (one,), (other,) = intake.aids(wheel, 5, 0.0), intake.aids(compass, 5, 0.0)
-        assert isinstance(one, WheelSpeedAid)
-        assert isinstance(other, CompassAid)
+        assert isinstance(one, WheelSpeedMeasurement)
+        assert isinstance(other, CompassMeasurement)
         return one, other
 
     speed, heading = made()

@@ -1,4 +1,4 @@
-"""Without an inertial unit: raw ranges, wheels and headings, and an operator's position."""
+"""Without an inertial unit: ranges, wheels, headings, bearings, an operator's position."""
 
 from __future__ import annotations
 
@@ -7,11 +7,22 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, WheelSpeed
+from drivers.measurements import (
+    Attitude,
+    Bearing,
+    Heading,
+    Measurement,
+    MonotonicStamp,
+    PositionFix,
+    WheelSpeed,
+)
 from drivers.raw.messages import RawGnssEpoch
+from fusiond.aiding.bearing import line_of_sight
 from fusiond.configuration.schema import Config
+from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
@@ -128,7 +139,7 @@ def test_a_heading_of_a_vehicle_that_may_slide_is_left_out() -> None:
     navigator = Navigator(Config.model_validate({"aiding": aiding}))
     driven(navigator, [(t, m) for t, m in _town(44.0) if not isinstance(m, WheelSpeed)])
     assert navigator.without_imu.active
-    assert "heading" not in navigator.without_imu.counted()
+    assert set(navigator.without_imu.counted()["heading"]) == {"no_attitude"}
 
 
 def test_the_order_in_which_headings_and_speeds_come_leaves_no_trace() -> None:
@@ -174,3 +185,59 @@ def test_an_operator_says_where_it_is_and_a_wheel_goes_on() -> None:
     lat, lon, height = (float(x) for x in truth.at(np.array([43.9])).position[0])
     assert navigator.set_position(lat + 0.01, lon, height, 3.0, now) == "gated"
     assert navigator.set_position(lat, lon, height, 3.0, now + TICK_NS) == "fused"
+
+
+SQUARE: dict[str, Any] = {"misalignment_sd_arcsec": 0.0}
+"""Of a sensor whose axes are the body's."""
+POINTS = {"1": (30.53, 114.33, 20.0), "2": (30.47, 114.34, 30.0)}
+
+
+def _seen(until_s: float, attitudes: bool) -> list[tuple[int, Measurement]]:
+    """Fixes until then; bearings of two points in turn and attitudes, once a second."""
+    d, rng = drive(), np.random.default_rng(9)
+    found: list[tuple[int, Measurement]] = [
+        (m.t_seen_ns, m)
+        for m in d.measurements
+        if isinstance(m, PositionFix) and m.t_seen_ns < START_NS + until_s * runs.SECOND
+    ]
+    for t_s in np.arange(9.0, 43.0, 1.0):
+        at, true = START_NS + round(t_s * 1e9), d.truth.at(np.array([t_s]))
+        stamp, noise = MonotonicStamp(at), rng.standard_normal(5) * 1e-3
+        if attitudes:
+            roll, pitch, yaw = (true.rpy[0] + noise[:3]).tolist()
+            found.append((at, Attitude("star", at, stamp, (roll, pitch, yaw), (1e-3,) * 3)))
+        name = str(1 + round(t_s) % 2)
+        lat, lon, height = POINTS[name]
+        point = math.radians(lat), math.radians(lon), height
+        place = tuple(true.position[0].tolist())
+        x, y, z = dcm_from_rpy(*true.rpy[0].tolist()).T @ line_of_sight(place, point)
+        azimuth, elevation = (
+            math.atan2(y, x) + noise[3],
+            math.atan2(-z, math.hypot(x, y)) + noise[4],
+        )
+        of = Bearing("sar", at, stamp, azimuth, elevation, (1e-3, 1e-3), name)
+        found.append((at + 1, of))  # after the attitude of the same instant
+    return found
+
+
+@pytest.mark.parametrize("attitudes", [True, False])
+def test_bearings_carry_on_where_fixes_end_if_something_measures_the_attitude(
+    attitudes: bool,
+) -> None:
+    sar = {"kind": "sar", "min_range_m": 100.0, "targets_deg_m": POINTS, **SQUARE}
+    aiding = {"gnss": FIXES, "sar": sar, "star": {"kind": "star_tracker", **SQUARE}}
+    navigator = Navigator(Config.model_validate({"aiding": aiding}))
+    said = driven(navigator, _seen(20.0, attitudes))
+    off, sd = errors(said[250:420], drive().truth)
+    assert np.abs(off / sd).max() < 4.0
+    counts = navigator.outcomes()["sar"]
+    if attitudes:
+        # Points 4 km away to 1.4 mrad are 6 m across the sight, the other one crosses it.
+        assert np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))) < 15.0
+        assert 0.15 < np.mean((off / sd)[:, :2] ** 2) < 1.6
+        assert np.hypot(*sd[-1, :2]) < 15.0
+        assert counts["fused"] > 25
+    else:
+        assert np.hypot(*sd[-1, :2]) > 50.0, "one bearing has two angles, an attitude three"
+        assert counts["fused"] == 0
+        assert counts["no_attitude"] > 25

@@ -16,7 +16,8 @@ group delay; all lengths m. What is drawn, one sigma in `GnssRawOptions`:
     s    error of the broadcast orbit and clock of each satellite, as smooth as orbits: what follows
          a Gauss-Markov process u, s' = (u - s) / T
     T    Saastamoinen's zenith delays with the wet one off by a constant, mapped by Niell
-    I    Klobuchar's GPS model; GPS broadcasts other coefficients, BeiDou its own model's
+    I    Klobuchar's GPS model, on a day on which the sky has more or less of it by a constant
+         factor; GPS broadcasts other coefficients, BeiDou its own model's
     nlos what a satellite's ranges have more while it comes by a wall alone
     mp   multipath, Gauss-Markov for each signal: sigma_mp (0.13 + 0.53 exp(-E / 10 deg))
     n    white; its sigma is that at 45 dB Hz times 10^((45 - C/N0) / 20)
@@ -78,6 +79,8 @@ GPS_BETA = (1.05e5, 9.8e4, -6.5e4, -3.3e5)
 BEIDOU_ALPHA = (2.4e-8, 4.5e-8, -3.0e-7, 4.2e-7)
 BEIDOU_BETA = (1.25e5, -3.3e4, 1.3e5, 1.3e5)
 """Broadcast models of the same sky that miss by a third or so at noon."""
+LEAST_IONOSPHERE = 0.1
+"""Of an ordinary day's: there is always some."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,8 @@ class GnssRawOptions:
     signal_in_space_sd_m: float = 0.5
     signal_in_space_correlation_s: float = 1800.0
     wet_delay_sd_m: float = 0.04
+    ionosphere_sd: float = 0.0
+    """Of the day's ionosphere, as a share of an ordinary one: models leave half of it."""
     clock_offset_sd_m: float = 3000.0
     clock_drift_constant_sd_m_s: float = 20.0
     clock_drift_sd_m_s: float = 0.5
@@ -174,6 +179,9 @@ class GnssRaw:
         )
         self.reflected_m = self._draw_reflections(n, step)
         """(n, satellites), m: what a satellite's ranges have more, satellites as `satellites`."""
+        # The last one drawn: what has no such days is as before.
+        more = float(rng.standard_normal()) * o.ionosphere_sd if o.ionosphere_sd else 0.0
+        self.ionosphere_factor = max(1.0 + more, LEAST_IONOSPHERE)
         self.begin(*start)
 
     @property
@@ -302,6 +310,7 @@ class GnssRaw:
             ionosphere = (CARRIER_HZ["G", "1"] / hz) ** 2 * klobuchar_gps(
                 self._coefficients, tow_s, lat, lon, e, math.cos(azimuth[i]), math.sin(azimuth[i])
             )
+            ionosphere *= self.ionosphere_factor
             cno = 36.0 + 12.0 * math.sin(e)
             weaker = 10.0 ** ((45.0 - cno) / 20.0)
             noise = self._white[k, cell].astype(np.float64)
