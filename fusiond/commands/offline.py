@@ -37,6 +37,7 @@ LOG_EVENTS = {
     "recorder_zone",
     "recorder_paused",
     "recorder_clock_off",
+    "recorder_clock_slewed",
     "system_clock_stepped",
     "utc_jumped",
     "utc_implausible",
