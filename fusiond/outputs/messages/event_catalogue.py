@@ -98,6 +98,11 @@ RECEIVERS: Mapping[str, Entry] = {
         "Only GLL has a position: no height, large sigma.",
         "Switch on GGA, RMC and GST.",
     ),
+    "attitude_left_out": Entry(
+        "info",
+        "A receiver tells its heading in a sentence of its maker's alone.",
+        "Switch on THS or HDT at the receiver.",
+    ),
     "compass_left_out": Entry(
         "info",
         "Headings of a compass arrive on a receiver's port.",
