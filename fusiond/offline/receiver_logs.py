@@ -29,6 +29,7 @@ from drivers.raw.rinex import (
     RinexError,
     version_and_type,
 )
+from drivers.raw.rinex2 import as_version_3
 from drivers.raw.rinex_nav import Broadcast, navigation
 from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
 from drivers.sbf.decoder import SbfDecoder
@@ -161,6 +162,7 @@ def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
     to a receiver that has been on. TableError where it is neither."""
     counters = Counter[str]()
     try:
+        text = as_version_3(text)
         if version_and_type(text)[1] == "N":
             rows = _broadcast(navigation(source, text, counters), imu)
         else:
