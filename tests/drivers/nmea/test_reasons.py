@@ -134,6 +134,10 @@ def novatel_text(payload: bytes) -> bytes:
     )
 
 
+def novatel_short(payload: bytes) -> bytes:
+    return b"%INSPVASA,2171,123456.000;2171,123456.000,51.1,-114.0,1064.9,0.1,0.2*0a1b2c3d\r\n"
+
+
 def gpsd(payload: bytes) -> bytes:
     return b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
 
@@ -149,6 +153,7 @@ def stripped(payload: bytes) -> bytes:
         (novatel, "NovAtel or Unicore"),
         (unicore, "NovAtel or Unicore"),
         (novatel_text, "text logs of NovAtel"),
+        (novatel_short, "short headers"),
         (sirf, "SiRF"),
         (skytraq, "SkyTraq"),
         (allystar, "Allystar"),
