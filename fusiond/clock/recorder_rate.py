@@ -10,13 +10,14 @@ percent for good. Hence r is constant between changes whose number is the least 
 reports: as long as one line passes all reports of a stretch within their own scatter, nothing has
 changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
 
-A rate counts where it is beyond the drift, and what it comes to beyond what a delay explains: the
-envelope of UTC (fusiond.clock.utc_envelope) follows all else.
+A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
+explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -28,10 +29,15 @@ from fusiond.clock.recorder_clock import ENOUGH_REPORTS, LEAP_NS, Slew
 SPACING_NS = SECOND_NS // 2
 """Between reports that are looked at: a change is followed within seconds, and a receiver that
 tells whole seconds alone tells each at its beginning."""
-FLOOR_NS = 5 * MILLISECOND_NS
+FLOOR_NS = 2 * MILLISECOND_NS
 """Scatter of reports at the least: a CAN controller's queue."""
 SCATTERS = 4.0
 """Sigmas that a sound report may be off its line: one of 16,000 is further."""
+DAMAGED = 2
+"""Reports off a line that may be damage: three are a change."""
+EVER_NS = 1 << 62
+"""Longer than any log: what the first and the last reports tell of the rate held before and holds
+after them."""
 FASTEST = 0.5
 """Gain or loss beyond which nothing is a clock's rate: adjtimex(2) allows 0.1, and reports that
 halt or come at once are a receiver's."""
@@ -61,17 +67,23 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
     lines = _joined(
         [_line(s, lead, *ends) for ends in _stretches(s, lead, within)], s, lead, within
     )
-    found = []
-    for k, line in enumerate(lines):
-        span_s = float(s[line.last] - s[line.first])
-        beyond = abs(line.slope) > drift_ppm * 1e-6 + within / max(span_s, 1e-9)
-        gained_s = abs(line.slope) * span_s
+    edges = [-np.inf, *(_edge(*pair, s) for pair in pairwise(lines)), np.inf]
+    found, gained_s = [], 0.0
+    for line, begin, end in zip(lines, edges, edges[1:], strict=False):
+        first, last = float(s[line.first]), float(s[line.last])
         rate = line.slope / (1.0 - line.slope)  # a second of UTC for one of the recorder's
-        if not beyond or gained_s < LEAP_NS * 1e-9 or abs(rate) > FASTEST:
+        if (
+            abs(line.slope) <= drift_ppm * 1e-6 + 2.0 * within / (last - first)
+            or abs(rate) > FASTEST
+        ):
             continue
-        edges = _edge(lines, k - 1, s), _edge(lines, k, s)
-        found.append(Slew(*(begin_ns + round(edge * SECOND_NS) for edge in edges), rate))
-    return tuple(found)
+        found.append(Slew(*(begin_ns + _ns(edge) for edge in (begin, end)), rate))
+        gained_s = max(gained_s, abs(line.slope) * (min(end, float(s[-1])) - max(begin, 0.0)))
+    return tuple(found) if gained_s >= LEAP_NS * 1e-9 else ()
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * SECOND_NS) if np.isfinite(t_s) else round(np.copysign(EVER_NS, t_s))
 
 
 def _thinned(reports: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -126,23 +138,18 @@ def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) 
             both = _line(s, lead, found[-2].first, found[-1].last)
             at, y = s[both.first : both.last + 1], lead[both.first : both.last + 1]
             off = np.abs(y - both.lead_s - both.slope * (at - both.middle_s))
-            if float(np.quantile(off, 0.9)) > within:
+            if int((off > within).sum()) > DAMAGED:
                 break
             found[-2:] = [both]
     return found
 
 
-def _edge(lines: list[_Line], k: int, s: np.ndarray) -> float:
-    """Where line `k` gives way to the next: where they meet, if that is between their middles."""
-    if k < 0:
-        return 0.0
-    if k + 1 == len(lines):
-        return float(s[-1])
-    one, next_one = lines[k], lines[k + 1]
-    between = float(s[one.last] + s[next_one.first]) / 2.0
-    apart = one.slope - next_one.slope
+def _edge(one: _Line, other: _Line, s: np.ndarray) -> float:
+    """Where a line gives way to the next: where they meet, if that is between their middles."""
+    between = float(s[one.last] + s[other.first]) / 2.0
+    apart = one.slope - other.slope
     if not apart:
         return between
-    of_one, of_next = (line.lead_s - line.slope * line.middle_s for line in (one, next_one))
-    meet = (of_next - of_one) / apart
-    return meet if one.middle_s < meet < next_one.middle_s else between
+    of_one, of_other = (line.lead_s - line.slope * line.middle_s for line in (one, other))
+    meet = (of_other - of_one) / apart
+    return meet if one.middle_s < meet < other.middle_s else between

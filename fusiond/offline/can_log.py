@@ -221,14 +221,15 @@ class _Replay:
 
     def tell_slews(self, source: str, slews: tuple[Slew, ...]) -> None:
         """By how much the recorder's clock was slewed, and when."""
-        first, *others = slews
-        span_s = (first.end_ns - first.begin_ns) * 1e-9
-        how = "fast" if first.rate > 0.0 else "slow"
-        more = f", and {len(others)} times more at another rate" if others else ""
+        largest = max(slews, key=lambda slew: abs(slew.rate))
+        how = "fast" if largest.rate > 0.0 else "slow"
+        times = f"in {len(slews)} stretches, at most " if len(slews) > 1 else ""
+        since = f"from {largest.begin_ns * 1e-9:.3f} s of the log on"
         self._told(
             "recorder_clock_slewed",
-            f"the recorder's clock ran {abs(first.rate):.2%} too {how} for {span_s:.0f} s from "
-            f"{first.begin_ns * 1e-9:.3f} s of the log on{more}: time is {source}'s there",
+            f"the recorder's clock ran {times}{abs(largest.rate):.2%} too {how} "
+            f"{since if largest.begin_ns > 0 else 'from the beginning on'}: time is "
+            f"{source}'s there",
         )
 
     def _tell_pause(self, passed_ns: int) -> None:
