@@ -11,7 +11,8 @@ reports: as long as one line passes all reports of a stretch within their own sc
 changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
 
 A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
-explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else.
+explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else. That of the first and
+of the last reports is held before and behind them, for as long as it was seen.
 """
 
 from __future__ import annotations
@@ -35,9 +36,6 @@ SCATTERS = 4.0
 """Sigmas that a sound report may be off its line: one of 16,000 is further."""
 DAMAGED = 2
 """Reports off a line that may be damage: three are a change."""
-EVER_NS = 1 << 62
-"""Longer than any log: what the first and the last reports tell of the rate held before and holds
-after them."""
 FASTEST = 0.5
 """Gain or loss beyond which nothing is a clock's rate: adjtimex(2) allows 0.1, and reports that
 halt or come at once are a receiver's."""
@@ -67,7 +65,11 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
     lines = _joined(
         [_line(s, lead, *ends) for ends in _stretches(s, lead, within)], s, lead, within
     )
-    edges = [-np.inf, *(_edge(*pair, s) for pair in pairwise(lines)), np.inf]
+    if not lines:
+        return ()
+    before, after = (float(s[line.last] - s[line.first]) for line in (lines[0], lines[-1]))
+    inner = (_edge(*pair, s) for pair in pairwise(lines))
+    edges = [s[lines[0].first] - before, *inner, s[lines[-1].last] + after]
     found, gained_s = [], 0.0
     for line, begin, end in zip(lines, edges, edges[1:], strict=False):
         first, last = float(s[line.first]), float(s[line.last])
@@ -77,13 +79,9 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
             or abs(rate) > FASTEST
         ):
             continue
-        found.append(Slew(*(begin_ns + _ns(edge) for edge in (begin, end)), rate))
+        found.append(Slew(*(begin_ns + round(at * SECOND_NS) for at in (begin, end)), rate))
         gained_s = max(gained_s, abs(line.slope) * (min(end, float(s[-1])) - max(begin, 0.0)))
     return tuple(found) if gained_s >= LEAP_NS * 1e-9 else ()
-
-
-def _ns(t_s: float) -> int:
-    return round(t_s * SECOND_NS) if np.isfinite(t_s) else round(np.copysign(EVER_NS, t_s))
 
 
 def _thinned(reports: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

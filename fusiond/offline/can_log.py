@@ -224,12 +224,10 @@ class _Replay:
         largest = max(slews, key=lambda slew: abs(slew.rate))
         how = "fast" if largest.rate > 0.0 else "slow"
         times = f"in {len(slews)} stretches, at most " if len(slews) > 1 else ""
-        since = f"from {largest.begin_ns * 1e-9:.3f} s of the log on"
         self._told(
             "recorder_clock_slewed",
-            f"the recorder's clock ran {times}{abs(largest.rate):.2%} too {how} "
-            f"{since if largest.begin_ns > 0 else 'from the beginning on'}: time is "
-            f"{source}'s there",
+            f"the recorder's clock ran {times}{abs(largest.rate):.2%} too {how} from "
+            f"{largest.begin_ns * 1e-9:.3f} s of the log on: time is {source}'s there",
         )
 
     def _tell_pause(self, passed_ns: int) -> None:
