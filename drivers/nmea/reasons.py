@@ -190,6 +190,17 @@ def _heading(heard: Heard) -> str:
     return next((name for name in OF_A_COMPASS if name in heard.unused), "")
 
 
+def _attitude(heard: Heard) -> str:
+    """The sentence on a heading that comes in a maker's own form alone; "" where none does."""
+    name = next((n for n in heard.unused for own in ATTITUDES if n.startswith(own)), "")
+    if not name or {"HDT", "THS"} & set(heard.used):
+        return ""
+    return (
+        f"the receiver's heading arrives in a sentence of its maker's alone (${name}), which is "
+        "not read: switch on THS or HDT"
+    )
+
+
 def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, str]:
     """By counter: what makes the fixes poorer than the receiver could, and what was done."""
     found = {}
@@ -234,12 +245,8 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
             f"headings of a compass arrive ({heading}), which a receiver's source does not use: a "
             'source with driver = "compass" reads them'
         )
-    attitude = next((n for n in heard.unused for own in ATTITUDES if n.startswith(own)), "")
-    if attitude and counters["fixes"] and not {"HDT", "THS"} & set(heard.used):
-        found["attitude_left_out"] = (
-            f"the receiver's heading arrives in a sentence of its maker's alone (${attitude}), "
-            "which is not read: switch on THS or HDT"
-        )
+    if attitude := _attitude(heard) * bool(counters["fixes"]):
+        found["attitude_left_out"] = attitude
     if counters["integrated"]:
         found["integrated"] = (
             "the positions' talker is II or IN: a plotter or an adapter may have smoothed them, or "

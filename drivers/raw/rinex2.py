@@ -122,7 +122,7 @@ def _named(types: list[str]) -> Iterator[str]:
 def _name(kind: str, types: list[str], codes: dict[str, str]) -> str:
     if len(kind) != 2:
         return _NOT_READ
-    letter, band = kind
+    letter, band = kind[0], kind[1]
     if letter in "CP":
         return f"C{codes[kind]}" if kind in codes else _NOT_READ
     served = [name for name in _SERVES.get(band, ()) if name in types and name in codes]

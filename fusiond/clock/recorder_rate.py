@@ -79,7 +79,8 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
             or abs(rate) > FASTEST
         ):
             continue
-        found.append(Slew(*(begin_ns + round(at * SECOND_NS) for at in (begin, end)), rate))
+        begin_at, end_at = (begin_ns + round(at * SECOND_NS) for at in (begin, end))
+        found.append(Slew(begin_at, end_at, rate))
         gained_s = max(gained_s, abs(line.slope) * (min(end, float(s[-1])) - max(begin, 0.0)))
     return tuple(found) if gained_s >= LEAP_NS * 1e-9 else ()
 
@@ -98,7 +99,7 @@ def _scatter_s(s: np.ndarray, lead: np.ndarray) -> float:
     share = (s[1:-1] - s[:-2]) / (s[2:] - s[:-2])
     off = lead[1:-1] - lead[:-2] - share * (lead[2:] - lead[:-2])
     sigma = float(np.median(np.abs(off))) / 0.6745 / 1.5**0.5  # of three independent ones
-    return min(max(sigma, FLOOR_NS * 1e-9), LEAP_NS * 1e-9 / SCATTERS)
+    return float(np.clip(sigma, FLOOR_NS * 1e-9, LEAP_NS * 1e-9 / SCATTERS))
 
 
 def _stretches(s: np.ndarray, lead: np.ndarray, within: float) -> list[tuple[int, int]]:
@@ -143,11 +144,11 @@ def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) 
 
 
 def _edge(one: _Line, other: _Line, s: np.ndarray) -> float:
-    """Where a line gives way to the next: where they meet, if that is between their middles."""
+    """Time at which a line gives way to the next: where they meet, if between their middles."""
     between = float(s[one.last] + s[other.first]) / 2.0
-    apart = one.slope - other.slope
-    if not apart:
+    turn = one.slope - other.slope
+    if not turn:
         return between
     of_one, of_other = (line.lead_s - line.slope * line.middle_s for line in (one, other))
-    meet = (of_other - of_one) / apart
+    meet = (of_other - of_one) / turn
     return meet if one.middle_s < meet < other.middle_s else between

@@ -109,7 +109,7 @@ def read_can_log(path: Path, config: Config) -> CanLog:
     if not slews:
         return log
     again = _Replay(path, config, slews)
-    again.tell_slews(source, slews)
+    again.report_slews(source, slews)
     return again.run()
 
 
@@ -219,7 +219,7 @@ class _Replay:
     def _clock_told(self, code: str, text: str) -> None:
         self._told(code, f"{text}, at {self._recorder.stamp_ns * 1e-9:.3f} s of the log")
 
-    def tell_slews(self, source: str, slews: tuple[Slew, ...]) -> None:
+    def report_slews(self, source: str, slews: tuple[Slew, ...]) -> None:
         """By how much the recorder's clock was slewed, and when."""
         largest = max(slews, key=lambda slew: abs(slew.rate))
         how = "fast" if largest.rate > 0.0 else "slow"
