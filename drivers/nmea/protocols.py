@@ -142,7 +142,7 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
         f'{_SWITCH}, or have it read: driver = "bestpos"',
     ),
     (
-        "logs of NovAtel with short headers (%...)",
+        "NovAtel's form of logs with short headers (%...)",
         lambda d: len(_NOVATEL_SHORT.findall(d)),
         f'{_SWITCH}, or BESTPOSA and BESTVELA with their long ones: driver = "bestpos"',
     ),
@@ -186,8 +186,7 @@ def named(data: bytes) -> str:
     """Text on the protocol of these bytes, as a sentence; "" where nobody knows them."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
-            verb = "arrive, which are" if "logs" in name else "arrives, which is"
-            return f"{name} {verb} not read here: {remedy}"
+            return f"{name} arrives, which is not read here: {remedy}"
     return _text(data)
 
 
