@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import importlib.resources
+import subprocess
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -134,12 +136,12 @@ def is_of_week(imu: ImuTable) -> bool:
 # --------------------------------------------------------------------------- RINEX
 
 
-def rinex_text(path: Path, data: bytes) -> str | None:
-    """The file's text, unpacked (Hatanaka, compress, zip); None where it is no RINEX file.
-    MissingPackageError, TableError."""
+def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
+    """The file's text, unpacked (Hatanaka, compress, zip), and what is lost of it; None where it is
+    no RINEX file. MissingPackageError, TableError."""
     label = data[:80].partition(b"\n")[0][LABEL].decode("ascii", "replace").strip()
     if label == FIRST_LABEL:
-        return data.decode("ascii", "replace")
+        return data.decode("ascii", "replace"), []
     if label != COMPRESSED_LABEL and not data.startswith(_COMPRESSED):
         return None
     try:
@@ -150,9 +152,23 @@ def rinex_text(path: Path, data: bytes) -> str | None:
             f"{install('rinex')}"
         ) from error
     try:
-        return str(hatanaka.decompress(data).decode("ascii", "replace"))
+        return str(hatanaka.decompress(data).decode("ascii", "replace")), []
     except Exception as error:  # it hands on what zip, ncompress and crx2rnx raise
-        raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
+        text = _before_damage(data) if label == COMPRESSED_LABEL else ""
+        if not text:
+            raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
+        why = str(error).partition(".")[0]
+        return text, [Rejection(0, "file_cut", f"used up to the damage: {why}", 0)]
+
+
+def _before_damage(data: bytes) -> str:
+    """Epochs of Hatanaka's compression up to where it cannot be followed, which the package's own
+    program has written by then; "" where there is none."""
+    program = importlib.resources.files("hatanaka.bin") / "crx2rnx"
+    with importlib.resources.as_file(program) as path:
+        done = subprocess.run([path, "-"], input=data, capture_output=True, check=False)
+    text = done.stdout.decode("ascii", "replace")
+    return text[: text.rfind("\n") + 1] if "\n>" in text or "END OF HEADER" in text else ""
 
 
 def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:

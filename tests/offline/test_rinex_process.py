@@ -134,9 +134,9 @@ def navigation_2(text: str) -> str:
 
 def test_rinex_2_of_the_same_station(tmp_path: Path) -> None:
     """GPS alone, converted: the station stands where it is."""
-    observed = rinex_text(OBSERVATIONS, gzip.decompress(OBSERVATIONS.read_bytes()))
-    assert observed is not None
-    (tmp_path / "esbc1770.20o").write_text(observations_2(observed))
+    unpacked = rinex_text(OBSERVATIONS, gzip.decompress(OBSERVATIONS.read_bytes()))
+    assert unpacked is not None
+    (tmp_path / "esbc1770.20o").write_text(observations_2(unpacked[0]))
     sent = gzip.decompress(NAVIGATION.read_bytes()).decode()
     (tmp_path / "esbc1770.20n.gz").write_bytes(gzip.compress(navigation_2(sent).encode()))
     imu = standing(tmp_path / "imu.csv", POSIX_S + FROM_S)
@@ -153,6 +153,25 @@ def test_rinex_2_of_the_same_station(tmp_path: Path) -> None:
     )
     assert np.linalg.norm(off) < 5.0, off
     assert (np.abs(off) < 3.0 * solution.sd_position[-1]).all(), (off, solution.sd_position[-1])
+
+
+@pytest.mark.parametrize("share", [0.04, 0.5, 0.97])
+def test_a_cut_hatanaka_file_is_used_up_to_the_cut(tmp_path: Path, share: float) -> None:
+    """As a station that lost its power leaves it; what a lost line damages, too."""
+    whole = gzip.decompress(OBSERVATIONS.read_bytes())
+    head = whole.index(b"END OF HEADER") + 14
+    at = head + round(share * (len(whole) - head))
+    imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
+    rows, _ = READERS["raw"](OBSERVATIONS, imu, "raw")
+    for data in (whole[:at], whole[:at] + whole[at + 200 :]):
+        cut = tmp_path / "cut.crx"
+        cut.write_bytes(data)
+        found, lost = READERS["raw"](cut, imu, "raw")
+        assert len(rows) * share - 12 < len(found) <= len(rows) * share + 12
+        for one, other in zip(found[:-1], rows, strict=False):
+            assert one.measurement == other.measurement
+        (note,) = [each for each in lost if each.reason == "file_cut"]
+        assert "up to the damage" in note.detail
 
 
 def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
