@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
 import importlib.resources
 import subprocess
@@ -136,13 +137,25 @@ def is_of_week(imu: ImuTable) -> bool:
 # --------------------------------------------------------------------------- RINEX
 
 
+_LINE = 200
+"""Characters in which a first line ends."""
+
+
 def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
     """The file's text, unpacked (Hatanaka, compress, zip), and what is lost of it; None where it is
     no RINEX file. MissingPackageError, TableError."""
-    label = data[:80].partition(b"\n")[0][LABEL].decode("ascii", "replace").strip()
+    data = data.removeprefix(codecs.BOM_UTF8).lstrip(b"\r\n")
+    first = data[:_LINE].partition(b"\n")[0].decode("ascii", "replace")
+    label = first[LABEL].strip()
+    packed = label == COMPRESSED_LABEL or data.startswith(_COMPRESSED)
+    if FIRST_LABEL.casefold() in first.casefold() and label != FIRST_LABEL and not packed:
+        raise TableError(
+            f"{path}: the first line of this RINEX file has its label elsewhere than from column "
+            "61 on, or in small letters: it has been edited, take it as it was written"
+        )
     if label == FIRST_LABEL:
         return data.decode("ascii", "replace"), []
-    if label != COMPRESSED_LABEL and not data.startswith(_COMPRESSED):
+    if not packed:
         return None
     try:
         hatanaka: Any = importlib.import_module("hatanaka")

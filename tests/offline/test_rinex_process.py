@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
+from fusiond.files.csv_tables import TableError
 from fusiond.files.tables import read_imu, read_solution
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
@@ -190,6 +191,22 @@ def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
             assert abs(row.t_arrival_ns - toe_ns) < 4 * 3600 * 10**9
     assert first >= 90
     assert later > 1500
+
+
+def test_first_lines_that_editors_leave(tmp_path: Path) -> None:
+    """A byte order mark and blank lines are passed over; a moved label is named."""
+    imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
+    unpacked = rinex_text(OBSERVATIONS, gzip.decompress(OBSERVATIONS.read_bytes()))
+    assert unpacked is not None
+    text = "\n>".join(unpacked[0].split("\n>")[:4]) + "\n"
+    for odd in ("\ufeff" + text, "\r\n" + text, text.replace("\n", "\r\n"), observations_2(text)):
+        file = tmp_path / "odd.rnx"
+        file.write_text(odd, newline="")
+        assert len(READERS["raw"](file, imu, "raw")[0]) == 3
+    for odd in (text.replace("  ", "\t"), text.replace("RINEX VERSION", "Rinex Version")):
+        file.write_text(odd)
+        with pytest.raises(TableError, match="its label elsewhere"):
+            READERS["raw"](file, imu, "raw")
 
 
 def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
