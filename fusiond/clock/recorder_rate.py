@@ -70,8 +70,11 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
     before, after = (float(s[line.last] - s[line.first]) for line in (lines[0], lines[-1]))
     inner = (_edge(*pair, s) for pair in pairwise(lines))
     edges = [s[lines[0].first] - before, *inner, s[lines[-1].last] + after]
+    late = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
     found, gained_s = [], 0.0
     for line, begin, end in zip(lines, edges, edges[1:], strict=False):
+        if line in late:
+            continue
         first, last = float(s[line.first]), float(s[line.last])
         rate = line.slope / (1.0 - line.slope)  # a second of UTC for one of the recorder's
         if (
@@ -141,6 +144,16 @@ def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) 
                 break
             found[-2:] = [both]
     return found
+
+
+def _meet(one: _Line, other: _Line, s: np.ndarray) -> bool:
+    """True if a clock can go from one line on to the next: it does not leap, reports that queue
+    somewhere do as the queue builds up or is over."""
+    last, first = float(s[one.last]), float(s[other.first])
+    middle = (last + first) / 2.0
+    ends = (line.lead_s + line.slope * (middle - line.middle_s) for line in (one, other))
+    steepest = max(abs(one.slope), abs(other.slope))
+    return abs(next(ends) - next(ends)) < LEAP_NS * 1e-9 + steepest * (first - last)
 
 
 def _edge(one: _Line, other: _Line, s: np.ndarray) -> float:

@@ -73,6 +73,8 @@ def test_reports_of_whole_seconds() -> None:
         lambda t_s: 1e-4 * t_s,
         lambda t_s: 5.0 * (t_s > 60.0),  # the receiver's own UTC has jumped
         lambda t_s: 0.15 * (40.0 < t_s < 50.0),  # a line that was busy
+        lambda t_s: max(0.0, 1.0 - (t_s - 60.0) / 5.0) * (t_s > 60.0),  # a queue that is drained
+        lambda t_s: (t_s - 60.0) / 5.0 * (60.0 < t_s < 66.0),  # one that is thrown away
     ],
 )
 def test_no_slew_where_there_is_none(ahead_s: Callable[[float], float]) -> None:
