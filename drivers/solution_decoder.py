@@ -41,6 +41,8 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         self._cycle = Cycle(self.counters)
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
+        self.left_out: Counter[str] = Counter()
+        """Names of messages that are not used, of a stream of nonsense the first few."""
 
     @property
     def refusal(self) -> str:

@@ -91,7 +91,9 @@ class SolutionDriver(ReceiverDriver):
     def _useless_detail(self) -> str:
         if self.counters["position_type_unknown"]:
             return "the receiver names a kind of position that is not known here: please report it"
-        nothing = f"{self.wanted} arrives, but none with a position: {self.switch_on}"
+        left_out = self._solutions.left_out
+        names = f" ({', '.join(left_out)})" if left_out else ""
+        nothing = f"nothing with a position arrives{names}: {self.switch_on}"
         return REFUSALS.get(self._solutions.refusal, nothing)
 
     def _unintelligible_detail(self) -> str:

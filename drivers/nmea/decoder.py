@@ -19,10 +19,10 @@ from drivers.nmea.epochs import (
     FORMATTERS,
     MAX_CYCLE,
     TALKERS,
-    BadFieldError,
     Epoch,
     time_of_day_ns,
 )
+from drivers.nmea.fields import BadFieldError
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.judge import EpochJudge
 from drivers.nmea.reasons import (
@@ -34,6 +34,7 @@ from drivers.nmea.reasons import (
     no_fix,
     note,
     nothing_verified,
+    own_name,
 )
 from drivers.nmea.time import (
     one_time,
@@ -58,9 +59,9 @@ class NmeaDecoder:
     refused sentences `other_talker`, `unused_sentence`, `rdss_sentence`, `bad_field`,
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
-    `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
-    `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `gga_awaited`,
-    `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`.
+    `datum_refused`, `height_implausible`, `speed_implausible`, `sigma_too_large`; within one
+    `heading_mode_refused`, `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`,
+    `gga_awaited`, `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`.
     """
 
     def __init__(
@@ -149,10 +150,13 @@ class NmeaDecoder:
         if is_rdss_sentence(sentence):
             self.counters["rdss_sentence"] += 1
             return
+        if sentence.formatter == "DTM" and sentence.talker in TALKERS:
+            self.received.datum = sentence.fields[0] if sentence.fields else ""
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
             own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
-            note(self.received.unused, sentence.address if own else sentence.formatter)
+            name = own_name(sentence.address, sentence.fields) if own else sentence.formatter
+            note(self.received.unused, name)
             if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ
                 note(self.received.talkers, sentence.address[:2])
             return

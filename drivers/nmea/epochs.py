@@ -21,14 +21,25 @@ Source: NMEA 0183 4.11, RMC and the table of mode indicators; u-blox ZED-F9P int
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import date
-from typing import NamedTuple
 
 from drivers.measurements import Vector3
-from drivers.nmea.fields import Fields, typed
+from drivers.nmea.fields import (
+    BadFieldError,
+    Fields,
+    Printed,
+    angle,
+    count,
+    dop,
+    letter,
+    number,
+    position,
+    sigma,
+    step,
+    typed,
+)
 from drivers.nmea.framing import Sentence
 from drivers.nmea.time import parse_time_of_day, printed_time
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
@@ -47,9 +58,6 @@ KM_H_M_S = 1.0 / 3.6
 STANDSTILL_M_S = 0.05
 """Below it an absent course means standing still: the Doppler velocity noise of a receiver
 (u-blox ZED-F9P data sheet: 0.05 m/s)."""
-NO_DOP = 99.0
-"""Receivers without a solution print 99.99."""
-
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
 _ESTIMATED = frozenset("EMS")
 _NOT_VALID = frozenset(("V", "N", ""))
@@ -59,23 +67,6 @@ OVERDETERMINED = 5
 """Satellites with which a fix is three-dimensional whatever GSA says, if it has an altitude and
 VDOP: four give place and clock, one more than that checks them (modules of Quectel and Telit say 2
 beside 8 to 14)."""
-MINUTE_M = 1852.0
-"""Of latitude."""
-_PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
-
-
-class Printed(NamedTuple):
-    """Latitude and longitude (deg) of a sentence, and one step of their last digits (m), that of
-    the longitude at the equator."""
-
-    lat_deg: float
-    lon_deg: float
-    lat_step_m: float
-    lon_step_m: float
-
-
-class BadFieldError(ValueError):
-    """A sentence verified, but a field of it cannot be true."""
 
 
 @dataclass(slots=True)
@@ -155,15 +146,22 @@ class Epoch:
         """Place and time of RMC, or else GLL; None where neither does."""
         return self.gll_valid if self.rmc_valid is None else self.rmc_valid
 
+    def take_mode(self) -> None:
+        """GGA has a place and leaves its quality empty: what RMC or GLL say of it counts."""
+        self.quality = self._quality_of_mode() if self.plain_valid else 0
+
     def take_plain(self) -> None:
         """RMC or GLL is all that the receiver says of its place."""
         if self.plain is None or not self.plain_valid:
             return
-        known = [quality for mode, quality in _MODE_QUALITY.items() if mode in self.modes]
-        if "N" in self.modes:
-            known = [0]
-        self.place, self.quality = self.plain, (known or [1])[0]
+        self.place, self.quality = self.plain, self._quality_of_mode()
         self.by_plain = "RMC" if self.rmc_valid else "GLL"
+
+    def _quality_of_mode(self) -> int:
+        """Of the worst mode; 1 where none is known (before NMEA 2.3)."""
+        if "N" in self.modes:
+            return 0
+        return next((q for mode, q in _MODE_QUALITY.items() if mode in self.modes), 1)
 
     @property
     def two_dimensional(self) -> bool:
@@ -212,87 +210,32 @@ def time_of_day_ns(sentence: Sentence) -> int | None:
         raise BadFieldError(str(error)) from None
 
 
-# --------------------------------------------------------------------------- fields
-
-
-def _number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
-    value = fields.get(name, "")
-    if not isinstance(value, float | int):
-        return None
-    if not math.isfinite(value) or value < least:
-        raise BadFieldError(f"{name} = {value}")
-    return float(value)
-
-
-def _count(fields: Fields, name: str) -> int | None:
-    number = _number(fields, name, 0.0)
-    return None if number is None else int(number)
-
-
-def _sigma(fields: Fields, name: str) -> float | None:
-    """A sigma that is no number is as large as can be: it must not pass for one not given."""
-    value = fields.get(name, "")
-    if isinstance(value, float) and not math.isfinite(value):
-        return math.inf
-    return _number(fields, name, 0.0)
-
-
-def _letter(fields: Fields, name: str) -> str:
-    return str(fields.get(name, ""))
-
-
-def _dop(fields: Fields, name: str) -> float | None:
-    dop = _number(fields, name, 0.0)
-    return dop if dop is not None and 0.0 < dop < NO_DOP else None
-
-
-def _angle(fields: Fields, name: str) -> float | None:
-    angle = _number(fields, name, 0.0)
-    if angle is not None and angle > 360.0:
-        raise BadFieldError(f"{name} = {angle} deg")
-    return angle
-
-
-def _step(printed: str) -> float:
-    """Of the last digit."""
-    return 10.0 ** -len(printed.partition(".")[2])
-
-
-def _position(fields: Fields, first: int = 1) -> Printed | None:
-    """From the fields `lat`, `NS`, `lon`, `EW`, which follow one another from number `first` on."""
-    lat, lon = _number(fields, "lat"), _number(fields, "lon")
-    if lat is None or lon is None:
-        return None
-    parts = fields["printed"][first : first + 4]
-    printed = ",".join(parts)
-    if not _PRINTED_POSITION.match(printed):  # no hemisphere, 60 minutes, signs
-        raise BadFieldError(f"not a position: {printed}")
-    if abs(lat) > 90.0 or abs(lon) > 180.0:
-        raise BadFieldError(f"no such place: {lat} {lon}")
-    return Printed(lat, lon, MINUTE_M * _step(parts[0]), MINUTE_M * _step(parts[2]))
+# --------------------------------------------------------------------------- sentences
 
 
 def _take_height(epoch: Epoch, fields: Fields) -> None:
-    epoch.altitude_m, epoch.separation_m = _number(fields, "alt"), _number(fields, "sep")
+    epoch.altitude_m, epoch.separation_m = number(fields, "alt"), number(fields, "sep")
     if epoch.altitude_m is not None:
-        epoch.height_step_m = _step(fields["printed"][8])
+        epoch.height_step_m = step(fields["printed"][8])
 
 
 def _take_gga(epoch: Epoch, fields: Fields) -> None:
-    place = _position(fields)
-    quality, satellites = _count(fields, "quality"), _count(fields, "numSV")
-    hdop = _dop(fields, "HDOP")
+    place = position(fields)
+    quality, satellites = count(fields, "quality"), count(fields, "numSV")
+    hdop = dop(fields, "HDOP")
     _take_height(epoch, fields)
-    epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality or 0
+    epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality
+    if place is None and quality is None:
+        epoch.quality = 0
     epoch.satellites = satellites or epoch.satellites or satellites  # GNS may have counted some
     epoch.hdop = hdop if hdop is not None else epoch.hdop
     epoch.counted = max(epoch.counted, satellites or 0)
 
 
 def _take_gns(epoch: Epoch, fields: Fields) -> None:
-    place = _position(fields)
-    satellites, hdop = _count(fields, "numSV"), _dop(fields, "HDOP")
-    used = set(_letter(fields, "posMode")) - {"N"}
+    place = position(fields)
+    satellites, hdop = count(fields, "numSV"), dop(fields, "HDOP")
+    used = set(letter(fields, "posMode")) - {"N"}
     epoch.modes |= used
     epoch.counted = max(epoch.counted, satellites or 0)
     if "GGA" in epoch.cycle:
@@ -309,9 +252,9 @@ _DATE_AT = 8
 
 
 def _take_rmc(epoch: Epoch, fields: Fields) -> None:
-    speed, course = _number(fields, "spd", 0.0), _angle(fields, "cog")
-    status, mode = _letter(fields, "status"), _letter(fields, "posMode")
-    place = _position(fields, 2)
+    speed, course = number(fields, "spd", 0.0), angle(fields, "cog")
+    status, mode = letter(fields, "status"), letter(fields, "posMode")
+    place = position(fields, 2)
     if status in _MODE_QUALITY or status in _ESTIMATED:
         epoch.rmc_valid, epoch.plain = True, place
         # Who sends D beside R means R; who sends E beside it means that, too.
@@ -331,8 +274,8 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
 
 
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
-    place, status = _position(fields, 0), _letter(fields, "status")
-    epoch.modes |= set(_letter(fields, "posMode"))
+    place, status = position(fields, 0), letter(fields, "status")
+    epoch.modes |= set(letter(fields, "posMode"))
     if status:  # before NMEA 2.0 it has neither time nor status, and says nothing
         epoch.gll_valid = status == "A"
     if epoch.gll_valid and epoch.plain is None:
@@ -340,9 +283,9 @@ def _take_gll(epoch: Epoch, fields: Fields) -> None:
 
 
 def _take_vtg(epoch: Epoch, fields: Fields) -> None:
-    course = _angle(fields, "cogt")
-    knots, km_h = _number(fields, "sogn", 0.0), _number(fields, "sogk", 0.0)
-    mode = _letter(fields, "posMode")
+    course = angle(fields, "cogt")
+    knots, km_h = number(fields, "sogn", 0.0), number(fields, "sogk", 0.0)
+    mode = letter(fields, "posMode")
     epoch.modes |= set(mode)
     if mode == "N":
         return
@@ -355,24 +298,24 @@ def _take_vtg(epoch: Epoch, fields: Fields) -> None:
 
 
 def _take_gsa(epoch: Epoch, fields: Fields) -> None:
-    hdop, vdop = _dop(fields, "HDOP"), _dop(fields, "VDOP")
-    nav_mode = _count(fields, "navMode")
+    hdop, vdop = dop(fields, "HDOP"), dop(fields, "VDOP")
+    nav_mode = count(fields, "navMode")
     if nav_mode is not None:
         epoch.nav_modes.add(nav_mode)
-    system = _letter(fields, "systemId")
-    epoch.listed.update((number, system) for number in fields["printed"][2:14] if number)
+    system = letter(fields, "systemId")
+    epoch.listed.update((each, system) for each in fields["printed"][2:14] if each)
     epoch.hdop = epoch.hdop if epoch.hdop is not None else hdop
     epoch.vdop = epoch.vdop if epoch.vdop is not None else vdop
 
 
 def _take_gst(epoch: Epoch, fields: Fields) -> None:
-    north, east, down = (_sigma(fields, name) for name in ("stdLat", "stdLong", "stdAlt"))
+    north, east, down = (sigma(fields, name) for name in ("stdLat", "stdLong", "stdAlt"))
     if north is not None and east is not None and down is not None:
         epoch.sd_ned_m = (north, east, down)
 
 
 def _take_zda(epoch: Epoch, fields: Fields) -> None:
-    parts = [_count(fields, name) for name in ("year", "month", "day")]
+    parts = [count(fields, name) for name in ("year", "month", "day")]
     if parts[0] is None or parts[1] is None or parts[2] is None:
         return
     try:
@@ -383,13 +326,13 @@ def _take_zda(epoch: Epoch, fields: Fields) -> None:
 
 
 def _take_hdt(epoch: Epoch, fields: Fields) -> None:
-    heading = _angle(fields, "headingT")
+    heading = angle(fields, "headingT")
     if epoch.heading_deg is None:
         epoch.heading_deg = heading
 
 
 def _take_ths(epoch: Epoch, fields: Fields) -> None:
-    heading, mode = _angle(fields, "headt"), _letter(fields, "mi")
+    heading, mode = angle(fields, "headt"), letter(fields, "mi")
     epoch.heading_deg, epoch.heading_mode = heading, mode
 
 

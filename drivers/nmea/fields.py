@@ -8,9 +8,11 @@ and dates by `strptime`: 70 us a sentence, where this takes 5; the values are th
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from datetime import date
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from pynmeagps.nmeahelpers import dmm2ddd
 from pynmeagps.nmeatypes_core import DE, DT, GROUP, IN, LA, LN
@@ -33,7 +35,17 @@ def _date(printed: str) -> date | str:
 
 
 Convert = Callable[[str], Any]
-_CONVERT: dict[str, Convert] = {DE: float, IN: int, LA: dmm2ddd, LN: dmm2ddd, DT: _date}
+
+
+def _degrees(printed: str) -> float:
+    """Of dddmm.mm. ValueError where it is none, which pynmeagps passes as empty."""
+    found = dmm2ddd(printed)
+    if found == "":
+        raise ValueError(f"not an angle: {printed!r}")
+    return cast(float, found)
+
+
+_CONVERT: dict[str, Convert] = {DE: float, IN: int, LA: _degrees, LN: _degrees, DT: _date}
 
 
 def _plan(table: Mapping[str, object]) -> list[tuple[str, Convert | None]]:
@@ -64,3 +76,88 @@ def typed(formatter: str, printed: Sequence[str]) -> Fields:
             amount = abs(fields[axis])
             fields[axis] = -amount if fields[side] == negative else amount
     return fields
+
+
+# --------------------------------------------------------------------------- what can be true
+
+NO_DOP = 99.0
+"""Receivers without a solution print 99.99."""
+MINUTE_M = 1852.0
+"""Of latitude."""
+_PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
+
+
+class Printed(NamedTuple):
+    """Latitude and longitude (deg) of a sentence, and one step of their last digits (m), that of
+    the longitude at the equator."""
+
+    lat_deg: float
+    lon_deg: float
+    lat_step_m: float
+    lon_step_m: float
+
+
+class BadFieldError(ValueError):
+    """A sentence verified, but a field of it cannot be true."""
+
+
+def number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
+    """A number, not below the least; None where the field is empty. BadFieldError."""
+    value = fields.get(name, "")
+    if not isinstance(value, float | int):
+        return None
+    if not math.isfinite(value) or value < least:
+        raise BadFieldError(f"{name} = {value}")
+    return float(value)
+
+
+def count(fields: Fields, name: str) -> int | None:
+    """A number of things, without sign."""
+    value = number(fields, name, 0.0)
+    return None if value is None else int(value)
+
+
+def sigma(fields: Fields, name: str) -> float | None:
+    """A sigma that is no number is as large as can be: it must not pass for one not given."""
+    value = fields.get(name, "")
+    if isinstance(value, float) and not math.isfinite(value):
+        return math.inf
+    return number(fields, name, 0.0)
+
+
+def letter(fields: Fields, name: str) -> str:
+    """A field of text."""
+    return str(fields.get(name, ""))
+
+
+def dop(fields: Fields, name: str) -> float | None:
+    """A dilution of precision; None where there is no solution."""
+    value = number(fields, name, 0.0)
+    return value if value is not None and 0.0 < value < NO_DOP else None
+
+
+def angle(fields: Fields, name: str) -> float | None:
+    """Of a circle, degrees."""
+    value = number(fields, name, 0.0)
+    if value is not None and value > 360.0:
+        raise BadFieldError(f"{name} = {value} deg")
+    return value
+
+
+def step(printed: str) -> float:
+    """One step of the last digit."""
+    return 10.0 ** -len(printed.partition(".")[2])
+
+
+def position(fields: Fields, first: int = 1) -> Printed | None:
+    """From the fields `lat`, `NS`, `lon`, `EW`, which follow one another from number `first` on."""
+    lat, lon = number(fields, "lat"), number(fields, "lon")
+    if lat is None or lon is None:
+        return None
+    parts = fields["printed"][first : first + 4]
+    printed = ",".join(parts)
+    if not _PRINTED_POSITION.match(printed):  # no hemisphere, 60 minutes, signs
+        raise BadFieldError(f"not a position: {printed}")
+    if abs(lat) > 90.0 or abs(lon) > 180.0:
+        raise BadFieldError(f"no such place: {lat} {lon}")
+    return Printed(lat, lon, MINUTE_M * step(parts[0]), MINUTE_M * step(parts[2]))

@@ -32,6 +32,9 @@ PLAIN_AFTER = 2
 """Epochs with RMC or GLL in a row that have neither GGA nor GNS, after which their position is a
 fix: one may be damaged. A GGA at an instant of its own is none of these (plotters take turns)."""
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
+DATUMS = frozenset({"", "W84", "P90"})
+"""Of DTM: WGS 84, and PZ-90, which agrees with it to some centimetres since 2007 (PZ-90.02); others
+are up to hundreds of metres away."""
 
 
 class EpochJudge:
@@ -66,6 +69,8 @@ class EpochJudge:
         if epoch.no_date:
             self.counters["bad_date"] += 1
             self._received.no_date = epoch.no_date
+        if epoch.quality is None and epoch.place is not None:
+            epoch.take_mode()
         if epoch.quality is None and epoch.plain_valid is not None:
             self._without_gga += 1
             if self._without_gga >= PLAIN_AFTER:
@@ -116,6 +121,8 @@ class EpochJudge:
             return "no_fix" if epoch.plain_valid is False else None
         if epoch.place is None:
             return "no_fix"
+        if self._received.datum not in DATUMS:
+            return "datum_refused"
         simulated = self._decoding.allow_simulator and epoch.quality in (7, 8)
         if not (epoch.quality in _QUALITIES or simulated):
             return "unknown_quality"

@@ -27,6 +27,7 @@ SHOWN = 40
 _LINE_ENDS = re.compile(rb"[\r\n]+")
 _PRINTED = re.compile(rb"[\t\x20-\x7e]")
 _NOVATEL_TEXT = re.compile(rb"#[A-Z][A-Z0-9]{3,15},[^\r\n#$]{20,600}\*[0-9a-fA-F]{8}\r?\n?")
+_NOVATEL_SHORT = re.compile(rb"%[A-Z][A-Z0-9]{3,15}SA,[^\r\n%$]{5,600}\*[0-9a-fA-F]{8}\r?\n?")
 _AIS = re.compile(rb"![A-Z]{2}VD[MO],[\x20-\x7e]{5,90}\*[0-9A-F]{2}")
 _ACTISENSE = re.compile(rb"\x10\x02[\x93-\x95\xa0\xd0](?:[^\x10]|\x10\x10){5,250}\x10\x03")
 _TSIP = re.compile(rb"(?<!\x10)\x10[^\x03\x10](?:[^\x10]|\x10\x10){1,250}\x10\x03")
@@ -139,6 +140,11 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
         "text logs of NovAtel or Unicore (#...)",
         lambda d: len(_NOVATEL_TEXT.findall(d)),
         f'{_SWITCH}, or have it read: driver = "bestpos"',
+    ),
+    (
+        "NovAtel's form of logs with short headers (%...)",
+        lambda d: len(_NOVATEL_SHORT.findall(d)),
+        f'{_SWITCH}, or BESTPOSA and BESTVELA with their long ones: driver = "bestpos"',
     ),
     ("SiRF's binary protocol", _framed(b"\xa0\xa2", _sirf), _SWITCH),
     ("SkyTraq's binary protocol", _framed(b"\xa0\xa1", _skytraq), _SWITCH),

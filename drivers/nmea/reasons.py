@@ -4,6 +4,7 @@ each."""
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 
@@ -16,6 +17,7 @@ REFUSALS = {
     "simulator_refused": "the receiver simulates: allow_simulator would accept it",
     "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
     "unknown_quality": "the receiver states a GGA quality that NMEA does not know",
+    "datum_refused": "the receiver states another datum than WGS 84 (DTM): set it to W84",
     "height_implausible": "the receiver states a height at which no vehicle can be",
     "speed_implausible": "the receiver states a speed that no vehicle has",
     "sigma_too_large": "the receiver states that it does not know where it is (GST)",
@@ -40,6 +42,12 @@ OWN_SENTENCES = {
     "PASHR": "Ashtech, Applanix and others: attitude of an inertial system",
     "PQTM": "Quectel",
     "PSAT": "Hemisphere",
+    "PSSN": "Septentrio",
+    "PGLOR": "Broadcom",
+    "PMTK": "MediaTek",
+    "PAIR": "Airoha, Quectel",
+    "PSTM": "ST",
+    "PSRF": "SiRF",
     "PNVG": "NVS",
     "PGRM": "Garmin",
     "KSXT": "Unicore, ComNav and others",
@@ -50,8 +58,13 @@ OWN_SENTENCES = {
 }
 """Owners of proprietary sentences, by their beginning, in which receivers tell place or
 attitude."""
+ATTITUDES = ("PASHR", "PTNL,AVR", "PSAT,HPR", "PSSN,HRP", "PSTI,036", "PQTMTAR", "GPHPR", "GNHPR")
+"""Beginnings of sentences in which receivers of two antennas tell their heading with roll or
+pitch."""
 MOST_NAMES = 8
 """Most talkers and formatters to remember; the first are enough to name."""
+KIND_LETTERS = (2, 3)
+"""Of the field that names a kind (PUBX,00; PTNL,GGK; PSTI,030)."""
 ROLLOVER = timedelta(weeks=1024)
 ROLLOVER_SPAN = timedelta(days=3653)
 """A date that is right but for the rollover is of the ten years from this software's on."""
@@ -77,6 +90,8 @@ class Received:
     """Those that are."""
     statuses: Counter[str] = field(default_factory=Counter)
     """Of RMC, that are no letter of the standard."""
+    datum: str = ""
+    """As DTM states it."""
     implausible_date: date | None = None
     no_date: str = ""
     """A date of RMC that is printed and is none."""
@@ -86,6 +101,13 @@ def note(names: Counter[str], name: str) -> None:
     """Count a name; of a stream of nonsense the first few."""
     if name in names or len(names) < MOST_NAMES:
         names[name] += 1
+
+
+def own_name(address: str, fields: Sequence[str]) -> str:
+    """A maker's own sentence by its address, and by its kind where the first field is that."""
+    kind = fields[0] if fields else ""
+    is_kind = kind.isalnum() and len(kind) in KIND_LETTERS
+    return f"{address},{kind}" if is_kind else address
 
 
 def wrong_checksums(counters: Counter[str]) -> str:
@@ -168,6 +190,17 @@ def _heading(received: Received) -> str:
     return next((name for name in OF_A_COMPASS if name in received.unused), "")
 
 
+def _attitude(received: Received) -> str:
+    """The sentence on a heading that comes in a maker's own form alone; "" where none does."""
+    name = next((n for n in received.unused for own in ATTITUDES if n.startswith(own)), "")
+    if not name or {"HDT", "THS"} & set(received.used):
+        return ""
+    return (
+        f"the receiver's heading arrives in a sentence of its maker's alone (${name}), which is "
+        "not read: switch on THS or HDT"
+    )
+
+
 def cautions(counters: Counter[str], received: Received, earliest: date) -> dict[str, str]:
     """By counter: what makes the fixes poorer than the receiver could, and what was done."""
     found = {}
@@ -212,6 +245,8 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
             f"headings of a compass arrive ({heading}), which a receiver's source does not use: a "
             'source with driver = "compass" reads them'
         )
+    if attitude := _attitude(received) * bool(counters["fixes"]):
+        found["attitude_left_out"] = attitude
     if counters["integrated"]:
         found["integrated"] = (
             "the positions' talker is II or IN: a plotter or an adapter may have smoothed them, or "

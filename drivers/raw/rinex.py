@@ -46,7 +46,8 @@ class RinexError(ValueError):
 
 
 def version_and_type(text: str) -> tuple[float, str]:
-    """Such as (3.05, "O"). RinexError where it is no RINEX 3 or 4."""
+    """Such as (3.05, "O"). RinexError where it is no RINEX 3 or 4
+    (of 2: `rinex2.as_version_3`)."""
     first = text.partition("\n")[0]
     if first[LABEL].strip() != FIRST_LABEL:
         raise RinexError("no RINEX file: the first line does not say so")
@@ -55,7 +56,7 @@ def version_and_type(text: str) -> tuple[float, str]:
     except ValueError:
         raise RinexError(f"no RINEX version in {first[:20]!r}") from None
     if not 3.0 <= version < 5.0:
-        raise RinexError(f"RINEX {version:.2f}; versions 3 and 4 are read (gfzrnx converts)")
+        raise RinexError(f"RINEX {version:.2f}; versions 2 to 4 are read")
     return version, first[20:21]
 
 

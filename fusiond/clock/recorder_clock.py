@@ -9,9 +9,11 @@ What a device says of UTC tells the two apart. Without it, stamps that go back w
 does not, and stamps that leap ahead are a pause: whoever takes a pause for a step navigates on
 through it, who takes a step for a pause aligns anew.
 
-A stamp alone among others, which come from where it left, is damage: `time_backwards`,
-`time_ahead`. Stamps of another channel that lie a little behind are its controller's own clock, or
-were written late: those frames have come by now, and their stamps stand.
+Where the clock is slewed, which only those who have read the whole log know (`recorder_rate`), time
+passes by its stamps less what it gains. A stamp alone among others, which come from where it left,
+is damage: `time_backwards`, `time_ahead`. Stamps of another channel that lie a little behind are
+its controller's own clock, or were written late: those frames have come by now, and their stamps
+stand.
 
 All times are integer nanoseconds; a pure function of its inputs.
 """
@@ -59,14 +61,26 @@ class Step(NamedTuple):
     set_ns: int
 
 
+class Slew(NamedTuple):
+    """The recorder's clock, without its steps, gains `rate` seconds a second from `begin_ns` to
+    `end_ns` of its time."""
+
+    begin_ns: int
+    end_ns: int
+    rate: float
+
+
 class RecorderClock:
     """Takes the stamps in their order. `t_ns` is monotonic time, which begins at the first of them;
-    `stamp_ns` the latest stamp taken; `steps` what the clock was set by."""
+    `stamp_ns` the latest stamp taken; `steps` what the clock was set by, `slewed_ns` what it has
+    gained by its slews, which come in their order."""
 
-    def __init__(self) -> None:
+    def __init__(self, slews: Sequence[Slew] = ()) -> None:
         self.t_ns = 0
         self.stamp_ns = 0
         self.steps: list[Step] = []
+        self.slewed_ns = 0
+        self._slews = deque(slews)
         self._started = False
         self._went_back = False
         """Time itself did, as UTC says: what was recorded before is refused until it is over."""
@@ -77,9 +91,9 @@ class RecorderClock:
         """Its last stamp."""
 
     @property
-    def set_ns(self) -> int:
-        """All steps together: the last stamps less monotonic time."""
-        return sum(step.set_ns for step in self.steps)
+    def ahead_ns(self) -> int:
+        """All steps and slews together: the last stamps less monotonic time."""
+        return sum(step.set_ns for step in self.steps) + self.slewed_ns
 
     def is_odd(self, stamp_ns: int, of: Of) -> bool:
         """True if `take` has to look at what follows."""
@@ -150,10 +164,26 @@ class RecorderClock:
     def _on(self, stamp_ns: int, passed_ns: int, of: Of) -> None:
         self._went_back = False
         self._of_channel[of[0]] = stamp_ns
+        if self._slews:
+            passed_ns -= self._gained(passed_ns)
         self.t_ns += passed_ns
         self.stamp_ns = stamp_ns
         self._spacings.append(passed_ns)
         self._frames.append((of, self.t_ns))
+
+    def _gained(self, passed_ns: int) -> int:
+        """By slews, while so much passed by the stamps."""
+        begin_ns = self.t_ns + self.slewed_ns
+        end_ns, gained_ns = begin_ns + passed_ns, 0
+        while self._slews and self._slews[0].begin_ns < end_ns:
+            slew = self._slews[0]
+            within_ns = min(end_ns, slew.end_ns) - max(begin_ns, slew.begin_ns)
+            gained_ns += round(max(0, within_ns) * slew.rate / (1.0 + slew.rate))
+            if slew.end_ns > end_ns:
+                break
+            self._slews.popleft()
+        self.slewed_ns += gained_ns
+        return gained_ns
 
     def _step(self, stamp_ns: int, set_ns: int, of: Of) -> None:
         """Reports of UTC come with jitter: where they say that no time passed, or as good as none,

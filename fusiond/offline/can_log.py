@@ -9,21 +9,17 @@ those of the clock as it was at the end.
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Iterator
+from collections import Counter
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from drivers.base import Emit, Emitted
-from drivers.can.bus import CanFrame
 from drivers.can.driver import CanDriver
 from drivers.can.imu import CanImuDriver
-from drivers.can.python_can import can
 from drivers.measurements import (
     DeviceEvent,
     ImuSample,
@@ -42,30 +38,19 @@ from drivers.raw.messages import (
 from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
-from fusiond.clock.recorder_clock import (
-    ENOUGH_REPORTS,
-    FOLLOWING,
-    REPORTS,
-    RecorderClock,
-    own_share,
-    set_by,
-)
+from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock, Slew
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import ImuTable
 from fusiond.offline.can_frames import Refusals, channels, messages
 from fusiond.offline.measurement_files import Arrival
+from fusiond.offline.recorder_reports import Ahead, Reports, frame
 
-REPORTS_WITHIN_NS = 120_000_000_000
-"""So far ahead reports of UTC are looked for where a clock may have been set: tunnels are shorter,
-and in two minutes a recorder's clock is off by 12 ms (100 ppm)."""
 OFF_S = 1.0
 """By so much a recorder's clock is as likely slow as wrong: receivers report UTC a second late."""
 PAUSE_NS = 60_000_000_000
 """Of a shorter pause the solution says enough; no bus that is awake is silent for so long."""
-LATEST_S = 9e9
-"""Seconds beyond which nanoseconds leave a 64-bit integer."""
 REFUSALS = {
     "wrong_length",
     "undecodable",
@@ -100,8 +85,8 @@ class CanLog(NamedTuple):
 
 
 class _LogTime:
-    """A host whose clocks are the log's: real time is the recorder's stamp of the frame, monotonic
-    and boot time that without what the recorder's clock was set by."""
+    """A host whose clocks are the log's: real time is the recorder's stamp of the frame without its
+    slews, monotonic and boot time that without what the recorder's clock was set by."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -117,27 +102,32 @@ class _LogTime:
 
 
 def read_can_log(path: Path, config: Config) -> CanLog:
-    """Take the log apart by the drivers of the configuration. Raises `TableError`."""
-    return _Replay(path, config).read()
+    """Take the log apart by the drivers of the configuration: once more where its reports of UTC
+    tell that the recorder's clock was slewed. Raises `TableError`."""
+    once = _Replay(path, config)
+    log = once.read()
+    source, slews = once.reports.slews(config.clock.max_clock_drift_ppm)
+    if not slews:
+        return log
+    again = _Replay(path, config, slews)
+    again.report_slews(source, slews)
+    return again.read()
 
 
 class _Replay:
     """Drivers, clock and what came of them."""
 
-    def __init__(self, path: Path, config: Config) -> None:
+    def __init__(self, path: Path, config: Config, slews: tuple[Slew, ...] = ()) -> None:
         self._path = path
         self._config = config
         self._host = _LogTime()
-        self._recorder = RecorderClock()
+        self._recorder = RecorderClock(slews)
         self._clock = Clock(config.clock, self._host)
         self._events: list[tuple[str, str]] = []
         self._clock.on_event = self._on_clock_event
         self._arrivals: list[Arrival] = []
         self._imu: list[tuple[int, ImuSample]] = []
-        self._reports: dict[str, deque[int]] = {}
-        """By source the last reports of UTC: the recorder's stamp less what was reported."""
-        self._silent_ns = (1, 0)
-        """Stamps from and to which nobody reports UTC."""
+        self.reports = Reports(self._recorder, self._scouts)
         self._sources = _on_a_bus(config)
         self._drivers = self._make_drivers(self._emit)
         self._on_buses: dict[Any, list[CanDriver[Any]]] = {}
@@ -153,7 +143,7 @@ class _Replay:
         self._on_buses = buses = self._buses()
         refusals, refused = Refusals(), Counter[str]()
         recorder, host = self._recorder, self._host
-        frames = _Ahead(messages(self._path, refusals, self._on_refusal), refused)
+        frames = Ahead(messages(self._path, refusals, self._on_refusal), refused)
         for message, stamp_ns in frames:
             if message.channel not in buses:
                 refused["unknown_channel"] += 1
@@ -162,21 +152,21 @@ class _Replay:
             if recorder.is_odd(stamp_ns, of):
                 before_ns, steps = recorder.stamp_ns, len(recorder.steps)
                 following = [ns for _, ns in frames.ahead(FOLLOWING)]
-                set_off = partial(self._set, frames, message, stamp_ns)
+                set_off = partial(self.reports.set_before, frames, message, stamp_ns)
                 verdict = recorder.take(stamp_ns, of, following, set_off)
                 if verdict != "taken":
                     refused[verdict] += 1
                     continue
                 if len(recorder.steps) > steps:
-                    self._follow(recorder.steps[-1].set_ns)
+                    self.reports.follow(recorder.steps[-1].set_ns)
                 elif self._arrivals:
                     self._report_pause(stamp_ns - before_ns)
             else:
                 recorder.next(stamp_ns, of)
-            host.t_ns, host.stamp_ns = recorder.t_ns, recorder.stamp_ns
-            frame = _frame(message, host.t_ns, stamp_ns)
+            host.t_ns, host.stamp_ns = recorder.t_ns, recorder.stamp_ns - recorder.slewed_ns
+            came = frame(message, host.t_ns, stamp_ns - recorder.slewed_ns)
             for driver in buses[message.channel]:
-                driver.feed(frame)
+                driver.feed(came)
         refusals.count(refused)
         self._report_error()
         self._shift()
@@ -213,19 +203,39 @@ class _Replay:
             buses[mine[0]].append(driver)
         return buses
 
+    def _scouts(self, emit: Emit) -> dict[Any, list[CanDriver[Any]]]:
+        """Other drivers in the places of the drivers."""
+        scouts = self._make_drivers(emit)
+        names = {id(driver): name for name, driver in self._drivers.items()}
+        return {
+            channel: [scouts[names[id(driver)]] for driver in drivers]
+            for channel, drivers in self._on_buses.items()
+        }
+
     # ------------------------------------------------------------------ the recorder's clock
 
     def _on_refusal(self, code: str, text: str) -> None:
         self._events.append((code, text))
 
     def _on_clock_event(self, code: str, text: str) -> None:
-        self._on_refusal(code, f"{text}, at {self._host.stamp_ns * 1e-9:.3f} s of the log")
+        self._on_refusal(code, f"{text}, at {self._recorder.stamp_ns * 1e-9:.3f} s of the log")
+
+    def report_slews(self, source: str, slews: tuple[Slew, ...]) -> None:
+        """By how much the recorder's clock was slewed, and when."""
+        largest = max(slews, key=lambda slew: abs(slew.rate))
+        how = "fast" if largest.rate > 0.0 else "slow"
+        times = f"in {len(slews)} stretches, at most " if len(slews) > 1 else ""
+        self._on_refusal(
+            "recorder_clock_slewed",
+            f"the recorder's clock ran {times}{abs(largest.rate):.2%} too {how} from "
+            f"{largest.begin_ns * 1e-9:.3f} s of the log on: time is {source}'s there",
+        )
 
     def _report_pause(self, passed_ns: int) -> None:
         """A step of the clock and a pause look alike where no device tells UTC."""
         if passed_ns > PAUSE_NS:
             text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
-            if not any(self._reports.values()):
+            if not self.reports:
                 text += ": a pause, or its clock was set, of which no device tells UTC"
             self._on_refusal("recorder_paused", text)
 
@@ -233,75 +243,19 @@ class _Replay:
         """Offset of a recorder that knows the date against a receiver's UTC at the end: a wrong
         zone shows so."""
         status = self._clock.status()
-        off_s = status.system_error_s or 0.0
+        off_s = (status.system_error_s or 0.0) + self._recorder.slewed_ns * 1e-9
         if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):
             how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
             self._on_refusal("recorder_clock_off", f"the recorder's clock is off {how}")
 
-    def _follow(self, set_ns: int) -> None:
-        """Reports of UTC before a step as the clock would have stamped them that was set."""
-        for reports in self._reports.values():
-            for k, ahead_ns in enumerate(reports):
-                reports[k] = ahead_ns + set_ns
-
-    def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
-        """Step (ns) of the recorder's clock before this frame; None where no report of UTC says
-        one.
-
-        The reports are of the sources that gave UTC before and go on to give it: behind further
-        jumps, too."""
-        known = {name for name, reports in self._reports.items() if reports}
-        if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
-            return None
-        after: dict[str, list[int]] = {name: [] for name in known}
-        stamp_ns, passed_ns, others_ns = first_ns, 0, list[int]()
-
-        def emit(item: Emitted) -> None:
-            if isinstance(item, TimeReport) and item.trusted and item.source in known:
-                after[item.source].append(stamp_ns - item.utc_ns)
-
-        scouts = self._make_drivers(emit)
-        buses = self._scouted(scouts)
-        for driver in buses.get(first.channel, ()):
-            driver.feed(_frame(first, first_ns, first_ns))
-        for message, ns in frames.ahead():
-            change_ns = ns - stamp_ns
-            if self._recorder.jumps(change_ns):
-                others_ns.append(change_ns)
-                stamp_ns = ns
-            elif change_ns > 0:
-                passed_ns += change_ns
-                stamp_ns = ns
-            if passed_ns > REPORTS_WITHIN_NS:
-                break
-            for driver in buses.get(message.channel, ()):
-                driver.feed(_frame(message, stamp_ns, stamp_ns))
-            if any(len(reports) >= ENOUGH_REPORTS for reports in after.values()):
-                break
-        if not any(after.values()):
-            self._silent_ns = first_ns, stamp_ns
-        sets = (set_by(self._reports[name], reports) for name, reports in after.items())
-        found = next((ns for ns in sets if ns is not None), None)
-        if found is None or not others_ns:
-            return found
-        return own_share(found, first_ns - self._recorder.stamp_ns, sum(others_ns))
-
-    def _scouted(self, scouts: dict[str, CanDriver[Any]]) -> dict[Any, list[CanDriver[Any]]]:
-        """The scouts in the places of the drivers."""
-        names = {id(driver): name for name, driver in self._drivers.items()}
-        return {
-            channel: [scouts[names[id(driver)]] for driver in drivers]
-            for channel, drivers in self._on_buses.items()
-        }
-
     def _shift(self) -> None:
         """Times by the recorder's clock as it was at the end."""
-        if not (set_ns := self._recorder.set_ns):
+        if not (by_ns := self._recorder.ahead_ns):
             return
         self._imu = [
-            (t_ns + set_ns, replace(m, t_seen_ns=m.t_seen_ns + set_ns)) for t_ns, m in self._imu
+            (t_ns + by_ns, replace(m, t_seen_ns=m.t_seen_ns + by_ns)) for t_ns, m in self._imu
         ]
-        self._arrivals = [_later(arrival, set_ns) for arrival in self._arrivals]
+        self._arrivals = [_later(arrival, by_ns) for arrival in self._arrivals]
 
     # ------------------------------------------------------------------ what drivers make
 
@@ -312,8 +266,7 @@ class _Replay:
                 self._on_refusal(item.code, f"{item.source}: {item.text}")
             case TimeReport():
                 if item.trusted:
-                    reports = self._reports.setdefault(item.source, deque(maxlen=REPORTS))
-                    reports.append(self._host.stamp_ns - item.utc_ns)
+                    self.reports.add(item, self._host.stamp_ns)
                 self._clock.report(item)
             case (
                 Ephemeris() | Klobuchar() | Bdgim() | SignalDelays() | Correction() | RawGnssEpoch()
@@ -350,53 +303,6 @@ def _on_a_bus(config: Config) -> dict[str, tuple[Any, Any]]:
     points = driver_entry_points()
     made = ((name, points[s.driver].load(), s.options) for name, s in config.sources.items())
     return {n: (make, make.Options(**o)) for n, make, o in made if issubclass(make, CanDriver)}
-
-
-class _Ahead:
-    """The data frames of a log with their stamps (ns), of which some may be looked at before they
-    are taken. What else a log holds is counted in `refused`."""
-
-    def __init__(self, messages: Iterator[can.Message], refused: Counter[str]) -> None:
-        self._messages = messages
-        self._refused = refused
-        self._kept: deque[tuple[can.Message, int]] = deque()
-        self.number = 0
-        """Of all frames."""
-
-    def __iter__(self) -> Iterator[tuple[can.Message, int]]:
-        while True:
-            while self._kept:
-                yield self._kept.popleft()
-            if (each := self._read()) is None:
-                return
-            yield each
-
-    def ahead(self, number: int | None = None) -> Iterator[tuple[can.Message, int]]:
-        """Those that have not been taken, at most so many, in order; they remain."""
-        yield from list(islice(self._kept, number))
-        while number is None or len(self._kept) < number:
-            if (each := self._read()) is None:
-                return
-            self._kept.append(each)
-            yield each
-
-    def _read(self) -> tuple[can.Message, int] | None:
-        for message in self._messages:
-            self.number += 1
-            if message.is_error_frame:
-                self._refused["error_frames"] += 1
-            elif message.is_remote_frame:
-                self._refused["remote_frames"] += 1
-            elif not -LATEST_S < message.timestamp < LATEST_S:  # NaN too
-                self._refused["time_out_of_range"] += 1
-            else:
-                return message, round(message.timestamp * 1e9)
-        return None
-
-
-def _frame(message: can.Message, t_ns: int, stamp_ns: int) -> CanFrame:
-    can_id, extended = message.arbitration_id, message.is_extended_id
-    return CanFrame(can_id, extended, bytes(message.data), t_ns, stamp_ns)
 
 
 def _later(arrival: Arrival, by_ns: int) -> Arrival:

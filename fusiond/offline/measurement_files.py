@@ -271,10 +271,11 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     from fusiond.offline.receiver_logs import read_rinex, rinex_text  # noqa: PLC0415
 
     log = log_bytes(path)
-    text = rinex_text(path, log.data)
-    if text is not None:
+    unpacked = rinex_text(path, log.data)
+    if unpacked is not None:
+        text, lost = unpacked
         rows, refused = read_rinex(path, text, imu, source)
-        return rows, [*log.notes, *refused]
+        return rows, [*log.notes, *lost, *refused]
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     if not of_week and len(imu.t_s):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
+import importlib.resources
+import subprocess
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -29,6 +32,7 @@ from drivers.raw.rinex import (
     RinexError,
     version_and_type,
 )
+from drivers.raw.rinex2 import as_version_3
 from drivers.raw.rinex_nav import Broadcast, navigation
 from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
 from drivers.sbf.decoder import SbfDecoder
@@ -133,13 +137,25 @@ def is_of_week(imu: ImuTable) -> bool:
 # --------------------------------------------------------------------------- RINEX
 
 
-def rinex_text(path: Path, data: bytes) -> str | None:
-    """The file's text, unpacked (Hatanaka, compress, zip); None where it is no RINEX file.
-    MissingPackageError, TableError."""
-    label = data[:80].partition(b"\n")[0][LABEL].decode("ascii", "replace").strip()
+_LINE = 200
+"""Characters in which a first line ends."""
+
+
+def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
+    """The file's text, unpacked (Hatanaka, compress, zip), and what is lost of it; None where it is
+    no RINEX file. MissingPackageError, TableError."""
+    data = data.removeprefix(codecs.BOM_UTF8).lstrip(b"\r\n")
+    first = data[:_LINE].partition(b"\n")[0].decode("ascii", "replace")
+    label = first[LABEL].strip()
+    packed = label == COMPRESSED_LABEL or data.startswith(_COMPRESSED)
+    if FIRST_LABEL.casefold() in first.casefold() and label != FIRST_LABEL and not packed:
+        raise TableError(
+            f"{path}: the first line of this RINEX file has its label elsewhere than from column "
+            "61 on, or in small letters: it has been edited, take it as it was written"
+        )
     if label == FIRST_LABEL:
-        return data.decode("ascii", "replace")
-    if label != COMPRESSED_LABEL and not data.startswith(_COMPRESSED):
+        return data.decode("ascii", "replace"), []
+    if not packed:
         return None
     try:
         hatanaka: Any = importlib.import_module("hatanaka")
@@ -149,9 +165,23 @@ def rinex_text(path: Path, data: bytes) -> str | None:
             f"{install('rinex')}"
         ) from error
     try:
-        return str(hatanaka.decompress(data).decode("ascii", "replace"))
+        return str(hatanaka.decompress(data).decode("ascii", "replace")), []
     except Exception as error:  # it hands on what zip, ncompress and crx2rnx raise
-        raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
+        text = _before_damage(data) if label == COMPRESSED_LABEL else ""
+        if not text:
+            raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
+        why = str(error).partition(".")[0]
+        return text, [Rejection(0, "file_cut", f"used up to the damage: {why}", 0)]
+
+
+def _before_damage(data: bytes) -> str:
+    """Epochs of Hatanaka's compression up to where it cannot be followed, which the package's own
+    program has written by then; "" where there is none."""
+    program = importlib.resources.files("hatanaka.bin") / "crx2rnx"
+    with importlib.resources.as_file(program) as path:
+        done = subprocess.run([path, "-"], input=data, capture_output=True, check=False)
+    text = done.stdout.decode("ascii", "replace")
+    return text[: text.rfind("\n") + 1] if "\n>" in text or "END OF HEADER" in text else ""
 
 
 def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
@@ -161,6 +191,7 @@ def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
     to a receiver that has been on. TableError where it is neither."""
     counters = Counter[str]()
     try:
+        text = as_version_3(text)
         if version_and_type(text)[1] == "N":
             rows = _broadcast(navigation(source, text, counters), imu)
         else:

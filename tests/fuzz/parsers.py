@@ -23,11 +23,12 @@ PARSERS = {
     "splitter": Parser(("drivers.nmea.framing",), 128),
     "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 256),
     "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 192),
+    "ssr": Parser(("drivers.raw.ssr",), 160),
     "words": Parser(tuple(f"drivers.raw.{m}" for m in (*_WORDS, "weeks")), 128),
     "ubx": Parser(("drivers.ubx.decoder", "drivers.ubx.messages", *_SHARED), 256),
     "bestpos": Parser(("drivers.bestpos.decoder", "drivers.bestpos.framing", *_SHARED), 640),
     "sbf": Parser(("drivers.sbf.decoder", "drivers.sbf.framing", *_SHARED), 256),
-    "rinex": Parser(("drivers.raw.rinex", "drivers.raw.rinex_nav"), 1200),
+    "rinex": Parser(("drivers.raw.rinex", "drivers.raw.rinex2", "drivers.raw.rinex_nav"), 1200),
     "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
     "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
     "rdss_mail": Parser(

@@ -18,6 +18,7 @@ from drivers.measurements import Heading, PositionFix
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.messages import Ephemeris
 from drivers.raw.rinex import ObservationReader, RinexError, version_and_type
+from drivers.raw.rinex2 import as_version_3
 from drivers.raw.rinex_nav import navigation
 from drivers.sbf.decoder import SbfDecoder
 from drivers.ubx.decoder import UbxDecoder
@@ -89,6 +90,7 @@ def rinex(data: bytes) -> None:
     text = data.decode("latin-1")
     counters = Counter[str]()
     try:
+        text = as_version_3(text)
         if version_and_type(text)[1] == "N":
             for record in navigation("fuzz", text, counters):
                 if isinstance(record.message, Ephemeris):

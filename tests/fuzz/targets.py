@@ -23,8 +23,9 @@ from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
-from drivers.raw.messages import Ephemeris, RawGnssEpoch
+from drivers.raw.messages import Correction, Ephemeris, RawGnssEpoch
 from drivers.raw.rtcm import load_pyrtcm
+from drivers.raw.ssr import LARGEST_M, MESSAGES
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
@@ -146,6 +147,29 @@ def raw(data: bytes) -> None:
         assert not decoder.epoch_open
     assert found[0] == found[1]
     _check_raw(found[0][0])
+
+
+_SSR = sorted(MESSAGES)
+
+
+def ssr(data: bytes) -> None:
+    """RTCM SSR: a line is the kind of a message and what stands behind its number; each message is
+    used, or its reason counted."""
+    decoder = RawDecoder("fuzz", earliest=EARLIEST)
+    decoder.note_utc(1_500_000_000_000_000_000)
+    for line in data.split(b"\n"):
+        if len(line) < 2:
+            continue
+        number = _SSR[line[0] % len(_SSR)]
+        body = (number << 4 | line[1] & 15).to_bytes(2, "big") + line[2:1023]
+        frame = b"\xd3" + len(body).to_bytes(2, "big") + body
+        before = decoder.counters.total()
+        found = decoder.take(Frame("rtcm", frame + b"\0\0\0"), 7)
+        assert decoder.counters.total() > before
+        for event in found:
+            assert isinstance(event, Correction)
+            assert 0.0 <= event.tow_s < 604_800.0 + event.interval_s
+            assert all(abs(value) <= LARGEST_M for value in event.values)
 
 
 _WORDS: tuple[tuple[int, int, int, Callable[[int], list[int]]], ...] = (
@@ -340,7 +364,7 @@ def can(data: bytes) -> None:
     assert accounted + whole <= frames
 
 
-_STREAMS = (splitter, nmea, raw, words, ubx, bestpos, sbf, rinex)
+_STREAMS = (splitter, nmea, raw, ssr, words, ubx, bestpos, sbf, rinex)
 _MORE = (
     rdss_binary,
     rdss_text,

@@ -176,3 +176,42 @@ def test_a_pause_among_steps_is_none(even: CanLog, tmp_path: Path) -> None:
     span_s = log.imu.t_s[-1] - log.imu.t_s[0]
     assert span_s == pytest.approx(even.imu.t_s[-1] - even.imu.t_s[0], abs=2e-2)
     assert [code for code, _ in log.events].count("system_clock_stepped") == 1
+
+
+@pytest.mark.parametrize("rate", [0.1, -0.1, 0.02, -0.3])
+def test_a_clock_that_is_slewed(rate: float, even: CanLog, tmp_path: Path) -> None:
+    """Tick of the system clock turned to its end: half of the fixes were lost."""
+
+    def ahead(t_s: float) -> float:
+        return rate * min(max(0.0, t_s - 20.0), 25.0)
+
+    log = read(tmp_path, candump(bus(SECONDS), ahead))
+    by = 25.0 * rate
+    assert len(log.imu.t_s) == len(even.imu.t_s)
+    assert len(fixes(log)) >= len(fixes(even)) - 1
+    # Begin and end of a slew are known to what reports jitter by, over its rate.
+    assert np.abs(log.imu.t_s - by - even.imu.t_s).max() < 0.03
+    assert off_s(valid_s(log) - by, valid_s(even)) < 0.03
+    assert max(row.sd_time_s for row in log.arrivals) < 0.1
+    (told,) = [text for code, text in log.events if code == "recorder_clock_slewed"]
+    ran = float(told.partition("clock ran ")[2].partition("%")[0]) / 100.0
+    assert ran == pytest.approx(abs(rate), abs=1e-3)
+    assert ("too fast" in told) == (rate > 0.0)
+    assert not [code for code, _ in log.events if code == "system_clock_stepped"]
+
+
+def test_an_even_clock_is_read_once(even: CanLog) -> None:
+    assert not [code for code, _ in even.events if code == "recorder_clock_slewed"]
+
+
+def test_a_slew_and_a_step(even: CanLog, tmp_path: Path) -> None:
+    """As a computer that is set by an hour, and then slews what is left of it."""
+
+    def ahead(t_s: float) -> float:
+        return -3600.0 * (t_s < 15.0) - 0.08 * (15.0 + 20.0 - min(max(t_s, 15.0), 35.0))
+
+    log = read(tmp_path, candump(bus(SECONDS), ahead))
+    assert len(fixes(log)) >= len(fixes(even)) - 2
+    assert np.abs(log.imu.t_s - even.imu.t_s).max() < 0.1
+    codes = [code for code, _ in log.events]
+    assert codes.count("system_clock_stepped") == codes.count("recorder_clock_slewed") == 1

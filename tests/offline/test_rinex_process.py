@@ -12,10 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
+from fusiond.files.csv_tables import TableError
 from fusiond.files.tables import read_imu, read_solution
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.offline.measurement_files import READERS
+from fusiond.offline.receiver_logs import rinex_text
 from tests.drivers.raw.test_rinex import BEIDOU, NOW, header, nav4, observed
 from tests.gnss.test_station import NAVIGATION, OBSERVATIONS, PLACE, STATION
 
@@ -80,6 +82,99 @@ def test_a_station_stands_where_it_is(tmp_path: Path, begin_s: float) -> None:
     assert (np.abs(off) < 3.0 * solution.sd_position[-1]).all(), (off, solution.sd_position[-1])
 
 
+KINDS = ("C1C", "L1C", "D1C", "S1C", "C2W", "L2W", "D2W", "S2W")
+"""Of RINEX 3; in RINEX 2 these are C1, L1, D1, S1, P2, L2, D2, S2."""
+
+
+def observations_2(text: str) -> str:
+    """GPS of an observation file as RINEX 2.11 has it."""
+    head, _, body = text.partition("END OF HEADER\n")
+    listed: list[str] = []
+    system = ""
+    for line in head.splitlines():
+        if line[60:].startswith("SYS / # / OBS TYPES"):
+            system = line[0] if line[0] != " " else system
+            listed += line[6:60].split() if system == "G" else []
+    columns = [listed.index(kind) for kind in KINDS]
+    types = "".join(f"    {kind}" for kind in ("C1", "L1", "D1", "S1", "P2", "L2", "D2", "S2"))
+    found = [
+        f"{2.11:9.2f}{'':11}{'OBSERVATION DATA':20}{'G (GPS)':20}RINEX VERSION / TYPE",
+        f"{8:6}{types:54}# / TYPES OF OBSERV",
+        f"{'':60}END OF HEADER",
+    ]
+    for epoch in body.split(">")[1:]:
+        first, *rows = epoch.splitlines()
+        gps = [row for row in rows if row[:1] == "G"]
+        for at in range(0, len(gps), 12):
+            names = "".join(row[:3] for row in gps[at : at + 12])
+            y, mo, d, h, mi, sec = first[:28].split()
+            date = f" {y[2:]} {int(mo):2} {int(d):2} {int(h):2} {int(mi):2}{float(sec):11.7f}"
+            found.append((f"{date}  0{len(gps):3}" if at == 0 else " " * 32) + names)
+        for row in gps:
+            values = [row[3 + 16 * k : 19 + 16 * k].ljust(16) for k in columns]
+            found += ["".join(values[:5]).rstrip(), "".join(values[5:]).rstrip()]
+    return "\n".join([*found, ""])
+
+
+def navigation_2(text: str) -> str:
+    """GPS of a navigation file as RINEX 2.11 has it."""
+    found = [
+        f"{2.11:9.2f}{'':11}{'N: GPS NAV DATA':40}RINEX VERSION / TYPE",
+        f"{'':60}END OF HEADER",
+    ]
+    gps = False
+    for line in text.partition("END OF HEADER\n")[2].splitlines():
+        if line[:1] != " ":
+            gps = line[:1] == "G"
+            y, mo, d, h, mi, sec = (int(x) for x in line[4:23].split())
+            date = f"{int(line[1:3]):2} {y % 100:02} {mo:2} {d:2} {h:2} {mi:2}{sec:5.1f}"
+            line = f" {date}{line[23:]}"  # noqa: PLW2901
+        found += [line[1:]] if gps else []
+    return "\n".join([*found, ""])
+
+
+def test_rinex_2_of_the_same_station(tmp_path: Path) -> None:
+    """GPS alone, converted: the station stands where it is."""
+    unpacked = rinex_text(OBSERVATIONS, gzip.decompress(OBSERVATIONS.read_bytes()))
+    assert unpacked is not None
+    (tmp_path / "esbc1770.20o").write_text(observations_2(unpacked[0]))
+    sent = gzip.decompress(NAVIGATION.read_bytes()).decode()
+    (tmp_path / "esbc1770.20n.gz").write_bytes(gzip.compress(navigation_2(sent).encode()))
+    imu = standing(tmp_path / "imu.csv", POSIX_S + FROM_S)
+    code, output = run(tmp_path, imu, tmp_path / "esbc1770.20o", tmp_path / "esbc1770.20n.gz")
+    assert code == 0, output
+    solution = read_solution(tmp_path / "out.csv")
+    lat, lon, height = to_geodetic(*PLACE)
+    off = np.array(
+        [
+            (solution.lat_rad[-1] - lat) * 6.37e6,
+            (solution.lon_rad[-1] - lon) * 6.37e6 * math.cos(lat),
+            solution.height_m[-1] - height,
+        ]
+    )
+    assert np.linalg.norm(off) < 5.0, off
+    assert (np.abs(off) < 3.0 * solution.sd_position[-1]).all(), (off, solution.sd_position[-1])
+
+
+@pytest.mark.parametrize("share", [0.04, 0.5, 0.97])
+def test_a_cut_hatanaka_file_is_used_up_to_the_cut(tmp_path: Path, share: float) -> None:
+    """As a station that lost its power leaves it; what a lost line damages, too."""
+    whole = gzip.decompress(OBSERVATIONS.read_bytes())
+    head = whole.index(b"END OF HEADER") + 14
+    at = head + round(share * (len(whole) - head))
+    imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
+    rows, _ = READERS["raw"](OBSERVATIONS, imu, "raw")
+    for data in (whole[:at], whole[:at] + whole[at + 200 :]):
+        cut = tmp_path / "cut.crx"
+        cut.write_bytes(data)
+        found, lost = READERS["raw"](cut, imu, "raw")
+        assert len(rows) * share - 12 < len(found) <= len(rows) * share + 12
+        for one, other in zip(found[:-1], rows, strict=False):
+            assert one.measurement == other.measurement
+        (note,) = [each for each in lost if each.reason == "file_cut"]
+        assert "up to the damage" in note.detail
+
+
 def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
     """The first of each satellite and message at the start, the others not before their time."""
     imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
@@ -98,6 +193,22 @@ def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
     assert later > 1500
 
 
+def test_first_lines_that_editors_leave(tmp_path: Path) -> None:
+    """A byte order mark and blank lines are passed over; a moved label is named."""
+    imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
+    unpacked = rinex_text(OBSERVATIONS, gzip.decompress(OBSERVATIONS.read_bytes()))
+    assert unpacked is not None
+    text = "\n>".join(unpacked[0].split("\n>")[:4]) + "\n"
+    for odd in ("\ufeff" + text, "\r\n" + text, text.replace("\n", "\r\n"), observations_2(text)):
+        file = tmp_path / "odd.rnx"
+        file.write_text(odd, newline="")
+        assert len(READERS["raw"](file, imu, "raw")[0]) == 3
+    for odd in (text.replace("  ", "\t"), text.replace("RINEX VERSION", "Rinex Version")):
+        file.write_text(odd)
+        with pytest.raises(TableError, match="its label elsewhere"):
+            READERS["raw"](file, imu, "raw")
+
+
 def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     imu = standing(tmp_path / "imu.csv", FROM_S)
     code, output = run(tmp_path, imu, OBSERVATIONS)
@@ -106,9 +217,9 @@ def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code, output = run(tmp_path, imu, NAVIGATION)
     assert (code, "and no observation: give that file as well" in output) == (65, True)
     old = tmp_path / "old.rnx"
-    old.write_text(header("2.11"))
+    old.write_text(header("1.00"))
     code, output = run(tmp_path, imu, old)
-    assert (code, "RINEX 2.11; versions 3 and 4 are read" in output) == (65, True)
+    assert (code, "RINEX 1.00; versions 2 to 4 are read" in output) == (65, True)
     cut = tmp_path / "cut.crx.gz"
     cut.write_bytes(gzip.compress(gzip.decompress(OBSERVATIONS.read_bytes())[:60_000]))
     code, output = run(tmp_path, imu, cut, NAVIGATION)

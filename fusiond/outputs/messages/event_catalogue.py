@@ -97,6 +97,10 @@ RECEIVERS: Mapping[str, Entry] = {
     "gll_alone": info(
         "Only GLL has a position: no height, large sigma.", "Switch on GGA, RMC and GST."
     ),
+    "attitude_left_out": info(
+        "A receiver tells its heading in a sentence of its maker's alone.",
+        "Switch on THS or HDT at the receiver.",
+    ),
     "compass_left_out": info(
         "Headings of a compass arrive on a receiver's port.",
         'Give it a source with driver = "compass".',

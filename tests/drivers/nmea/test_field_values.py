@@ -86,6 +86,12 @@ def test_no_verified_sentence_raises(formatter: str, fields: list[str]) -> None:
             assert math.isfinite(measurement.lon_rad)
 
 
+_ANGLES = {
+    **{("GGA", 1): "lat", ("GGA", 3): "lon", ("GNS", 1): "lat", ("GNS", 3): "lon"},
+    **{("RMC", 2): "lat", ("RMC", 4): "lon"},
+}
+
+
 @given(
     st.sampled_from([GGA, GGA_SW, RMC, VTG, GNS, GSA, GST, ZDA, HDT, THS]),
     st.dictionaries(
@@ -103,6 +109,11 @@ def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length:
         wanted = NMEAReader.parse(made(",".join([address, *printed])), validate=0)
     except NMEATypeError:
         with pytest.raises(ValueError, match=r"could not convert|invalid literal"):
+            typed(address[2:], printed)
+        return
+    angles = (_ANGLES.get((address[2:], k), "") for k, text in enumerate(printed) if text)
+    if any(name and getattr(wanted, name) == "" for name in angles):  # passed there as empty
+        with pytest.raises(ValueError, match="not an angle"):
             typed(address[2:], printed)
         return
     found = typed(address[2:], printed)

@@ -210,3 +210,36 @@ def test_a_status_that_is_none_makes_rmc_count_for_nothing() -> None:
     (fix,) = fixes(found)
     assert (fix.quality, fix.v_ned_m_s) == (4, None)
     assert one.counters["unknown_status"] == 1
+
+
+@pytest.mark.parametrize(
+    ("rmc", "quality", "refusal"),
+    [(RMC, 4, ""), (changed(RMC, "R,V", ","), 1, ""), (changed(RMC, ",A,", ",V,"), None, "no_fix")],
+)
+def test_where_gga_leaves_its_quality_empty_rmc_says_it(
+    rmc: str, quality: int | None, refusal: str
+) -> None:
+    """Jackson Labs' FireFly: with its altitude, which RMC has not."""
+    found, one = decode(changed(GGA, "E,4", "E,"), rmc)
+    got = fixes(found)
+    assert [fix.quality for fix in got] == ([] if quality is None else [quality])
+    assert all(fix.height_m == pytest.approx(36.2) for fix in got)
+    assert one.refusal == refusal
+    assert "rmc_alone" not in one.counters
+
+
+@pytest.mark.parametrize(
+    ("datum", "number"), [("W84", 1), ("P90", 1), ("", 1), ("W72", 0), ("999", 0), ("TOK", 0)]
+)
+def test_another_datum_is_refused(datum: str, number: int) -> None:
+    dtm = made(f"GPDTM,{datum},,0.0,N,0.0,E,0.0,W84")
+    found, one = decode(dtm, GGA, RMC)
+    assert len(fixes(found)) == number
+    assert one.refusal == ("" if number else "datum_refused")
+
+
+def test_an_angle_that_is_none_is_no_missing_one() -> None:
+    """Not "the receiver has no fix"."""
+    _, one = decode(*[changed(GGA, "3958.12345", "3958;12345")] * 3)
+    assert one.counters["bad_field"] == 3
+    assert "cannot be true" in one.cause

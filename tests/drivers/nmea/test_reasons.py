@@ -134,6 +134,10 @@ def novatel_text(payload: bytes) -> bytes:
     )
 
 
+def novatel_short(payload: bytes) -> bytes:
+    return b"%INSPVASA,2171,123456.000;2171,123456.000,51.1,-114.0,1064.9,0.1,0.2*0a1b2c3d\r\n"
+
+
 def gpsd(payload: bytes) -> bytes:
     return b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
 
@@ -149,6 +153,7 @@ def stripped(payload: bytes) -> bytes:
         (novatel, "NovAtel or Unicore"),
         (unicore, "NovAtel or Unicore"),
         (novatel_text, "text logs of NovAtel"),
+        (novatel_short, "short headers"),
         (sirf, "SiRF"),
         (skytraq, "SkyTraq"),
         (allystar, "Allystar"),
@@ -200,10 +205,15 @@ def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
         ([made("GPGSV,1,1,00")], "switch on GGA and RMC"),
         ([made("HEHDT,30.0,T"), made("HEROT,0.1,A")], "compass arrive (HDT), and no position: a s"),
         ([made("APXDR,A,3.8,D,ROLL"), made("APHDM,218.6,M")], 'driver = "compass" reads them'),
-        ([made("PUBX,00,021429.00,3958.1,N,11619.5,E,45.3,G3,2.1,2.0")], "($PUBX: u-blox)"),
-        ([made("PTNL,GGK,021429.00,061925,3958.1,N,11619.5,E,3,12,1,EHT45,M")], "($PTNL: Trimble)"),
-        ([made("PSTI,030,021429.0,A,3958.1,N,11619.5,E,45.3")], "($PSTI: SkyTraq)"),
+        ([made("PUBX,00,021429.00,3958.1,N,11619.5,E,45.3,G3,2.1,2.0")], "($PUBX,00: u-blox)"),
+        (
+            [made("PTNL,GGK,021429.00,061925,3958.1,N,11619.5,E,3,12,1,EHT45,M")],
+            "($PTNL,GGK: Trimble)",
+        ),
+        ([made("PSTI,030,021429.0,A,3958.1,N,11619.5,E,45.3")], "($PSTI,030: SkyTraq)"),
         ([made("PQTMPVT,1,31075000,20250619,021429.000,,3")], "($PQTMPVT: Quectel)"),
+        ([made("PSSN,HRP,021429.00,190625,184.1,1.2,0.3")], "($PSSN,HRP: Septentrio)"),
+        ([made("PMTK001,314,3")], "($PMTK001,314: MediaTek)"),
         ([made("KSXT,20250619021429.00,116.3,39.9,45.3,350.0")], "($KSXT: Unicore"),
         ([made("GNHPD,2319,353687.0,350.0,0.1,0.2")], "($GNHPD: ComNav"),
         ([made("PASHR,021429.00,350.0,T,0.1,0.2"), VTG], "which are not read: switch on GGA, RMC"),
@@ -291,6 +301,8 @@ def test_the_rollover_of_the_gps_week_is_told() -> None:
         ([GGA, RMC, *["$GPVTG,1,2"] * MANY], "checksum_missing"),
         ([GGA, RMC, made("HEHDT,30.0,T")], "compass_left_out"),
         ([GGA, RMC, made("HCHDG,30.0,,,2.0,E")], "compass_left_out"),
+        ([GGA, RMC, made("PSSN,HRP,021429.00,190625,184.1,1.2,0.3")], "attitude_left_out"),
+        ([GGA, RMC, made("PTNL,AVR,021429.00,+149.4,Yaw,+0.1,Tilt")], "attitude_left_out"),
         ([GGA, RMC], None),
     ],
 )

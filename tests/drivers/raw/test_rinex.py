@@ -165,7 +165,7 @@ def test_damage_costs_its_line() -> None:
     ("text", "words"),
     [
         ("", "the first line does not say so"),
-        (header("2.11", "OBSERVATION DATA"), "RINEX 2.11; versions 3 and 4 are read"),
+        (header("1.00", "OBSERVATION DATA"), "RINEX 1.00; versions 2 to 4 are read"),
         (header("x", "OBSERVATION DATA"), "no RINEX version"),
         (header("3.05", "NAVIGATION DATA"), "has no observations"),
         (header("3.05", "OBSERVATION DATA"), "names no observables"),

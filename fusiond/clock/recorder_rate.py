@@ -1,0 +1,167 @@
+"""Rate of a recorder's clock that is slewed while it records.
+
+    s(k) = o + (1 + r) u(k) + delay(k),     0 <= delay(k) < LEAP_NS
+
+s is the recorder's time without what it was set by, u what a receiver on the bus reports of UTC.
+Offset o and rate r are the clock's two states. A quartz keeps r within the configured drift;
+whoever disciplines a clock moves r at once, holds it and moves it back: adjtimex(2) to 500 ppm by
+its frequency and to 10 % by its tick, chrony to 8.3 % (`maxslewrate`), a bad oscillator to a
+percent for good. Hence r is constant between changes whose number is the least that explains the
+reports: as long as one line passes all reports of a stretch within their own scatter, nothing has
+changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
+
+A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
+explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else. That of the first and
+of the last reports is held before and behind them, for as long as it was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
+from fusiond.clock.recorder_clock import ENOUGH_REPORTS, LEAP_NS, Slew
+
+SPACING_NS = SECOND_NS // 2
+"""Between reports that are looked at: a change is followed within seconds, and a receiver that
+tells whole seconds alone tells each at its beginning."""
+FLOOR_NS = 2 * MILLISECOND_NS
+"""Scatter of reports at the least: a CAN controller's queue."""
+SCATTERS = 4.0
+"""Sigmas that a sound report may be off its line: one of 16,000 is further."""
+DAMAGED = 2
+"""Reports off a line that may be damage: three are a change."""
+FASTEST = 0.5
+"""Gain or loss beyond which nothing is a clock's rate: adjtimex(2) allows 0.1, and reports that
+halt or come at once are a receiver's."""
+
+
+class _Line(NamedTuple):
+    """Of reports `first` to `last`: lead of the recorder's time at `middle_s`, and its slope."""
+
+    first: int
+    last: int
+    middle_s: float
+    lead_s: float
+    slope: float
+
+
+def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, ...]:
+    """Slews that the reports show: recorder's time without its steps and UTC, both in ns."""
+    kept = _thinned(reports)
+    if len(kept) < 2 * ENOUGH_REPORTS:
+        return ()
+    begin_ns, begin_utc_ns = kept[0]
+    s = np.array([t_ns - begin_ns for t_ns, _ in kept]) * 1e-9
+    lead = s - np.array([utc_ns - begin_utc_ns for _, utc_ns in kept]) * 1e-9
+    if float(np.ptp(lead)) < LEAP_NS * 1e-9:
+        return ()
+    within = SCATTERS * _scatter_s(s, lead)
+    lines = _joined(
+        [_line(s, lead, *ends) for ends in _stretches(s, lead, within)], s, lead, within
+    )
+    if not lines:
+        return ()
+    before, after = (float(s[line.last] - s[line.first]) for line in (lines[0], lines[-1]))
+    inner = (_edge(*pair, s) for pair in pairwise(lines))
+    edges = [s[lines[0].first] - before, *inner, s[lines[-1].last] + after]
+    late = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
+    found, gained_s = [], 0.0
+    for line, begin, end in zip(lines, edges, edges[1:], strict=False):
+        if line in late:
+            continue
+        first, last = float(s[line.first]), float(s[line.last])
+        rate = line.slope / (1.0 - line.slope)  # a second of UTC for one of the recorder's
+        if (
+            abs(line.slope) <= drift_ppm * 1e-6 + 2.0 * within / (last - first)
+            or abs(rate) > FASTEST
+        ):
+            continue
+        begin_at, end_at = (begin_ns + round(at * SECOND_NS) for at in (begin, end))
+        found.append(Slew(begin_at, end_at, rate))
+        gained_s = max(gained_s, abs(line.slope) * (min(end, float(s[-1])) - max(begin, 0.0)))
+    return tuple(found) if gained_s >= LEAP_NS * 1e-9 else ()
+
+
+def _thinned(reports: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Reports that go on by `SPACING_NS` at least, of which none is told again."""
+    kept: list[tuple[int, int]] = []
+    for t_ns, utc_ns in reports:
+        if not kept or (utc_ns - kept[-1][1] >= SPACING_NS and t_ns > kept[-1][0]):
+            kept.append((t_ns, utc_ns))
+    return kept
+
+
+def _scatter_s(s: np.ndarray, lead: np.ndarray) -> float:
+    """One sigma of a report, by how far each is off the line between its neighbours."""
+    share = (s[1:-1] - s[:-2]) / (s[2:] - s[:-2])
+    off = lead[1:-1] - lead[:-2] - share * (lead[2:] - lead[:-2])
+    sigma = float(np.median(np.abs(off))) / 0.6745 / 1.5**0.5  # of three independent ones
+    return float(np.clip(sigma, FLOOR_NS * 1e-9, LEAP_NS * 1e-9 / SCATTERS))
+
+
+def _stretches(s: np.ndarray, lead: np.ndarray, within: float) -> list[tuple[int, int]]:
+    """First and last report of each stretch that one line passes; a report alone that none of its
+    neighbours agrees with is damage, and no stretch."""
+    found, first = [], 0
+    while first < len(s) - 1:
+        least, most, last = -np.inf, np.inf, first
+        for k in range(first + 1, len(s)):
+            passed = s[k] - s[first]
+            low, high = (lead[k] - lead[first] + by for by in (-2.0 * within, 2.0 * within))
+            if max(least, low / passed) > min(most, high / passed):
+                break
+            least, most, last = max(least, low / passed), min(most, high / passed), k
+        found.append((first, last))
+        first = last + 1
+    return [(a, b) for a, b in found if b - a + 1 >= ENOUGH_REPORTS]
+
+
+def _line(s: np.ndarray, lead: np.ndarray, first: int, last: int) -> _Line:
+    """Through the reports of a stretch, whatever a few of them say (Theil and Sen, by halves)."""
+    at, y = s[first : last + 1], lead[first : last + 1]
+    half = (len(at) + 1) // 2
+    slope = median((y[half:] - y[: len(y) - half]) / (at[half:] - at[: len(at) - half]))
+    middle_s = float(at.mean())
+    return _Line(first, last, middle_s, float(np.median(y - slope * (at - middle_s))), float(slope))
+
+
+def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) -> list[_Line]:
+    """Neighbours made one where one line passes both."""
+    found: list[_Line] = []
+    for line in lines:
+        found.append(line)
+        while len(found) > 1:
+            both = _line(s, lead, found[-2].first, found[-1].last)
+            at, y = s[both.first : both.last + 1], lead[both.first : both.last + 1]
+            off = np.abs(y - both.lead_s - both.slope * (at - both.middle_s))
+            if int((off > within).sum()) > DAMAGED:
+                break
+            found[-2:] = [both]
+    return found
+
+
+def _meet(one: _Line, other: _Line, s: np.ndarray) -> bool:
+    """True if a clock can go from one line on to the next: it does not leap, reports that queue
+    somewhere do as the queue builds up or is over."""
+    last, first = float(s[one.last]), float(s[other.first])
+    middle = (last + first) / 2.0
+    ends = (line.lead_s + line.slope * (middle - line.middle_s) for line in (one, other))
+    steepest = max(abs(one.slope), abs(other.slope))
+    return abs(next(ends) - next(ends)) < LEAP_NS * 1e-9 + steepest * (first - last)
+
+
+def _edge(one: _Line, other: _Line, s: np.ndarray) -> float:
+    """Time at which a line gives way to the next: where they meet, if between their middles."""
+    between = float(s[one.last] + s[other.first]) / 2.0
+    turn = one.slope - other.slope
+    if not turn:
+        return between
+    of_one, of_other = (line.lead_s - line.slope * line.middle_s for line in (one, other))
+    meet = (of_other - of_one) / turn
+    return meet if one.middle_s < meet < other.middle_s else between
