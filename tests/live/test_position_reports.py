@@ -39,7 +39,7 @@ class Spy:
         self.status = DriverStatus("running")
         self.taken: list[tuple[str, Message]] = []
 
-    def take(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message) -> None:
         self.taken.append((topic.path, message))
 
     async def run(self) -> None:
