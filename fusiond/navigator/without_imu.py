@@ -288,15 +288,16 @@ class WithoutImu:
 def counted_together(
     inertial: Mapping[str, Counter[str]], without: Mapping[str, Counter[str]]
 ) -> dict[str, Counter[str]]:
-    """Outcomes by source of both. A measurement that was fused without an inertial unit, and came
-    before the alignment or where no sample reaches, is not counted as lost as well."""
+    """Outcomes by source of both. A measurement that was fused or left out without an inertial
+    unit, and came before the alignment or where no sample reaches, is not counted as lost as
+    well."""
     found = {name: Counter(counts) for name, counts in inertial.items()}
     for name, counts in without.items():
         both = found.setdefault(name, Counter())
-        fused = counts["fused"]
+        told = counts["fused"] + counts["no_attitude"]
         for lost in ("no_alignment", "no_imu"):
-            spared = min(both[lost], fused)
-            both[lost], fused = both[lost] - spared, fused - spared
+            spared = min(both[lost], told)
+            both[lost], told = both[lost] - spared, told - spared
         both.update(counts)
     return found
 

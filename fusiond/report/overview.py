@@ -21,7 +21,7 @@ MARKED_FROM = 0.05
 _NO_FAULT = frozenset(
     (
         *("start", "no_alignment", "no_imu", "moving", "turning", "turns_at_rest"),
-        *("quiet_at_speed", "too_slow", "height_held"),
+        *("quiet_at_speed", "too_slow", "height_held", "no_attitude"),
     )
 )
 """Outcomes that say nothing against the source: it could not be used just then."""
