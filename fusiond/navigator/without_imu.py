@@ -294,10 +294,10 @@ def counted_together(
     found = {name: Counter(counts) for name, counts in inertial.items()}
     for name, counts in without.items():
         both = found.setdefault(name, Counter())
-        told = counts["fused"] + counts["no_attitude"]
+        counted = counts["fused"] + counts["no_attitude"]
         for lost in ("no_alignment", "no_imu"):
-            spared = min(both[lost], told)
-            both[lost], told = both[lost] - spared, told - spared
+            spared = min(both[lost], counted)
+            both[lost], counted = both[lost] - spared, counted - spared
         both.update(counts)
     return found
 

@@ -78,10 +78,10 @@ class Refusals:
         return str(self._named[0]) if self._named else ""
 
     def all(self) -> list[Rejection]:
-        """Of each reason what is told and how many more there are."""
-        told = Counter(each.reason for each in self._named)
+        """Of each reason the named ones and how many more there are."""
+        named = Counter(each.reason for each in self._named)
         more = [
-            Rejection(0, name, f"{n} {'more' if told[name] else 'times'}", n)
+            Rejection(0, name, f"{n} {'more' if named[name] else 'times'}", n)
             for name, n in self._more.items()
             if n
         ]
@@ -91,9 +91,9 @@ class Refusals:
 def messages(
     path: Path,
     refusals: Refusals | None = None,
-    told: Callable[[str, str], None] = lambda code, text: None,
+    on_zone: Callable[[str, str], None] = lambda code, text: None,
 ) -> Iterator[can.Message]:
-    """The messages of a log in its order. `told(code, text)` hears which zone its dates are of.
+    """The messages of a log in its order. `on_zone(code, text)` hears which zone its dates are of.
 
     Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
     asammdf, OSError for a file that cannot be opened.
@@ -103,7 +103,7 @@ def messages(
     count, odd = 0, Counter[str]()
     with contextlib.ExitStack() as stack:
         stack.enter_context(_warned(lambda: odd.update(("length_or_type_odd",))))
-        for message in read(log, lost, stack, told):
+        for message in read(log, lost, stack, on_zone):
             count += 1
             yield message
     if log.suffix != ".trc":  # whose lines are refused by their number
@@ -159,7 +159,7 @@ def _channel_words(path: Path) -> Iterator[str | int]:
 
 
 def _text(
-    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, on_zone: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
     """Of a text log. A reader that a line has stopped goes on behind it."""
     stream = stack.enter_context(log.open())
@@ -170,7 +170,7 @@ def _text(
             stamps = first_stamps(first)
         candump = candump_of(stamps)
         if stamps and dated(stamps[0]):
-            told("recorder_zone", _DATED_LOG.format(zone=_zone(stamp_s(stamps[0]))))
+            on_zone("recorder_zone", _DATED_LOG.format(zone=_zone(stamp_s(stamps[0]))))
     trc = Trc()
     plain = {".log": candump.plain, ".asc": asc.plain, ".trc": trc.plain}[log.suffix]
     lines = TextLines(stream, plain, lambda line, text: lost.add(line, "unreadable", text))
@@ -191,7 +191,7 @@ def _text(
                     message.timestamp -= 2.0 * asc.before_trigger_s
                 if not began:
                     began = True
-                    _report_zone(log, getattr(reader, "start_time", None), told)
+                    _report_zone(log, getattr(reader, "start_time", None), on_zone)
                 yield message
             break
         except Exception:  # whatever a reader raises for a line that is none
@@ -212,7 +212,7 @@ def _text(
 
 
 def _binary(
-    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, on_zone: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
     stream = stack.enter_context(log.open())
     containers = Containers(stream, lambda text: lost.add(0, "unreadable", text))
@@ -222,7 +222,7 @@ def _binary(
         lost.add(0, "unreadable", f"its header: {error}")
         return
     containers.body()
-    _report_zone(log, reader.start_timestamp, told)
+    _report_zone(log, reader.start_timestamp, on_zone)
     reader.start_timestamp -= DAY_S
     try:
         yield from reader
@@ -233,7 +233,7 @@ def _binary(
 
 
 def _mf4(
-    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, on_zone: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
     if importlib.util.find_spec("asammdf") is None:
         raise MissingPackageError(f"MF4 logs need the package asammdf: {install('mf4')}")
@@ -250,13 +250,13 @@ def _mf4(
             gc.collect()
 
 
-def _report_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
+def _report_zone(log: _Log, start: Any, on_zone: Callable[[str, str], None]) -> None:
     """Report the time zone of the log's date, or that it has none."""
     if log.suffix in _ZONES and not start:
-        told("recorder_zone", _UNDATED)
+        on_zone("recorder_zone", _UNDATED)
     elif log.suffix in _ZONES:
         zone = _zone(start) if log.suffix == ".asc" else ""
-        told("recorder_zone", _ZONES[log.suffix].format(zone=zone))
+        on_zone("recorder_zone", _ZONES[log.suffix].format(zone=zone))
 
 
 def _zone(t_s: float | None) -> str:

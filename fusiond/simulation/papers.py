@@ -167,8 +167,8 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_lines(base: dict[str, Any], lines: dict[str, Any]) -> dict[str, Any]:
-    """A configuration with further lines, of which an aid of another kind takes the place of what
-    was there: it has other keys, but for the lever arm, which is the antenna's."""
+    """A configuration with further lines, of which a measurement of another kind takes the place of
+    what was there: it has other keys, but for the lever arm, which is the antenna's."""
     base, changed = {**base, "aiding": {**base["aiding"]}}, lines.get("aiding", {})
     for name, section in changed.items():
         was = base["aiding"].get(name, {})

@@ -46,7 +46,7 @@ HONEST = (0.7, 1.4)
 GROUPS = {"position": slice(6, 9), "velocity": slice(3, 6), "attitude": slice(0, 3)}
 IN_DEGREES = {"attitude": math.degrees(1.0)}
 KIND_OF = {"gnss": "gnss", "star_tracker": "attitude", "sar": "bearing", "rdss": "rdss"}
-"""File of a device: the kind of aid."""
+"""File of a device: the kind of measurement."""
 MEMS = {"axes": ("+x", "-y", "-z"), "rate_hz": 100.0, "sensor_class": "mems"}
 
 

@@ -47,8 +47,8 @@ def exact(block: str = "") -> Oriented:
     return Oriented(AT_NS, RPY, (0.0, 0.0, 0.0), block)
 
 
-def asked(aid: BearingMeasurement, at: State) -> Innovation:
-    found = aid.innovation(at)
+def asked(measurement: BearingMeasurement, at: State) -> Innovation:
+    found = measurement.innovation(at)
     assert isinstance(found, Innovation)
     return found
 
@@ -56,11 +56,11 @@ def asked(aid: BearingMeasurement, at: State) -> Innovation:
 def test_slopes_are_those_of_the_angles() -> None:
     # Of noise that is the same everywhere: whitening then changes nothing.
     bearing = replace(BEARING, sd=(1.0, 1.0))
-    aid = replace(bearing, attitude=exact(STAR_BLOCK))
+    measurement = replace(bearing, attitude=exact(STAR_BLOCK))
     xi = np.zeros(MODEL.size)
     xi[9:15] = 2e-4, -1e-4, 3e-4, 1e-4, 2e-4, -2e-4
     base = state(xi=xi)
-    h = asked(aid, base).h
+    h = asked(measurement, base).h
     # No attitude is estimated, and a velocity turns nothing.
     assert not h[:, :6].any()
     metres = runs.metres(base.nav[LAT], base.nav[LAT + 2])
@@ -69,14 +69,14 @@ def test_slopes_are_those_of_the_angles() -> None:
         for d in (-0.5, 0.5):
             nav = base.nav.copy()
             nav[LAT + axis] += d / metres[axis]
-            ends.append(asked(aid, state(nav, xi)).z)
+            ends.append(asked(measurement, state(nav, xi)).z)
         assert h[:, 6 + axis] == pytest.approx(ends[1] - ends[0], rel=1e-4, abs=1e-8)
     for slot in range(9, 15):
         ends = []
         for d in (-1e-4, 1e-4):
             moved = xi.copy()
             moved[slot] -= d  # an error is true minus estimate
-            ends.append(asked(aid, state(xi=moved)).z)
+            ends.append(asked(measurement, state(xi=moved)).z)
         assert h[:, slot] == pytest.approx((ends[1] - ends[0]) / 2e-4, abs=3e-4)
 
 

@@ -109,7 +109,10 @@ def test_wheel_and_compass_count_their_drifts() -> None:
     compass = MagneticHeading("compass", 5, stamp, 1.0)
 
     def made() -> tuple[WheelSpeedMeasurement, CompassMeasurement]:
-        (one,), (other,) = intake.aids(wheel, 5, 0.0), intake.aids(compass, 5, 0.0)
+        (one,), (other,) = (
+            intake.measurements_of(wheel, 5, 0.0),
+            intake.measurements_of(compass, 5, 0.0),
+        )
         assert isinstance(one, WheelSpeedMeasurement)
         assert isinstance(other, CompassMeasurement)
         return one, other

@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from fusiond.offline.aid_files import READERS
 
 from drivers.measurements import MonotonicStamp
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.files.tables import ImuTable
+from fusiond.offline.measurement_files import READERS
 from tests.places import DATA
 
 FILE = DATA.parent / "cases" / "18_rtcm_of_2016.rtcm3"
