@@ -164,7 +164,7 @@ def ssr(data: bytes) -> None:
         body = (number << 4 | line[1] & 15).to_bytes(2, "big") + line[2:1023]
         frame = b"\xd3" + len(body).to_bytes(2, "big") + body
         before = decoder.counters.total()
-        found = decoder.take(Frame("rtcm", frame + b"\0\0\0"), 7)
+        found = decoder.decode(Frame("rtcm", frame + b"\0\0\0"), 7)
         assert decoder.counters.total() > before
         for event in found:
             assert isinstance(event, Correction)

@@ -198,7 +198,7 @@ def test_sigma_of_a_start_is_honest(name: str) -> None:
     assert np.mean(yaw_sd) < 10.0
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.late_s])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.delay_s])
 def test_a_receiver_without_velocity_starts_by_its_positions(name: str) -> None:
     """Forward, reversing, on a slope and in a spiral, from rest and met on the move."""
     case = CASES[name]
