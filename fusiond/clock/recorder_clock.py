@@ -98,8 +98,10 @@ class RecorderClock:
     def is_odd(self, stamp_ns: int, of: Of) -> bool:
         """True if `take` has to look at what follows."""
         change = stamp_ns - self.stamp_ns
+        if not self._started:
+            return True
         if 0 <= change < LEAP_NS:
-            return not self._started
+            return False
         own_ns = self._of_channel.get(of[0], stamp_ns)
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 

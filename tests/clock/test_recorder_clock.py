@@ -161,6 +161,14 @@ def test_reports_of_utc_on_both_sides() -> None:
     assert set_by(rough, [t + 5 * S for t in rough]) == 5 * S
 
 
+def test_a_log_that_begins_within_a_second_before_its_trigger() -> None:
+    """Its first stamps are below zero, where no time has passed yet."""
+    stamps = [-300 * MS + k * PERIOD for k in range(100)]
+    _, times, verdicts = replayed(stamps)
+    assert times == stamps
+    assert verdicts == {"taken": 100}
+
+
 def test_any_stamps_at_all() -> None:
     """Monotonic time never goes back, and every frame ends in a verdict."""
     draw = random.Random(40)
