@@ -48,9 +48,10 @@ TYPED = (SIDE_DRIFT, WHEEL_DRIFT, DISTURBANCE)
 """Beginnings of the names of their blocks."""
 GRID: Final = 4.0 ** np.arange(-3.0, 0.1, 0.25)
 """Levels: all of the variance, down to an eighth of the sigma."""
-FIRST = 2.0
-"""Instants that it counts that all of it is there: a filter that has once been too sure of its
-course stays so."""
+FIRST = 6.0
+"""Instants, a minute of them, that it counts that all of it is there: a filter that has once been
+too sure of its course stays so, and slip comes with bends, of which a street has one a minute. With
+two a calibrated `drive_0708` had one false isolation more, just before an outage."""
 FORGETS = 180.0
 """Instants, half an hour of them: loads, tyres and roads change."""
 MOVES_M_S = 2.0

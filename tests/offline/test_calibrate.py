@@ -116,18 +116,7 @@ def test_a_drive_tells_how_its_sensor_is_mounted(
 
 
 @recorded
-@pytest.mark.parametrize(
-    "rpy_deg",
-    [
-        (0.0, 0.0, 0.0),
-        pytest.param(
-            (5.0, 5.0, 5.0),
-            marks=pytest.mark.xfail(
-                strict=True, reason="turned by 5 deg a sound velocity is left out before an outage"
-            ),
-        ),
-    ],
-)
+@TURNS
 def test_what_was_calibrated_bridges_outages_as_what_was_typed(
     rpy_deg: tuple[float, float, float], typed_rms_m: float, tmp_path: Path
 ) -> None:
