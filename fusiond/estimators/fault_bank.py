@@ -115,6 +115,8 @@ E_ROWS = np.array([E_AT, E1, E2])
 # What never changes of eight groups: the prior's precisions, its mean, and what of the log odds
 # does not depend on what has come, with the prior's density and without.
 P_AT, MEAN_AT, ODDS_AT, RATE_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5, LANES * 6
+TINY = 1e-9
+"""A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
@@ -225,3 +227,23 @@ def column_of(bank: Array, number: int, component: int) -> int:
         ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
         column = ones * LANES + (number - threes) % LANES
     return column
+
+
+@compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)
+def explained_by_three(bank: Array, lanes: Array, j: np.uint64, c: np.uint64) -> float:
+    """e^T L^-1 e of the group of three numbers at `j`, whose constants are at `c`."""
+    unsigned = np.uint64
+    d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
+    a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+    l_1, l_2 = a_1 / d_0, a_2 / d_0
+    d_1 = bank[j + unsigned(L11)] + TINY * lanes[c + unsigned(P_AT + LANES)]
+    d_1 -= l_1 * a_1
+    a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+    l_3 = a_3 / d_1
+    d_2 = bank[j + unsigned(L22)] + TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
+    d_2 -= l_2 * a_2 + l_3 * a_3
+    e_0 = bank[j + unsigned(E_AT)]
+    e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+    e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+    explained: float = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+    return explained
