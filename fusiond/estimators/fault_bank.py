@@ -94,11 +94,12 @@ LOG_PRIOR = 7
 # aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
 # one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the row
 # width of the transition, by how much the unit has been found to have turned on the vehicle in
-# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, and what has been
-# fed back of the velocity in all (m/s).
+# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
+# back of the velocity in all (m/s), and behind how many eights of groups with three numbers, and of
+# those with one, no V is other than zero.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, HEAD = 21, 22, 32
+UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEAD = 21, 22, 25, 26, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -227,6 +228,26 @@ def column_of(bank: Array, number: int, component: int) -> int:
         ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
         column = ones * LANES + (number - threes) % LANES
     return column
+
+
+@compiled("void(f8[::1], i8)", forceinline=True)
+def wake(bank: Array, kind: int) -> None:
+    """A kind's V may be other than zero from now on."""
+    threes, last = int(bank[THREES]), RESTARTS * (kind + 1) - 1
+    if last < threes:
+        bank[THREES_AWAKE] = max(bank[THREES_AWAKE], last // LANES + 1)
+    else:
+        bank[ONES_AWAKE] = max(bank[ONES_AWAKE], (last - threes) // LANES + 1)
+
+
+@compiled("UniTuple(i8, 2)(f8[::1], b1)", forceinline=True)
+def awake(bank: Array, three: bool) -> tuple[int, int]:
+    """First column of groups with three numbers, or of those with one, and behind the last of which
+    V may be other than zero."""
+    if three:
+        return 0, 3 * LANES * int(bank[THREES_AWAKE])
+    first = 3 * LANES * ((int(bank[THREES]) + LANES - 1) // LANES)
+    return first, first + LANES * int(bank[ONES_AWAKE])
 
 
 @compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)

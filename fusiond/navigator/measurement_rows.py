@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, NAMES, SIZE
+from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
-from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.fault_bank import NOTHING
 from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.estimators.row_kernels import (
     BECAME,
-    FUSED,
-    GATED,
+    DEGREES,
+    ENDS,
     INNOVATION,
     MOVES,
     NIS,
-    NOT_FINITE,
     OF_STATE,
     WHITENED,
 )
@@ -54,8 +53,8 @@ class MeasurementRows:
     """Rows for one estimator; none for one that takes aids one by one."""
 
     def __init__(self, estimator: Estimator) -> None:
-        runs = estimator.runs
-        self._bank = None if runs is None else estimator.hypotheses
+        self._runs = estimator.runs is not None
+        self._bank = estimator.hypotheses
         self._model = estimator.model
         self._known: dict[str, tuple[int, int, int, int]] = {}
         """By source: number of its series, what its rows are and its device, what is asked."""
@@ -64,23 +63,24 @@ class MeasurementRows:
 
     def packed(self, measurement: Aid) -> tuple[bytes, object]:
         """An aid's row, empty where it has none, and what a frozen sensor would repeat of it."""
-        bank = None if measurement.robust else self._bank
-        packed = None if bank is None else measurement.packed(self._model)
-        if bank is None or packed is None:
+        alike = self._runs and not measurement.robust
+        packed = measurement.packed(self._model) if alike else None
+        if packed is None:
             return b"", None
-        known = self._known.get(measurement.source) or self._new(measurement, bank)
+        known = self._known.get(measurement.source) or self._new(measurement)
         kind, rows, body = packed
         row = HEADER.pack(kind, measurement.t_ns, rows, THRESHOLDS[measurement.gate, rows], *known)
         shown = None if measurement.constraint else type(measurement).shown
         return row + body + _PADDING[len(body)], None if shown is None else shown(measurement)
 
-    def _new(self, measurement: Aid, bank: Hypotheses) -> tuple[int, int, int, int]:
+    def _new(self, measurement: Aid) -> tuple[int, int, int, int]:
         """Constants of an aid's source."""
-        number, asked = len(self._known), 0
+        number, asked, bank = len(self._known), 0, self._bank
+        of = (NOTHING, -1) if bank is None else bank.of(measurement)
         self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not measurement.constraint:
             asked = MEASURED if measurement.locates else MEASURED | MOTION_ASKED
-        known = self._known[measurement.source] = number, *bank.of(measurement), asked
+        known = self._known[measurement.source] = number, *of, asked
         return known
 
     def batch(
@@ -128,17 +128,11 @@ class MeasurementRows:
                 span.one.noise[:] = self._noise[span.number]
 
 
-def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:
-    """Outcome of an measurement with a row, by what a run has made of it."""
-    became, degrees = int(result[BECAME]), HEADER.unpack_from(row)[2]
-    if became == FUSED:
-        whitened = tuple(result[WHITENED : WHITENED + degrees])
-        return Outcome("fused", result[NIS], degrees, whitened)
-    if became == GATED:
-        return Outcome("gated", result[NIS], degrees)
-    if became == NOT_FINITE:
-        return Outcome("not_finite", result[NIS], degrees)
-    return Outcome(NAMES[became])
+def outcome_of(result: Sequence[float]) -> Outcome:
+    """Outcome of a measurement with a row, by what a run has made of it."""
+    name, degrees = ENDS[int(result[BECAME])], int(result[DEGREES])
+    whitened = tuple(result[WHITENED : WHITENED + degrees]) if name == "fused" else ()
+    return Outcome(name, result[NIS], degrees, whitened)
 
 
 def raw_of(result: Sequence[float], degrees: int) -> RawInnovation | None:

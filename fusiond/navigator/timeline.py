@@ -236,7 +236,7 @@ class Timeline:
         entries = self._entries[self._next : self._next + ran.done]
         self._rows.went_on(entries, results)
         for entry, result in zip(entries, results, strict=True):
-            outcome = outcome_of(entry.row, result)
+            outcome = outcome_of(result)
             entry.raw = raw_of(result, outcome.degrees) if self.keeps_raw else None
             self._next += 1
             if ran.how == JUDGE and entry is entries[-1]:

@@ -19,9 +19,11 @@ from fusiond.estimators.fault_bank import (
     E_ROWS,
     L_AT,
     L_ROWS,
+    LANES,
     LEVEL_OF,
     N_AT,
     RESTARTS,
+    awake,
     group_at,
 )
 from fusiond.estimators.fault_odds import APART, solve
@@ -268,6 +270,34 @@ def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
     made.adopt(found.mean, found.spread)
     after = np.abs(runs.nav_error(made.nav, truth)[6])
     assert after < 0.5 * before
+
+
+def test_what_nothing_has_moved_is_left_out() -> None:
+    """V of kinds whose rows never come, and of a fault's end where there was none, is zero and not
+    gone through, until something moves it."""
+
+    def behind(made: KalmanEstimator) -> tuple[int, int, bool]:
+        """Columns of V that are left out, of groups of three numbers and of one; whether `over` is
+        zero."""
+        bank, over = made.hypotheses, row_of("over")
+        assert bank is not None
+        v = bank.sensitivities
+        (_, threes), (ones, end) = awake(bank.bank, True), awake(bank.bank, False)
+        assert not v[:, threes:ones].any()
+        assert not v[:, end:].any()
+        for last, step in ((threes, 3 * LANES), (end, LANES)):
+            assert v[:, last - step : last].any()
+        effects = [bank.effect(RESTARTS * over + restart) for restart in range(RESTARTS)]
+        return ones - threes, v.shape[1] - end, not np.any(effects)
+
+    ground, of_over, nothing = behind(run())
+    assert ground >= 3 * LANES
+    assert of_over >= LANES
+    assert nothing
+    size = np.array([1.5, 0.0, 0.0])
+    _, less, nothing = behind(run("position_drift", size, until_ns=26 * runs.SECOND))
+    assert less < of_over
+    assert not nothing
 
 
 def test_what_returns_to_service_begins_anew() -> None:
