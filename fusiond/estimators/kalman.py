@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
+from fusiond.estimators.base import AS_STATED, THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
 from fusiond.estimators.measurement_run import MeasurementRun
@@ -31,7 +31,7 @@ _NOTHING = np.zeros(0)
 _NO_BANK: OfBank = _NOTHING, *NO_FAULTS[:3], 0, 0, 0, np.zeros(0, dtype=np.float32), _NOTHING
 
 
-class KalmanEstimator(ErrorStateFilter):
+class KalmanEstimator(Estimator):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
     packs: ClassVar[bool] = True
