@@ -213,11 +213,16 @@ def _sign(
         if offset == 0.0 and slope == 0.0:
             continue
         wake(bank, kind)
-        for number in range(RESTARTS * kind, RESTARTS * (kind + 1)):
-            d = offset
-            if slope != 0.0:
-                d += slope * (t_s - bank[group_at(bank, number) + ONSET])
-            work[a * columns + column_of(bank, number, 0 if size == 1 else a)] += d
+        number, behind = RESTARTS * kind, RESTARTS * (kind + 1)
+        while number < behind:  # those of eight at once
+            at = group_at(bank, number)
+            count = min(behind - number, LANES - (at - GROUPS) % LANES)
+            onsets = bank[at + ONSET : at + ONSET + count]
+            first = a * columns + column_of(bank, number, 0 if size == 1 else a)
+            s = work[first : first + count]
+            for j in range(s.shape[0]):
+                s[j] += offset + slope * (t_s - onsets[j])
+            number += count
 
 
 @compiled(

@@ -52,10 +52,12 @@ class KalmanEstimator(Estimator):
         self._runs = self._new_run(NO_AXES)
 
     def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Aids in one call, with what updates carry over; None of a filter whose updates differ."""
-        if not self.packs:
+        """Aids in one call, with what updates carry over; None without a bank, of whose fixes a
+        second a call costs more than it spares, and of a filter whose updates differ."""
+        bank = self.hypotheses
+        if bank is None or not self.packs:
             return None
-        return MeasurementRun(self, self._memory, self.model, self.hypotheses, axes, self._knows)
+        return MeasurementRun(self, self._memory, self.model, bank, axes, self._knows)
 
     @property
     def runs(self) -> MeasurementRun | None:

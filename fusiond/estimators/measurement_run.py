@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS
-from fusiond.estimators.fault_bank import NO_FAULTS
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import Memory
 from fusiond.estimators.propagation import RECORD
@@ -38,27 +37,22 @@ class Filter(Protocol):
 
 
 class MeasurementRun:
-    """`run_rows` of one filter: its memory, bank, if it has one, and axes, with what it `knows`
-    (KNOWS,)."""
+    """`run_rows` of one filter: its memory, bank and axes, with what it `knows` (KNOWS,)."""
 
     def __init__(
         self,
         filter_: Filter,
         memory: Memory,
         model: Model,
-        bank: Hypotheses | None,
+        bank: Hypotheses,
         axes: Axes,
         knows: Array,
     ) -> None:
         work = np.zeros(AT_H + LENT_ROWS * (model.size + model.width))
         self._filter, self._memory, self._kernel = filter_, memory.array, run_for(model.width)
-        table = NO_FAULTS if bank is None else bank.table
-        none = np.zeros((0, 2)), np.zeros(0, dtype=np.float32), np.zeros(0), np.zeros(0)
-        of = none if bank is None else (bank.mounting, bank.rows, bank.work, bank.found)
-        mounting, rows, opened, found = of
         self._given = (
-            *(*table[:3], model.column_of, model.initial, *axes),
-            *(mounting, work, rows, opened, knows, found),
+            *(*bank.table[:3], model.column_of, model.initial, *axes),
+            *(bank.mounting, work, bank.rows, bank.work, knows, bank.found),
         )
         self._hold_height, self._knows = model.hold_height, knows
 

@@ -1,4 +1,4 @@
-"""Compiled kernels: a filter taken from aid to aid, with the bank that it has, in one call.
+"""Compiled kernels: a filter taken from aid to aid, with its bank of hypotheses, in one call.
 
 Aids come as rows of numbers in order of validity (fusiond.aiding.packed). Each is what
 fusiond.estimators.kalman makes of it: propagated to, gated, folded in, taken for evidence, and the
@@ -129,8 +129,6 @@ def conclude(
     `waits` where nobody reads odds before they are others."""
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
-    if bank.size == 0:
-        return
     judge_what_waits(bank, ints, numbers, lanes, found)
     epoch_s = bank[UNJUDGED]
     if epoch_s < np.inf:
@@ -173,12 +171,11 @@ def _judged(
     bank, ints, numbers, lanes, found, _, work = of_bank
     m, t_s = of[ROWS], of[T_NS] * 1e-9
     if of[ASKED] & MEASURED:
-        if bank.size:
-            if bank[SUSPECTS] != 0.0:
-                return JUDGE
-            bank[UNJUDGED] = t_s
+        if bank[SUSPECTS] != 0.0:
+            return JUDGE
+        bank[UNJUDGED] = t_s
         learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
-    elif bank.size:
+    else:
         published, mounting, wider = opened
         judge_and_widen(
             *(bank, ints, numbers, lanes, dx.shape[0], t_s, False, True),

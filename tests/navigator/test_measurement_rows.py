@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fusiond.aiding.velocity import VelocityAid
-from fusiond.bench.bench import DELAY_NS, FIX_NS, _filter, _fix
 from fusiond.bench.delayed_fix import Drive
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.navigator.timeline import Entry, Timeline
+from fusiond.navigator.timeline import Entry
 
 SECOND_ROWS = 10
 """Epochs of the drive's receiver a second."""
@@ -77,38 +74,6 @@ def test_rows_are_what_aids_are_one_by_one(monkeypatch: pytest.MonkeyPatch, alte
         assert diagnosis.series[name].state is series.state
     outcomes = by_rows.navigator.timeline.counters.outcomes
     assert outcomes == singly.navigator.timeline.counters.outcomes
-
-
-def without_bank(monkeypatch: pytest.MonkeyPatch, *, packs: bool) -> Timeline:
-    """Four seconds of a filter without a bank, of whose fixes one is late and one far off."""
-    monkeypatch.setattr(KalmanEstimator, "packs", packs)
-    _, estimator, buffer = _filter(800)
-    timeline = Timeline(estimator, buffer, keep_s=15.0, checkpoint_s=0.5)
-    timeline.start()
-    far, late = 3 * FIX_NS, buffer.latest_ns - DELAY_NS
-    for t_ns in range(FIX_NS, buffer.latest_ns + 1, FIX_NS):
-        fix = _fix("gnss", t_ns)
-        timeline.insert(replace(fix, lat_rad=fix.lat_rad + 1e-3) if t_ns == far else fix)
-        v, sd = (1e-12 * t_ns, 0.0, 0.0), (0.1, 0.1, 0.1)
-        timeline.insert(VelocityAid("gnss_velocity", t_ns, 0.9999, v, sd, (0.3, 0.0, -1.0)))
-    timeline.run()
-    timeline.insert(_fix("rdss", late))
-    timeline.run()
-    return timeline
-
-
-def test_a_filter_without_a_bank_takes_rows_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    by_rows = without_bank(monkeypatch, packs=True)
-    singly = without_bank(monkeypatch, packs=False)
-    one, other = by_rows.estimator.snapshot(), singly.estimator.snapshot()
-    assert by_rows.estimator.runs is not None
-    assert singly.estimator.runs is None
-    assert one.kept.tobytes() == other.kept.tobytes()
-    assert by_rows.counters == singly.counters
-    assert by_rows.counters.outcomes["gnss"] == {"fused": 19, "gated": 1}
-    assert by_rows.counters.rewinds == 1
-    noise = by_rows.diagnosis.series["gnss"].noise
-    assert np.array_equal(noise, singly.diagnosis.series["gnss"].noise)
 
 
 def test_raw_innovations_are_those_of_the_aids(monkeypatch: pytest.MonkeyPatch) -> None:
