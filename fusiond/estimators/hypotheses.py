@@ -27,6 +27,7 @@ from fusiond.estimators.fault_bank import (
     TURNED_BY,
     UNEXPLAINED,
     UNJUDGED,
+    UNWEIGHED,
     WAITS,
     WEIGHT,
     FaultTable,
@@ -156,7 +157,8 @@ class Hypotheses:
 
     def conclude(self) -> None:
         """Judge what waits for it."""
-        judge_what_waits(self.bank, *self.table[:3], self.found)
+        if self.bank.item(UNWEIGHED) < math.inf:
+            judge_what_waits(self.bank, *self.table[:3], self.found)
         epoch_s = self.bank.item(UNJUDGED)
         if epoch_s < math.inf:
             judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)

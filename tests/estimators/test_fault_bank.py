@@ -22,6 +22,7 @@ from fusiond.estimators.fault_bank import (
     LANES,
     LEVEL_OF,
     N_AT,
+    ONSET,
     RESTARTS,
     awake,
     group_at,
@@ -143,6 +144,20 @@ def test_the_filter_is_off_by_v_b(fault: str, size: tuple[float, ...]) -> None:
     for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
         scale = max(np.abs(expected[part]).max(), 1e-9)
         assert np.abs(found[part] - expected[part]).max() < 0.02 * scale + 1e-9, part
+
+
+def test_what_is_carried_off_runs_away_at_the_velocity_that_it_adds() -> None:
+    """V of a device that is carried off is the sum of those of its position's drift and its
+    velocity's offset, of one onset."""
+    bank = run().hypotheses
+    assert bank is not None
+    rows = [row_of(name) for name in ("carried_off", "position_drift", "velocity")]
+    for restart in range(RESTARTS):
+        onsets = {float(bank.each(ONSET)[row, restart]) for row in rows}
+        assert len(onsets) == 1
+        both, drift, offset = (bank.effect(RESTARTS * row + restart) for row in rows)
+        scale = np.abs(drift) + np.abs(offset)
+        assert np.abs(both - drift - offset).max() < 1e-5 * scale.max()
 
 
 def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
