@@ -73,42 +73,6 @@ def nis_if_sensors_fail(
 
 
 @compiled(
-    "i8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1], f8[:, ::1],"
-    "f8[::1], i8, i8, i8, f4[::1], f8[::1])"
-)
-def _evidence_rows(
-    nav: Array,
-    step: Array,
-    h: Array,
-    r: Array,
-    g: Array,
-    fails: bool,
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    lanes: Array,
-    t_ns: int,
-    measures: int,
-    device: int,
-    work: Single,
-    found: Array,
-) -> int:
-    """`sensitivity_rows` after what has to come before: restarts that are due, and odds that these
-    need, or a measurement that `fails`."""
-    if fails or restarts(bank, t_ns):
-        judge_what_waits(bank, ints, numbers, lanes, found)
-    bank[UNWEIGHED] = np.inf  # what comes now is evidence, too
-    if fails and bank[UNJUDGED] < np.inf:
-        judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
-    n = h.shape[1]
-    restart_due(bank, ints, numbers, n, t_ns, nav, step)
-    columns: int = sensitivity_rows(
-        bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work
-    )
-    return columns
-
-
-@compiled(
     "f8(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
     "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, i8, f4[::1], f8[::1])"
 )
@@ -145,12 +109,18 @@ def fold_and_account(
     if not nis < np.inf:
         return nis
     if bank.size:
-        fails = nis > threshold
-        of_bank = bank, ints, numbers, lanes, t_ns, measures, device, work, found
-        columns = _evidence_rows(nav, step, h, r, g, fails, *of_bank)
+        n, fails = dx.shape[0], nis > threshold
+        if fails or restarts(bank, t_ns):
+            judge_what_waits(bank, ints, numbers, lanes, found)
+        bank[UNWEIGHED] = np.inf  # what comes now is evidence, too
+        if fails and bank[UNJUDGED] < np.inf:
+            judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
+        restart_due(bank, ints, numbers, n, t_ns, nav, step)
+        rows = bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work
+        columns = sensitivity_rows(*rows)
         if fails:
             nis = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-        account(bank, dx.shape[0], y, g, nis <= threshold, work)
+        account(bank, n, y, g, nis <= threshold, work)
     if nis <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -185,6 +155,10 @@ def account_for(
 ) -> None:
     """Update the bank by rows that were `fused` or not, as `whiten` has left y (m,) and g (m, w):
     of a filter that keeps its estimate."""
-    of_bank = bank, ints, numbers, lanes, t_ns, measures, device, work, found
-    _evidence_rows(nav, step, h, r, g, False, *of_bank)
-    account(bank, h.shape[1], y, g, fused, work)
+    n = h.shape[1]
+    if restarts(bank, t_ns):
+        judge_what_waits(bank, ints, numbers, lanes, found)
+    bank[UNWEIGHED] = np.inf
+    restart_due(bank, ints, numbers, n, t_ns, nav, step)
+    sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
+    account(bank, n, y, g, fused, work)

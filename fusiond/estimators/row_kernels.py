@@ -72,7 +72,7 @@ Single = NDArray[np.float32]
 FUSED, GATED, NOT_FINITE = range(len(NAMES), len(NAMES) + 3)
 """Results of an aid beside those of `packed_rows`, which say why it does not apply."""
 ENDS = (*NAMES, "fused", "gated", "not_finite")
-"""What they are called."""
+"""Names of all results."""
 BECAME, NIS, MOVES, DEGREES, WHITENED, INNOVATION, OF_STATE = 0, 1, 2, 3, 4, 7, 10
 RESULT = OF_STATE + LENT_ROWS * 6
 """Layout of a result: what became of the aid, NIS, 1 if the vehicle moves, number of rows that

@@ -213,9 +213,12 @@ def carry_over(
     lever: Indices,
     late: Indices,
 ) -> float:
-    """P (w, w) of n states, T P T^T, and sensitivities of a `bank`, if it has any room, T V, after
-    an update of an estimate `before`; `keep_downward` of xi (n,). By how much (rad) it has turned
-    the axes about the vertical."""
+    """P <- T P T^T and V <- T V after an update.
+
+    Of P (w, w) with n states, of a `bank` if it has any room, and of an estimate `before`;
+    `keep_downward` of xi (n,). Returned is by how much (rad) the update has turned the axes about
+    the vertical.
+    """
     keep_downward(before, nav, xi, biases)
     turned = heading_turn(before[Q0:NAV_SIZE], nav[Q0:])
     slots = _turned_slots(biases[0], gyros, lever, late)
