@@ -1,4 +1,4 @@
-r"""Interface and common state of estimators: an error-state filter in a closed loop.
+r"""Estimators: what an error-state filter in a closed loop has to do, and what all have in common.
 
 One navigation state is propagated through the IMU's samples. Beside it run the statistics of its
 error: one covariance and one error estimate for each filter that the estimator keeps (`covs`,
@@ -14,7 +14,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,101 +98,11 @@ class Snapshot(NamedTuple):
     extra: object
 
 
-class Estimator(Protocol):
-    """Interface of an estimator to timeline, navigator and studies.
+class Estimator:
+    """Interface of an estimator to timeline, navigator and studies, and what all have in common:
+    the state, its propagation, feedback and snapshots.
 
     State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute).
-    """
-
-    model: Model
-    t_ns: int
-    sample: int
-    nav: Array
-    xi: Array
-    step: Array
-    passing: bool
-    """True if it was brought where it is in passing: before a measurement is folded in it has to be
-    propagated there otherwise."""
-    published: Published
-    """Axes and clock of publication: at first the clock of the model's receiver."""
-    turned: float
-    """By how much (rad) the last update that was fused turned the axes in which P has the tilt."""
-    wider: Array
-    """Variances (9,) that `sigmas` has beyond P's: what hypotheses of a fault leave open."""
-    hypotheses: Hypotheses | None
-    """The bank of hypotheses beside it; None where it has none."""
-
-    @property
-    def state(self) -> State:
-        """View of the filter for a measurement."""
-
-    @property
-    def covariance(self) -> Array:
-        """P (n, n) of the published error state."""
-
-    @property
-    def sensor_errors(self) -> Array:
-        """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
-
-    @property
-    def isolates(self) -> bool:
-        """True if it detects and leaves out faulty sources by itself."""
-
-    @property
-    def runs(self) -> MeasurementRun | None:
-        """Measurements in one call; None while it takes them one by one."""
-
-    @property
-    def isolated(self) -> dict[str, str]:
-        """Sources that a fault detection keeps out of the solution, and why."""
-
-    def publish_by(self, published: Published) -> None:
-        """From the next start on."""
-
-    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
-        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
-
-    def propagate(
-        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
-    ) -> None:
-        """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
-        `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
-        be had nobody asked."""
-
-    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not; the variances of its rows, up to three, count
-        `noise` times (3,)."""
-
-    def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing is
-        folded in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
-
-    def adopt(self, mean: Array, spread: Array) -> None:
-        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
-
-    def hold(self) -> None:
-        """From now on estimate without feedback: errors are carried along with the state."""
-
-    def release(self) -> None:
-        """Feed back what was carried."""
-
-    def sigmas(self) -> Array:
-        """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
-
-    def surely_moves(self, published: bool) -> bool:
-        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
-        `published`, or P's alone."""
-
-    def snapshot(self) -> Snapshot:
-        """A copy of everything."""
-
-    def restore(self, s: Snapshot) -> None:
-        """Back to a snapshot, bit for bit."""
-
-
-class ErrorStateFilter:
-    """Common part of the estimators: the state, its propagation, feedback and snapshots.
-
     `shares` (k,): filter i gets its process noise and its initial covariance divided by shares[i].
     """
 
@@ -210,10 +120,15 @@ class ErrorStateFilter:
         self.t_ns = 0
         self.sample = 0
         self.passing = False
+        """True if it was brought where it is in passing: before a measurement is folded in it has
+        to be propagated there otherwise."""
         self.published = Published(model.time_slot)
+        """Axes and clock of publication: at first the clock of the model's receiver."""
         m = memory(model, round(gap_s * 1e9), shares, self.carries_transition, faults)
         self._memory, self._array, self.nav, self.xi, self.step = m, m.array, m.nav, m.xi, m.step
-        self.wider, self._phi, self._shares = m.wider, m.phi, m.shares
+        self._phi, self._shares = m.phi, m.shares
+        self.wider = m.wider
+        """Variances (9,) that `sigmas` has beyond P's: what hypotheses of a fault leave open."""
         self._covs: Array = m.covs
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
@@ -224,9 +139,12 @@ class ErrorStateFilter:
         m.published[:] = self.published
         own = m.bank, faults, model, (m.nav, m.xi, m.step, m.published), m.wider
         self.hypotheses = Hypotheses(*own) if faults.groups else None
+        """The bank of hypotheses beside it; None where it has none."""
         self._holding = False
         self._carrying = False
         self.turned = 0.0
+        """By how much (rad) the last update that was fused turned the axes in which P has the
+        tilt."""
         self.kernel_options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(model.width)
 
@@ -285,7 +203,8 @@ class ErrorStateFilter:
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
     ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
-        `passing`, if nothing is to be folded in there."""
+        `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
+        be had nobody asked."""
         if self.hypotheses is not None:
             self.hypotheses.conclude()
         options = self.kernel_options
@@ -299,6 +218,19 @@ class ErrorStateFilter:
         self.sample, self.t_ns = self._kernel(
             self._array, imu.packed, self.sample, self.t_ns, target_ns, options
         )
+
+    def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one measurement in, or name why not; the variances of its rows, up to three, count
+        `noise` times (3,)."""
+        raise NotImplementedError
+
+    def hold(self) -> None:
+        """From now on estimate without feedback: errors are carried along with the state."""
+        raise NotImplementedError
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        raise NotImplementedError
 
     @property
     def state(self) -> State:

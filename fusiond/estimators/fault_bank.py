@@ -95,11 +95,12 @@ LOG_PRIOR = 7
 # measurement lies, 1 if it is not the identity, the probability of any fault as it was judged last,
 # 1 if one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the
 # row width of the transition, by how much the unit has been found to have turned on the vehicle in
-# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, and what has been
-# fed back of the velocity in all (m/s).
+# pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
+# back of the velocity in all (m/s), and behind how many eights of groups with three numbers, and of
+# those with one, no V is other than zero.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, HEAD = 21, 22, 32
+UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEAD = 21, 22, 25, 26, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -116,6 +117,8 @@ E_ROWS = np.array([E_AT, E1, E2])
 # What never changes of eight groups: the prior's precisions, its mean, and what of the log odds
 # does not depend on what has come, with the prior's density and without.
 P_AT, MEAN_AT, ODDS_AT, RATE_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5, LANES * 6
+TINY = 1e-9
+"""A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
@@ -227,3 +230,43 @@ def column_of(bank: Array, number: int, component: int) -> int:
         ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
         column = ones * LANES + (number - threes) % LANES
     return column
+
+
+@compiled("void(f8[::1], i8)", forceinline=True)
+def wake(bank: Array, kind: int) -> None:
+    """A kind's V may be other than zero from now on."""
+    threes, last = int(bank[THREES]), RESTARTS * (kind + 1) - 1
+    if last < threes:
+        bank[THREES_AWAKE] = max(bank[THREES_AWAKE], last // LANES + 1)
+    else:
+        bank[ONES_AWAKE] = max(bank[ONES_AWAKE], (last - threes) // LANES + 1)
+
+
+@compiled("UniTuple(i8, 2)(f8[::1], b1)", forceinline=True)
+def awake(bank: Array, three: bool) -> tuple[int, int]:
+    """First column of groups with three numbers, or of those with one, and behind the last of which
+    V may be other than zero."""
+    if three:
+        return 0, 3 * LANES * int(bank[THREES_AWAKE])
+    first = 3 * LANES * ((int(bank[THREES]) + LANES - 1) // LANES)
+    return first, first + LANES * int(bank[ONES_AWAKE])
+
+
+@compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)
+def explained_by_three(bank: Array, lanes: Array, j: np.uint64, c: np.uint64) -> float:
+    """e^T L^-1 e of the group of three numbers at `j`, whose constants are at `c`."""
+    unsigned = np.uint64
+    d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
+    a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+    l_1, l_2 = a_1 / d_0, a_2 / d_0
+    d_1 = bank[j + unsigned(L11)] + TINY * lanes[c + unsigned(P_AT + LANES)]
+    d_1 -= l_1 * a_1
+    a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+    l_3 = a_3 / d_1
+    d_2 = bank[j + unsigned(L22)] + TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
+    d_2 -= l_2 * a_2 + l_3 * a_3
+    e_0 = bank[j + unsigned(E_AT)]
+    e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+    e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+    explained: float = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+    return explained

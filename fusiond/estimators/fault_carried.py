@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.block_covariance import DENSITIES, STEPS
 from fusiond.estimators.covariance import transition_for
-from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH
+from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH, awake
 from fusiond.estimators.fault_rows import add_rows, walk_path
 from fusiond.estimators.turned_axes import rest_rows
 from fusiond.navigation.compiled import compiled
@@ -76,51 +76,76 @@ def begin_transition(bank: Array, n: int, width: int) -> None:
     bank[WAITS] = 0.0
 
 
+@compiled("void(f8[::1], i8, i8[::1])", allocates=True)
+def _multiply(bank: Array, n: int, rows: Indices) -> None:
+    """V <- Phi V, of which `rows` (k,) are not those of the identity; afterwards they are."""
+    width, count = int(bank[WIDTH]), rows.shape[0]
+    phi, v = bank[int(bank[PHI]) :], bank[int(bank[SENSITIVITIES]) :].view(np.float32)
+    columns = v.shape[0] // n
+    # Which others a row takes something of; one that takes of none decays where it is.
+    begins, of = np.zeros(count + 1, dtype=np.int64), np.empty(count * n, dtype=np.int64)
+    alone = np.zeros(count, dtype=np.bool_)
+    for k in range(count):
+        end = begins[k]
+        for j in range(n):
+            if phi[rows[k] * width + j] != 0.0:
+                of[end] = j
+                end += 1
+        begins[k + 1] = end
+        alone[k] = end == begins[k] + 1 and of[begins[k]] == rows[k]
+    new = np.empty(count * CHUNK, dtype=np.float32)
+    for three in (True, False):
+        begin, behind = awake(bank, three)
+        for first in range(begin, behind, CHUNK):
+            length = min(CHUNK, behind - first)
+            for k in range(count):
+                if alone[k]:
+                    continue
+                out = new[k * CHUNK : k * CHUNK + length]
+                for j in range(out.shape[0]):
+                    out[j] = 0.0
+                those = of[begins[k] : begins[k + 1]]
+                row = phi[rows[k] * width : (rows[k] + 1) * width]
+                add_rows(v, columns, first, those, those.shape[0], row, out)
+            for k in range(count):
+                at = rows[k] * columns + first
+                out, to = new[k * CHUNK : k * CHUNK + length], v[at : at + length]
+                if alone[k]:
+                    keep = np.float32(phi[rows[k] * width + rows[k]])
+                    for j in range(to.shape[0]):
+                        to[j] *= keep
+                else:
+                    for j in range(to.shape[0]):
+                        to[j] = out[j]
+    for i in rows:
+        for j in range(width):
+            phi[i * width + j] = 1.0 if i == j else 0.0
+
+
 @compiled("void(f8[::1], i8)", allocates=True)
 def settle(bank: Array, n: int) -> None:
     """V <- Phi V of all that has been carried since the last measurement."""
     if bank[WAITS] == 0.0:
         return
-    width = int(bank[WIDTH])
-    phi, v = bank[int(bank[PHI]) :], bank[int(bank[SENSITIVITIES]) :].view(np.float32)
-    columns = v.shape[0] // n
-    # Rows that take something of others, and of which.
-    mixed, count = np.empty(n, dtype=np.int64), 0
-    begins, of = np.zeros(n + 1, dtype=np.int64), np.empty(n * n, dtype=np.int64)
-    alone = np.zeros(n, dtype=np.bool_)
+    width, phi = int(bank[WIDTH]), bank[int(bank[PHI]) :]
+    rows, count = np.empty(n, dtype=np.int64), 0
     for i in range(n):
-        begin = begins[count]
-        end, row, entries = begin, phi[i * width : i * width + n], 0
+        row, entries = phi[i * width : i * width + n], 0
         for j in range(row.shape[0]):
             entries += row[j] != 0.0
-        alone[i] = entries == 1 and row[i] != 0.0
-        if alone[i]:
-            continue
-        for j in range(n):
-            if row[j] != 0.0:
-                of[end] = j
-                end += 1
-        mixed[count] = i
-        count += 1
-        begins[count] = end
-    new = np.empty(count * CHUNK, dtype=np.float32)
-    for first in range(0, columns, CHUNK):
-        length = min(CHUNK, columns - first)
-        for k in range(count):
-            out = new[k * CHUNK : k * CHUNK + length]
-            for j in range(out.shape[0]):
-                out[j] = 0.0
-            those = of[begins[k] : begins[k + 1]]
-            row = phi[mixed[k] * width : (mixed[k] + 1) * width]
-            add_rows(v, columns, first, those, those.shape[0], row, out)
-        for i in range(n):
-            keep = np.float32(phi[i * width + i])
-            if alone[i] and keep != 1.0:
-                kept = v[i * columns + first : i * columns + first + length]
-                for j in range(kept.shape[0]):
-                    kept[j] *= keep
-        for k in range(count):
-            out, to = new[k * CHUNK : k * CHUNK + length], v[mixed[k] * columns + first :]
-            for j in range(out.shape[0]):
-                to[j] = out[j]
-    begin_transition(bank, n, width)
+        if entries != 1 or row[i] != 1.0:
+            rows[count] = i
+            count += 1
+    _multiply(bank, n, rows[:count])
+    bank[WAITS] = 0.0
+
+
+@compiled("void(f8[::1], i8, i8[::1], f8[:, ::1])", allocates=True)
+def mix(bank: Array, n: int, slots: Indices, t: Array) -> None:
+    """V <- T V, where T is that of the identity but for rows and columns `slots` (k,): t (k, k)."""
+    settle(bank, n)
+    width, phi = int(bank[WIDTH]), bank[int(bank[PHI]) :]
+    for a in range(slots.shape[0]):
+        for b in range(slots.shape[0]):
+            phi[slots[a] * width + slots[b]] = t[a, b]
+    _multiply(bank, n, slots)

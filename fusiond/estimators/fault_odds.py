@@ -35,8 +35,6 @@ from fusiond.estimators.fault_bank import (
     COUNTS_BY,
     DECIDED,
     DEVICE,
-    E1,
-    E2,
     E_AT,
     E_ROWS,
     EXPLAINED,
@@ -72,11 +70,13 @@ from fusiond.estimators.fault_bank import (
     SIZE,
     SUSPECTS,
     THREES,
+    TINY,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
     UNJUDGED,
     WEIGHT,
     column_of,
+    explained_by_three,
     group_at,
 )
 from fusiond.navigation.compiled import compiled
@@ -84,8 +84,6 @@ from fusiond.navigation.compiled import compiled
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_TINY = 1e-9
-"""A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
 MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
@@ -157,20 +155,8 @@ def _gains(bank: Array, lanes: Array) -> None:
         if row < threes:
             for k in range(length):
                 j, c = at + unsigned(k), constants + unsigned(k)
-                d_0 = bank[j + unsigned(L_AT)] + _TINY * lanes[c + unsigned(P_AT)]
+                bank[j + unsigned(EXPLAINED)] = explained_by_three(bank, lanes, j, c)
                 a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
-                l_1, l_2 = a_1 / d_0, a_2 / d_0
-                d_1 = bank[j + unsigned(L11)] + _TINY * lanes[c + unsigned(P_AT + LANES)]
-                d_1 -= l_1 * a_1
-                a_3 = bank[j + unsigned(L21)] - l_2 * a_1
-                l_3 = a_3 / d_1
-                d_2 = bank[j + unsigned(L22)] + _TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
-                d_2 -= l_2 * a_2 + l_3 * a_3
-                e_0 = bank[j + unsigned(E_AT)]
-                e_1 = bank[j + unsigned(E1)] - l_1 * e_0
-                e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
-                gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
-                bank[j + unsigned(EXPLAINED)] = gained
                 # det (L + S^-1)
                 b_0 = bank[j + unsigned(L_AT)] + lanes[c + unsigned(P_AT)]
                 m_1, m_2 = a_1 / b_0, a_2 / b_0
@@ -184,7 +170,7 @@ def _gains(bank: Array, lanes: Array) -> None:
                 j, c = at + unsigned(k), constants + unsigned(k)
                 information, mean = bank[j + unsigned(L_AT)], lanes[c + unsigned(MEAN_AT)]
                 e, prior = bank[j + unsigned(E_AT)], lanes[c + unsigned(P_AT)]
-                bank[j + unsigned(EXPLAINED)] = e * e / (information + _TINY * prior)
+                bank[j + unsigned(EXPLAINED)] = e * e / (information + TINY * prior)
                 a = information + prior
                 beyond = e - information * mean
                 along = mean * (e - 0.5 * mean * information)
@@ -202,7 +188,7 @@ def _gains(bank: Array, lanes: Array) -> None:
 def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
     """Log of the factor by which a likely fault is larger than it is expected to be; what no unit's
     fault can be it does not explain."""
-    share = MOST_OF_UNIT**-2 if unit else _TINY
+    share = MOST_OF_UNIT**-2 if unit else TINY
     gained = solve(bank, at, size, numbers, share, m)
     bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
     bank[at + EXPLAINED], square = gained, 0.0

@@ -41,6 +41,7 @@ from fusiond.estimators.fault_bank import (
     N_AT,
     OF_ONE,
     OF_THREE,
+    ONES_AWAKE,
     ONSET,
     OTHER,
     PATH,
@@ -59,10 +60,13 @@ from fusiond.estimators.fault_bank import (
     SIZE,
     SPEED,
     THREES,
+    THREES_AWAKE,
     VELOCITY,
     VELOCITY_RAMP,
+    awake,
     column_of,
     group_at,
+    wake,
 )
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DV
@@ -144,26 +148,6 @@ def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
     return of_this
 
 
-@compiled("void(f8[::1], i8, i8, f8, f8, f8, f4[::1])")
-def _offset_rows(
-    bank: Array,
-    kind: int,
-    component: int,
-    offset: float,
-    slope: float,
-    t_s: float,
-    s: Single,
-) -> None:
-    """Add to s (columns,) what a kind's component makes of a row: an offset, and what has grown
-    with a slope since the onset of each restart until `t_s`."""
-    for restart in range(RESTARTS):
-        number = RESTARTS * kind + restart
-        d = offset
-        if slope != 0.0:
-            d += slope * (t_s - bank[group_at(bank, number) + ONSET])
-        s[column_of(bank, number, component)] += d
-
-
 @compiled("UniTuple(f8, 2)(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8)")
 def _of_row(
     bank: Array,
@@ -221,14 +205,25 @@ def _sign(
     columns: int,
     work: Single,
 ) -> None:
-    """Add D of the m rows of a measurement that a kind concerns."""
+    """Add D of the m rows of a measurement that a kind concerns: of each restart an offset, and
+    what has grown with a slope since its onset."""
     of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
     back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
     for a in range(m if size == 1 else min(m, size)):
         offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
-        if offset != 0.0 or slope != 0.0:
-            s = work[a * columns : (a + 1) * columns]
-            _offset_rows(bank, kind, 0 if size == 1 else a, offset, slope, t_s, s)
+        if offset == 0.0 and slope == 0.0:
+            continue
+        wake(bank, kind)
+        number, behind = RESTARTS * kind, RESTARTS * (kind + 1)
+        while number < behind:  # those of eight at once
+            at = group_at(bank, number)
+            count = min(behind - number, LANES - (at - GROUPS) % LANES)
+            onsets = bank[at + ONSET : at + ONSET + count]
+            first = a * columns + column_of(bank, number, 0 if size == 1 else a)
+            s = work[first : first + count]
+            for j in range(s.shape[0]):
+                s[j] += offset + slope * (t_s - onsets[j])
+            number += count
 
 
 @compiled(
@@ -339,21 +334,21 @@ def sensitivity_rows(
     return columns
 
 
-@compiled("void(f4[::1], i8, f8[:, ::1], i8, i8, f4[::1])")
-def _fold_in(v: Single, n: int, g: Array, m: int, columns: int, work: Single) -> None:
-    """V <- V - g^T s, three rows in one pass, or one."""
-    at = 0
+@compiled("void(f4[::1], i8, f8[:, ::1], i8, i8, i8, f4[::1])")
+def _fold_in(v: Single, n: int, g: Array, columns: int, first: int, end: int, work: Single) -> None:
+    """V <- V - g^T s of columns from `first` to `end`, three rows in one pass, or one."""
+    at, m = 0, g.shape[0]
     while at < m:
-        s_0 = work[at * columns : (at + 1) * columns]
+        s_0 = work[at * columns + first : at * columns + end]
         if at + 3 <= m:
-            s_1 = work[(at + 1) * columns : (at + 2) * columns]
-            s_2 = work[(at + 2) * columns : (at + 3) * columns]
+            s_1 = work[(at + 1) * columns + first : (at + 1) * columns + end]
+            s_2 = work[(at + 2) * columns + first : (at + 2) * columns + end]
             for i in range(n):
                 c_0, c_1 = np.float32(g[at, i]), np.float32(g[at + 1, i])
                 c_2 = np.float32(g[at + 2, i])
                 if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
                     continue
-                row = v[i * columns : (i + 1) * columns]
+                row = v[i * columns + first : i * columns + end]
                 for j in range(row.shape[0]):
                     row[j] -= c_0 * s_0[j] + c_1 * s_1[j] + c_2 * s_2[j]
             at += 3
@@ -361,7 +356,7 @@ def _fold_in(v: Single, n: int, g: Array, m: int, columns: int, work: Single) ->
             for i in range(n):
                 c_0 = np.float32(g[at, i])
                 if c_0 != 0.0:
-                    row = v[i * columns : (i + 1) * columns]
+                    row = v[i * columns + first : i * columns + end]
                     for j in range(row.shape[0]):
                         row[j] -= c_0 * s_0[j]
             at += 1
@@ -390,6 +385,8 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) 
             j = own + unsigned(k)
             bank[j + unsigned(J_AT)] += square
             bank[j + unsigned(N_AT)] += m
+        if row - (0 if three else threes) >= bank[THREES_AWAKE if three else ONES_AWAKE]:
+            continue
         for a in range(m):
             y_a = y[a]
             at_0 = unsigned(a * columns + first * LANES)
@@ -411,4 +408,6 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) 
                     bank[j + unsigned(E1)] += s_1 * y_a
                     bank[j + unsigned(E2)] += s_2 * y_a
     if fused:
-        _fold_in(v, n, g, m, columns, work)
+        for three in (True, False):
+            begin, end = awake(bank, three)
+            _fold_in(v, n, g, columns, begin, end, work)

@@ -18,15 +18,8 @@ from fusiond.estimators.fault_bank import (
     CONSTANTS,
     COUNTS_BY,
     DECIDED,
-    E1,
-    E2,
     E_AT,
     GROUPS,
-    L10,
-    L11,
-    L20,
-    L21,
-    L22,
     L_AT,
     LANES,
     LENGTH,
@@ -37,10 +30,11 @@ from fusiond.estimators.fault_bank import (
     RATE_AT,
     RESTARTED,
     THREES,
+    TINY,
     UNJUDGED,
     UNWEIGHED,
+    explained_by_three,
 )
-from fusiond.estimators.fault_odds import _TINY as TINY
 from fusiond.estimators.fault_odds import judge
 from fusiond.navigation.compiled import compiled
 
@@ -64,19 +58,7 @@ def any_likely(bank: Array, lanes: Array) -> bool:
         if row < threes:
             for k in range(length):
                 j, c = at + unsigned(k), constants + unsigned(k)
-                d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
-                a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
-                l_1, l_2 = a_1 / d_0, a_2 / d_0
-                d_1 = bank[j + unsigned(L11)] + TINY * lanes[c + unsigned(P_AT + LANES)]
-                d_1 -= l_1 * a_1
-                a_3 = bank[j + unsigned(L21)] - l_2 * a_1
-                l_3 = a_3 / d_1
-                d_2 = bank[j + unsigned(L22)] + TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
-                d_2 -= l_2 * a_2 + l_3 * a_3
-                e_0 = bank[j + unsigned(E_AT)]
-                e_1 = bank[j + unsigned(E1)] - l_1 * e_0
-                e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
-                gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+                gained = explained_by_three(bank, lanes, j, c)
                 odds = lanes[c + unsigned(RATE_AT)] + bank[j + unsigned(COUNTS_BY)] + 0.5 * gained
                 most[unsigned(k)] = max(most[unsigned(k)], odds)
         else:

@@ -99,35 +99,37 @@ def fold_and_account(
     work: Single,
     found: Array,
 ) -> float:
-    """As `fusiond.estimators.update.fuse` without holding, with the bank beside it; `measures` and
-    `device` as of `sensitivity_rows`.
+    """As `fusiond.estimators.update.fuse` without holding, with the bank beside it, if it has any
+    room; `measures` and `device` as of `sensitivity_rows`.
 
     A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
     would never be found else. Where such a fault, as likely as it is, explains it, it is folded in;
     what of the same instant has not been judged is judged before, to `found` (5,).
     """
-    n = dx.shape[0]
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
-    if nis > threshold or restarts(bank, t_ns):
-        judge_what_waits(bank, ints, numbers, lanes, found)
-    bank[UNWEIGHED] = np.inf  # what comes now is evidence, too
-    if nis > threshold and bank[UNJUDGED] < np.inf:
-        judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
-    restart_due(bank, ints, numbers, n, t_ns, nav, step)
-    columns = sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
-    judged = nis
-    if nis > threshold:
-        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-    account(bank, n, y, g, judged <= threshold, work)
-    if judged <= threshold:
+    if bank.size:
+        n, fails = dx.shape[0], nis > threshold
+        if fails or restarts(bank, t_ns):
+            judge_what_waits(bank, ints, numbers, lanes, found)
+        bank[UNWEIGHED] = np.inf  # what comes now is evidence, too
+        if fails and bank[UNJUDGED] < np.inf:
+            judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
+        restart_due(bank, ints, numbers, n, t_ns, nav, step)
+        rows = bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work
+        columns = sensitivity_rows(*rows)
+        if fails:
+            nis = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
+        account(bank, n, y, g, nis <= threshold, work)
+    if nis <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
-        keep_fed_back(bank, dx)
+        if bank.size:
+            keep_fed_back(bank, dx)
         feed_back(nav, xi, dx)
         dx[:] = 0.0
-    return judged
+    return nis
 
 
 @compiled(

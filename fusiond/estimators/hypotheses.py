@@ -18,7 +18,6 @@ from fusiond.estimators.fault_bank import (
     NOTHING,
     ONSET,
     OTHER,
-    PHI,
     PLACES,
     RESTARTS,
     ROLLS,
@@ -28,6 +27,7 @@ from fusiond.estimators.fault_bank import (
     TURNED_BY,
     UNEXPLAINED,
     UNJUDGED,
+    UNWEIGHED,
     WAITS,
     WEIGHT,
     FaultTable,
@@ -35,7 +35,6 @@ from fusiond.estimators.fault_bank import (
     columns_of,
     group_at,
 )
-from fusiond.estimators.fault_carried import settle
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
 from fusiond.estimators.fault_opened import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
@@ -97,9 +96,6 @@ class Hypotheses:
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].view(np.float32).reshape(self.n, -1)
         """Sensitivities V (n, columns)."""
-        first = int(bank[PHI])
-        self.transition = bank[first : first + self.width**2].reshape(self.width, -1)
-        """Matrix (w, w) that V waits to be multiplied by; one where it waits for nothing."""
         self._nine = np.zeros((9, 9))
         self.of_source: dict[str, tuple[int, int]] = {}
 
@@ -164,7 +160,8 @@ class Hypotheses:
 
     def conclude(self) -> None:
         """Judge what waits for it."""
-        judge_what_waits(self.bank, *self.table[:3], self.found)
+        if self.bank.item(UNWEIGHED) < math.inf:
+            judge_what_waits(self.bank, *self.table[:3], self.found)
         epoch_s = self.bank.item(UNJUDGED)
         if epoch_s < math.inf:
             judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)
@@ -205,11 +202,6 @@ class Hypotheses:
             effect[0],
             effect[1:],
         )
-
-    def carry_over(self) -> None:
-        """`transition` has been written: V <- T V."""
-        self.bank[WAITS] = 1.0
-        settle(self.bank, self.n)
 
     def each(self, which: int) -> Array:
         """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
+from fusiond.estimators.base import AS_STATED, THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
 from fusiond.estimators.measurement_run import MeasurementRun
@@ -25,9 +25,13 @@ from fusiond.estimators.update import fuse, whiten, work
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
+OfBank = tuple[Array, NDArray[np.int64], Array, Array, int, int, int, NDArray[np.float32], Array]
+
+_NOTHING = np.zeros(0)
+_NO_BANK: OfBank = _NOTHING, *NO_FAULTS[:3], 0, 0, 0, np.zeros(0, dtype=np.float32), _NOTHING
 
 
-class KalmanEstimator(ErrorStateFilter):
+class KalmanEstimator(Estimator):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
     packs: ClassVar[bool] = True
@@ -48,8 +52,8 @@ class KalmanEstimator(ErrorStateFilter):
         self._runs = self._new_run(NO_AXES)
 
     def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Measurements in one call, with what updates carry over; None without a bank, whose
-        updates are cheap, and of a filter whose updates differ."""
+        """Measurements in one call, with what updates carry over; None without a bank, of whose
+        fixes a second a call costs more than it spares, and of a filter whose updates differ."""
         bank = self.hypotheses
         if bank is None or not self.packs:
             return None
@@ -79,24 +83,27 @@ class KalmanEstimator(ErrorStateFilter):
         threshold = THRESHOLDS[measurement.gate, degrees]
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
-        bank = self.hypotheses
-        if bank is None or degrees > LENT_ROWS:
-            nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
+        of_bank = self._of_bank(measurement, degrees)
+        if not self._holding:
+            nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *of_bank)
         else:
-            of, table = bank.of_source.get(measurement.source) or bank.of(measurement), bank.table
-            if not self._holding:
-                now = bank.bank, *table[:3], measurement.t_ns, *of, bank.rows, bank.found
-                nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
-            else:
-                nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
-                if nis < math.inf:
-                    of_row = bank.bank, *table[:3], measurement.t_ns, *of, bank.rows, bank.found
-                    account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_row)
+            nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
+            if nis < math.inf and of_bank[0].size:
+                account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_bank)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
         return Outcome("gated", nis, degrees)
+
+    def _of_bank(self, measurement: Linearised, rows: int) -> OfBank:
+        """Bank, its table, a measurement's instant and what its rows are to it, and work space; of
+        nothing where there is none, and for more rows than are lent."""
+        bank = self.hypotheses
+        if bank is None or rows > LENT_ROWS:
+            return _NO_BANK
+        of = bank.of_source.get(measurement.source) or bank.of(measurement)
+        return bank.bank, *bank.table[:3], measurement.t_ns, *of, bank.rows, bank.found
 
     def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
         """Rows that pass are folded in, or none."""

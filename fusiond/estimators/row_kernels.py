@@ -30,15 +30,14 @@ from fusiond.aiding.packed import (
     MEASURED,
     MEASURES,
     MOTION_ASKED,
+    NAMES,
     OF_DEVICE,
     ROWS,
     SERIES,
     T_NS,
     packed_rows,
 )
-from fusiond.estimators.fault_bank import PHI as BANK_PHI
-from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, WAITS
-from fusiond.estimators.fault_carried import settle
+from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED
 from fusiond.estimators.fault_odds import judge
 from fusiond.estimators.fault_opened import judge_and_widen
 from fusiond.estimators.fault_suspects import any_likely, judge_what_waits
@@ -60,8 +59,7 @@ from fusiond.estimators.propagation import RECORD, propagate_for
 from fusiond.estimators.published_state import WIDER, surely_moves
 from fusiond.estimators.tilt_axes_carried import (
     ESTIMATE_SIZE,
-    carry_over_all,
-    carry_over_rows,
+    carry_over,
     may_part,
     remember_estimate,
 )
@@ -73,12 +71,15 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Single = NDArray[np.float32]
 
-FUSED, GATED, NOT_FINITE = 10, 11, 12
+FUSED, GATED, NOT_FINITE = range(len(NAMES), len(NAMES) + 3)
 """Results of a measurement beside those of `packed_rows`, which say why it does not apply."""
-BECAME, NIS, MOVES, WHITENED, INNOVATION, OF_STATE = 0, 1, 2, 3, 6, 9
+ENDS = (*NAMES, "fused", "gated", "not_finite")
+"""Names of all results."""
+BECAME, NIS, MOVES, DEGREES, WHITENED, INNOVATION, OF_STATE = 0, 1, 2, 3, 4, 7, 10
 RESULT = OF_STATE + LENT_ROWS * 6
-"""Layout of a result: what became of the measurement, NIS, 1 if the vehicle moves, innovation
-whitened and as it is (3 each), and what its rows have of velocity and position (3 x 6)."""
+"""Layout of a result: what became of the measurement, NIS, 1 if the vehicle moves, number of rows
+that apply, innovation whitened and as it is (3 each), and what its rows have of velocity and
+position (3 x 6)."""
 DONE, KEEP, JUDGE, OTHERWISE = range(4)
 """Ways in which a call ends: all is done; a checkpoint is due before the next measurement; the last
 one is to be judged; the next one is no row of this kernel."""
@@ -157,24 +158,6 @@ def _said_later(ints: Indices, first: int, until_ns: int) -> bool:
     return False
 
 
-@compiled(f"void({_STATE}, f8[::1], {_AXES}, f8[::1], f8[::1])", allocates=True)
-def _carry_over(
-    state: StateParts, bank: Array, axes: AxesParts, before: Array, knows: Array
-) -> None:
-    """P and V after an update of an estimate `before`, as fusiond.estimators.tilt_axes says."""
-    nav, xi, step, cov, dx = state
-    biases, gyros, lever, time = axes
-    n, width = dx.shape[0], cov.shape[1]
-    kept = gyros if knows[UNDOUBTED] > 0.0 and step[STEP_RESTS_S] == 0.0 else gyros[:0]
-    turned = carry_over_all(cov[:n, :n], before, nav, xi, biases, kept, lever, time)
-    knows[TURNED] = turned
-    at = int(bank[BANK_PHI])
-    phi = bank[at : at + width * width].reshape((width, width))
-    carry_over_rows(phi, before, nav, xi, turned, biases, kept, lever, time)
-    bank[WAITS] = 1.0
-    settle(bank, n)
-
-
 @compiled(f"i8(i8[::1], f8[::1], {_STATE}, {_BANK}, {_OPENED}, f8[::1])")
 def _judged(
     of: Indices,
@@ -232,7 +215,7 @@ def fold_row(
             return OTHERWISE
         if heading < knows[PLAIN]:
             knows[KNOWN] = 1.0
-    result[NIS], result[MOVES] = np.nan, 0.0
+    result[NIS], result[MOVES], result[DEGREES] = np.nan, 0.0, 0.0
     if of[ASKED] & MOTION_ASKED:
         result[MOVES] = surely_moves(cov, nav, step, opened[0], np.zeros(WIDER))
     y, z, r = work[_Y : _Y + m], work[_Z : _Z + m], work[_R : _R + m]
@@ -242,6 +225,7 @@ def fold_row(
     result[BECAME], knows[TURNED] = applies, 0.0
     if applies != APPLIES:
         return DONE
+    result[DEGREES] = m
     for a in range(m):
         r[a] *= noise[a]
         result[INNOVATION + a] = z[a]
@@ -263,7 +247,9 @@ def fold_row(
     for a in range(m):
         result[WHITENED + a] = y[a]
     if carried:
-        _carry_over(state, bank, axes, before, knows)
+        biases, gyros, lever, time = axes
+        kept = gyros if knows[UNDOUBTED] > 0.0 and step[STEP_RESTS_S] == 0.0 else gyros[:0]
+        knows[TURNED] = carry_over(cov, n, bank, before, nav, xi, biases, kept, lever, time)
     return _judged(of, y, state, of_bank, opened, noise)
 
 

@@ -81,8 +81,7 @@ from fusiond.estimators.propagation import TURN_TILT
 from fusiond.estimators.row_kernels import UNDOUBTED, Axes
 from fusiond.estimators.tilt_axes_carried import (
     ESTIMATE_SIZE,
-    carry_over_all,
-    carry_over_rows,
+    carry_over,
     keep_rows,
     may_part,
     remember_estimate,
@@ -172,12 +171,8 @@ class TiltAxesFilter(KalmanEstimator):
 
     def _carry_over(self, before: Array) -> None:
         """P after an update of an `_estimate` `before`."""
-        slots = self._biases, *self._kept
-        self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
-        if self.hypotheses is not None:
-            bank = self.hypotheses
-            carry_over_rows(bank.transition, before, self.nav, self.xi, self.turned, *slots)
-            bank.carry_over()
+        of, slots = (self._memory.bank, before, self.nav, self.xi), (self._biases, *self._kept)
+        self.turned = carry_over(self._cov, self.model.size, *of, *slots)
 
     @property
     def _keeps_turn(self) -> bool:

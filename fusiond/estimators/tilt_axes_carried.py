@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.antenna_place import keep_antenna
+from fusiond.estimators.fault_carried import mix
 from fusiond.estimators.turn_rate import keep_turn
 from fusiond.estimators.turned_axes import UPRIGHT
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.navigation.error_model import PHI
+from fusiond.navigation.error_model import DR, PHI
 from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import NAV_SIZE, Q0
 
@@ -84,15 +85,6 @@ def may_part(p: Array, slots: Indices) -> bool:
     return apart
 
 
-@compiled("f8(f8[:, :], f8[::1], f8[::1], i8[:, ::1])")
-def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
-    """P (n, n) after an update that has turned the attitude q_nb (4,) `before` to `after`, which is
-    by so much (rad) about the vertical."""
-    turn_rows(p, before, after, biases[0], biases[1])
-    turn_rows(p.T, before, after, biases[0], biases[1])
-    return heading_turn(before, after)
-
-
 # An estimate before an update: nav, the gyros' biases, what is left of a lever arm, the force
 # biases; behind it what the update has told of the gyros, and the lever then.
 _GYROS, _ARM, _FORCES, _TOLD, _ARM_AFTER, ESTIMATE_SIZE = NAV_SIZE, 13, 16, 19, 22, 25
@@ -157,9 +149,64 @@ def keep_downward(before: Array, nav: Array, xi: Array, biases: Indices) -> None
     xi[biases[0, 0]] -= beyond / new[8]
 
 
-@compiled("f8(f8[:, :], f8[::1], f8[::1], f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1])")
-def carry_over_all(
-    p: Array,
+@compiled("i8[::1](i8[::1], i8[::1], i8[::1], i8[::1])", allocates=True)
+def _turned_slots(forces: Indices, gyros: Indices, lever: Indices, late: Indices) -> Indices:
+    """States whose rows and columns an update's T has others than those of the identity (k,)."""
+    behind = 3 + forces.size + gyros.size
+    slots = np.empty(behind + (3 + lever.size + late.size if lever.size else 0), dtype=np.int64)
+    for j in range(3):
+        slots[j] = PHI + j
+    slots[3 : 3 + forces.size], slots[3 + forces.size : behind] = forces, gyros
+    if lever.size:
+        for j in range(3):
+            slots[behind + j] = DR + j
+        slots[behind + 3 : behind + 3 + lever.size] = lever
+        slots[behind + 3 + lever.size :] = late
+    return slots
+
+
+@compiled("void(f8[:, ::1], i8[::1], f8[:, ::1])", allocates=True)
+def turn_covariance(cov: Array, slots: Indices, t: Array) -> None:
+    """P <- T P T^T of P (w, w), where T is that of the identity but for rows and columns `slots`
+    (k,): t (k, k)."""
+    count, end = slots.shape[0], 0
+    mixed, rows = np.empty(count, dtype=np.int64), np.zeros((count, cov.shape[1]))
+    for a in range(count):
+        entries = 0
+        for b in range(count):
+            entries += t[a, b] != 0.0
+        if entries == 1 and t[a, a] == 1.0:
+            continue
+        out = rows[end]
+        for b in range(count):
+            c, row = t[a, b], cov[slots[b]]
+            if c != 0.0:
+                for j in range(out.shape[0]):
+                    out[j] += c * row[j]
+        mixed[end] = a
+        end += 1
+    crossed = np.zeros((end, end))
+    for i in range(end):
+        for k in range(i + 1):
+            for b in range(count):
+                crossed[i, k] += rows[i, slots[b]] * t[mixed[k], b]
+            crossed[k, i] = crossed[i, k]
+    for i in range(end):
+        for k in range(end):
+            rows[i, slots[mixed[k]]] = crossed[i, k]
+    for i in range(end):
+        for j in range(cov.shape[1]):
+            cov[slots[mixed[i]], j] = cov[j, slots[mixed[i]]] = rows[i, j]
+
+
+@compiled(
+    "f8(f8[:, ::1], i8, f8[::1], f8[::1], f8[::1], f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1])",
+    allocates=True,
+)
+def carry_over(
+    cov: Array,
+    n: int,
+    bank: Array,
     before: Array,
     nav: Array,
     xi: Array,
@@ -168,26 +215,23 @@ def carry_over_all(
     lever: Indices,
     late: Indices,
 ) -> float:
-    """`carry_over` of P (n, n), and `keep_rows` of it; `keep_downward` of xi (n,)."""
+    """P <- T P T^T and V <- T V after an update.
+
+    Of P (w, w) with n states, of a `bank` if it has any room, and of an estimate `before`;
+    `keep_downward` of xi (n,). Returned is by how much (rad) the update has turned the axes about
+    the vertical.
+    """
     keep_downward(before, nav, xi, biases)
-    turned = carry_over(p, before[Q0:NAV_SIZE], nav[Q0:], biases)
-    keep_rows(p, before, nav, xi, turned, gyros, lever, late)
-    keep_rows(p.T, before, nav, xi, turned, gyros, lever, late)
-    return turned
-
-
-@compiled("void(f8[:, :], f8[::1], f8[::1], f8[::1], f8, i8[:, ::1], i8[::1], i8[::1], i8[::1])")
-def carry_over_rows(
-    m: Array,
-    before: Array,
-    nav: Array,
-    xi: Array,
-    turned: float,
-    biases: Indices,
-    gyros: Indices,
-    lever: Indices,
-    late: Indices,
-) -> None:
-    """V <- T V for sensitivities (n, k), as `carry_over_all` does P."""
+    turned = heading_turn(before[Q0:NAV_SIZE], nav[Q0:])
+    slots = _turned_slots(biases[0], gyros, lever, late)
+    m, t = np.zeros((n, slots.size)), np.empty((slots.size, slots.size))
+    for a in range(slots.size):
+        m[slots[a], a] = 1.0
     turn_rows(m, before[Q0:NAV_SIZE], nav[Q0:], biases[0], biases[1])
     keep_rows(m, before, nav, xi, turned, gyros, lever, late)
+    for a in range(slots.size):
+        t[a] = m[slots[a]]
+    turn_covariance(cov, slots, t)
+    if bank.size:
+        mix(bank, n, slots, t)
+    return turned

@@ -10,20 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, NAMES, SIZE
+from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.estimators.row_kernels import (
-    BECAME,
-    FUSED,
-    GATED,
+    ENDS,
     INNOVATION,
-    MOVES,
-    NIS,
-    NOT_FINITE,
     OF_STATE,
-    WHITENED,
 )
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.service import Series
@@ -38,13 +32,15 @@ _PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZ
 """By the length of a body: what makes a row of it."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Span:
-    """A series' part of a batch: its number, instant and value of the last, and at how many the
+    """A series' part of a batch: its number, what its rows are and its device to the bank, and what
+    is asked of them; of which batch it is, instant and value of the last, and at how many the
     vehicle moved."""
 
-    one: Series
-    number: int
+    constants: tuple[int, int, int, int]
+    batch: int = 0
+    one: Series | None = None
     t_ns: int = 0
     value: object = None
     moved: int = 0
@@ -57,32 +53,35 @@ class MeasurementRows:
         runs = estimator.runs
         self._bank = None if runs is None else estimator.hypotheses
         self._model = estimator.model
-        self._known: dict[str, tuple[int, int, int, int]] = {}
-        """By source: number of its series, what its rows are and its device, what is asked."""
         self._noise = np.zeros((0, NOISE_SIZE))
-        self._spans: dict[str, Span] = {}
+        self._known: dict[str, Span] = {}
+        """By source."""
+        self._batch = 0
+        self._spans: list[Span] = []
+        """Those of a batch."""
 
-    def packed(self, measurement: AidingMeasurement) -> tuple[bytes, object]:
-        """A measurement's row, empty where it has none, and what a frozen sensor would repeat of
-        it."""
+    def packed(self, measurement: AidingMeasurement) -> tuple[bytes, object, Span | None]:
+        """A measurement's row, what a frozen sensor would repeat of it, and the span of its source;
+        none of one that has no row."""
         bank = None if measurement.robust else self._bank
         packed = None if bank is None else measurement.packed(self._model)
         if bank is None or packed is None:
-            return b"", None
-        known = self._known.get(measurement.source) or self._new(measurement, bank)
-        kind, rows, body = packed
-        row = HEADER.pack(kind, measurement.t_ns, rows, THRESHOLDS[measurement.gate, rows], *known)
+            return b"", None, None
+        span = self._known.get(measurement.source) or self._new(measurement, bank)
+        (kind, rows, body), of = packed, span.constants
+        row = HEADER.pack(kind, measurement.t_ns, rows, THRESHOLDS[measurement.gate, rows], *of)
         shown = None if measurement.constraint else type(measurement).shown
-        return row + body + _PADDING[len(body)], None if shown is None else shown(measurement)
+        value = None if shown is None else shown(measurement)
+        return row + body + _PADDING[len(body)], value, span
 
-    def _new(self, measurement: AidingMeasurement, bank: Hypotheses) -> tuple[int, int, int, int]:
-        """Constants of a measurement's source."""
+    def _new(self, measurement: AidingMeasurement, bank: Hypotheses) -> Span:
+        """Span of a source that has not been heard."""
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not measurement.constraint:
             asked = MEASURED if measurement.locates else MEASURED | MOTION_ASKED
-        known = self._known[measurement.source] = number, *bank.of(measurement), asked
-        return known
+        span = self._known[measurement.source] = Span((number, *bank.of(measurement), asked))
+        return span
 
     def batch(
         self, entries: Sequence[Entry], which: range, diagnosis: Diagnosis, until_ns: int
@@ -90,25 +89,26 @@ class MeasurementRows:
         """The first `which` of entries up to one that has no row, or of which more is to be judged:
         a series that is not nominal, a value that repeats itself; or that is not before `until_ns`.
         Rows (k, SIZE), and the noise scales of all series (s, .); None of none."""
-        rows, values, spans = [], {}, self._spans
+        rows, spans = [], self._spans
         spans.clear()
+        self._batch = number = self._batch + 1
         for k in which:
             entry = entries[k]
-            if not entry.row:
+            span, value = entry.span, entry.value
+            if span is None:
                 break
-            measurement, value = entry.measurement, entry.value
-            source = measurement.source
-            if source not in spans:
-                one = diagnosis.plain(measurement)
+            if span.batch != number:
+                one = diagnosis.plain(entry.measurement)
                 if one is None:
                     break
-                number = self._known[source][0]
-                spans[source], values[source] = Span(one, number), one.value
-                self._noise[number] = one.noise
+                span.batch, span.one, span.value = number, one, one.value
+                span.t_ns = span.moved = 0
+                self._noise[span.constants[0]] = one.noise
+                spans.append(span)
             if value is not None:
-                if value == values[source]:
+                if value == span.value:
                     break
-                values[source] = value
+                span.value = value
             rows.append(entry.row)
             if entry.key[0] >= until_ns:
                 break
@@ -116,31 +116,24 @@ class MeasurementRows:
             return None
         return np.frombuffer(bytearray().join(rows)).reshape(-1, SIZE), self._noise
 
-    def went_on(self, entries: Sequence[Entry], results: Sequence[Sequence[float]]) -> None:
+    def went_on(self, entries: Sequence[Entry], results: Array) -> list[Outcome]:
         """Tell the series of a batch that so many of its measurements have come, with these
-        results."""
-        spans = self._spans
-        for entry, result in zip(entries, results, strict=True):
-            span = spans[entry.measurement.source]
-            span.t_ns, span.value = entry.key[0], entry.value
-            span.moved += result[MOVES] > 0.0
-        for span in spans.values():
-            if span.t_ns:
-                span.one.went_on(span.t_ns, span.value, span.moved)
-                span.one.noise[:] = self._noise[span.number]
-
-
-def outcome_of(row: bytes, result: Sequence[float]) -> Outcome:
-    """Outcome of a measurement with a row, by what a run has made of it."""
-    became, degrees = int(result[BECAME]), HEADER.unpack_from(row)[2]
-    if became == FUSED:
-        whitened = tuple(result[WHITENED : WHITENED + degrees])
-        return Outcome("fused", result[NIS], degrees, whitened)
-    if became == GATED:
-        return Outcome("gated", result[NIS], degrees)
-    if became == NOT_FINITE:
-        return Outcome("not_finite", result[NIS], degrees)
-    return Outcome(NAMES[became])
+        results; their outcomes."""
+        outcomes = []
+        for entry, result in zip(entries, results[:, :INNOVATION].tolist(), strict=True):
+            became, nis, moves, count, *whitened = result
+            if (span := entry.span) is not None:
+                span.t_ns, span.value = entry.key[0], entry.value
+                if moves:
+                    span.moved += 1
+            name, degrees = ENDS[int(became)], int(count)
+            shown = tuple(whitened[:degrees]) if name == "fused" else ()
+            outcomes.append(Outcome(name, nis, degrees, shown))
+        for span in self._spans:
+            if (one := span.one) is not None and span.t_ns:
+                one.went_on(span.t_ns, span.value, span.moved)
+                one.noise[:] = self._noise[span.constants[0]]
+        return outcomes
 
 
 def raw_of(result: Sequence[float], degrees: int) -> RawInnovation | None:

@@ -20,13 +20,13 @@ import numpy as np
 from fusiond.aiding.base import AidingMeasurement, Feedback
 from fusiond.aiding.candidates import Candidate
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.estimators.row_kernels import INNOVATION, JUDGE, KEEP, RESULT
+from fusiond.estimators.row_kernels import JUDGE, KEEP
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
-from fusiond.navigator.measurement_rows import MeasurementRows, outcome_of, raw_of
+from fusiond.navigator.measurement_rows import MeasurementRows, Span, raw_of
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
 Key = tuple[int, str, int]
@@ -43,13 +43,15 @@ class Entry:
     """A measurement on the timeline and how it ended so far; `serial` tells equal sources apart,
     `judged` that its innovation has been told a verdict of: a rewind applies it again. `error` is
     what made it `failed`; `raw` is kept where the timeline `keeps_raw`. `row` is the measurement as
-    a row of numbers, empty where it has none, and `value` what a frozen sensor would repeat."""
+    a row of numbers, empty where it has none, `value` what a frozen sensor would repeat and `span`
+    what is the same of all such rows of a source."""
 
     key: Key
     measurement: AidingMeasurement
     feedback: Feedback = "at_once"
     row: bytes = b""
     value: object = None
+    span: Span | None = None
     outcome: Outcome | None = None
     judged: bool = False
     error: str = ""
@@ -238,16 +240,13 @@ class Timeline:
         if batch is None:
             return False
         ran = runs(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
-        results = ran.results[: ran.done, : RESULT if self.keeps_raw else INNOVATION].tolist()
         entries = self._entries[self._next : self._next + ran.done]
-        self._rows.went_on(entries, results)
-        for entry, result in zip(entries, results, strict=True):
-            outcome = outcome_of(entry.row, result)
-            entry.raw = raw_of(result, outcome.degrees) if self.keeps_raw else None
+        outcomes = self._rows.went_on(entries, ran.results[: ran.done])
+        for k, (entry, outcome) in enumerate(zip(entries, outcomes, strict=True)):
+            entry.raw = raw_of(ran.results[k].tolist(), outcome.degrees) if self.keeps_raw else None
             self._next += 1
-            if ran.how == JUDGE and entry is entries[-1]:
-                outcome = self._judged(entry, outcome)
-            self._count(entry, outcome)
+            judged = ran.how == JUDGE and k + 1 == ran.done
+            self._count(entry, self._judged(entry, outcome) if judged else outcome)
         if ran.how == KEEP:
             self._checkpoint()
         return ran.done > 0 or ran.how == KEEP

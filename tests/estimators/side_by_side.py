@@ -10,7 +10,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.base import ErrorStateFilter
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.models.catalogue import make_model
@@ -45,7 +45,7 @@ def pair_of(
     return pair
 
 
-def compare(a: ErrorStateFilter, b: ErrorStateFilter, sigmas: float, relative: float) -> None:
+def compare(a: Estimator, b: Estimator, sigmas: float, relative: float) -> None:
     """Means to `sigmas` one sigma, covariances to `relative` of the sigmas' product."""
     sd = np.sqrt(np.diag(a.covariance))
     sd[sd == 0.0] = 1.0

@@ -13,7 +13,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.base import ErrorStateFilter
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.block_covariance import GRID_NS
 from fusiond.estimators.block_sigmas import ROWS
 from fusiond.estimators.invariant import InvariantFilter
@@ -61,8 +61,8 @@ def drive(shaken: bool = False) -> tuple[Model, ImuBuffer, list[Linearised], Arr
 
 
 def begun(
-    kind: Callable[[Model, float], ErrorStateFilter], shaken: bool = False
-) -> tuple[ErrorStateFilter, ImuBuffer, list[Linearised]]:
+    kind: Callable[[Model, float], Estimator], shaken: bool = False
+) -> tuple[Estimator, ImuBuffer, list[Linearised]]:
     model, buffer, measurements, start, sd = drive(shaken)
     estimator = kind(model, IMU.gap_s)
     estimator.initialise(0, 0, start, np.zeros(len(sd)), np.diag(sd**2))
@@ -91,7 +91,7 @@ def test_sigmas_are_those_of_every_sample(shaken: bool) -> None:
 
 @pytest.mark.parametrize("kind", FILTERS)
 def test_who_asks_in_passing_leaves_no_trace(
-    kind: Callable[[Model, float], ErrorStateFilter],
+    kind: Callable[[Model, float], Estimator],
 ) -> None:
     """At ends of samples, and at the instant of a measurement before it is folded in."""
     alone, buffer, measurements = begun(kind)

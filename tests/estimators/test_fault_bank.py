@@ -19,9 +19,12 @@ from fusiond.estimators.fault_bank import (
     E_ROWS,
     L_AT,
     L_ROWS,
+    LANES,
     LEVEL_OF,
     N_AT,
+    ONSET,
     RESTARTS,
+    awake,
     group_at,
 )
 from fusiond.estimators.fault_odds import APART, solve
@@ -141,6 +144,20 @@ def test_the_filter_is_off_by_v_b(fault: str, size: tuple[float, ...]) -> None:
     for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
         scale = max(np.abs(expected[part]).max(), 1e-9)
         assert np.abs(found[part] - expected[part]).max() < 0.02 * scale + 1e-9, part
+
+
+def test_what_is_carried_off_runs_away_at_the_velocity_that_it_adds() -> None:
+    """V of a device that is carried off is the sum of those of its position's drift and its
+    velocity's offset, of one onset."""
+    bank = run().hypotheses
+    assert bank is not None
+    rows = [row_of(name) for name in ("carried_off", "position_drift", "velocity")]
+    for restart in range(RESTARTS):
+        onsets = {float(bank.each(ONSET)[row, restart]) for row in rows}
+        assert len(onsets) == 1
+        both, drift, offset = (bank.effect(RESTARTS * row + restart) for row in rows)
+        scale = np.abs(drift) + np.abs(offset)
+        assert np.abs(both - drift - offset).max() < 1e-5 * scale.max()
 
 
 def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
@@ -268,6 +285,37 @@ def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
     made.adopt(found.mean, found.spread)
     after = np.abs(runs.nav_error(made.nav, truth)[6])
     assert after < 0.5 * before
+
+
+def test_what_nothing_has_moved_is_left_out() -> None:
+    """V of kinds whose rows never come, and of a fault's end where there was none, is zero and not
+    gone through, until something moves it."""
+
+    def behind(made: KalmanEstimator) -> tuple[int, int, bool]:
+        """Columns of V that are left out, of groups of three numbers and of one; whether `over` is
+        zero."""
+        bank, over = made.hypotheses, row_of("over")
+        assert bank is not None
+        v = bank.sensitivities
+        (_, threes), (ones, end) = awake(bank.bank, True), awake(bank.bank, False)
+        assert not v[:, threes:ones].any()
+        assert not v[:, end:].any()
+        for last, step in ((threes, 3 * LANES), (end, LANES)):
+            assert v[:, last - step : last].any()
+        effects = [bank.effect(RESTARTS * over + restart) for restart in range(RESTARTS)]
+        return ones - threes, v.shape[1] - end, not np.any(effects)
+
+    ground, of_over, nothing = behind(run())
+    assert ground >= 3 * LANES
+    assert of_over >= LANES
+    assert nothing
+    drifted, rng = run("position_drift", np.array([1.5, 0.0, 0.0])), np.random.default_rng(1)
+    assert drifted.hypotheses is not None
+    drifted.hypotheses.judge(LAST_NS)
+    drifted.update(aids(LAST_NS + runs.SECOND, rng, "", np.zeros(3))[1])
+    _, less, nothing = behind(drifted)
+    assert less < of_over
+    assert not nothing
 
 
 def test_what_returns_to_service_begins_anew() -> None:

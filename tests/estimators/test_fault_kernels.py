@@ -33,12 +33,13 @@ from fusiond.estimators.fault_bank import (
     WAITS,
     fault_table,
 )
-from fusiond.estimators.fault_carried import settle
+from fusiond.estimators.fault_carried import mix, settle
 from fusiond.estimators.fault_odds import MOST_OF_UNIT
 from fusiond.estimators.fault_rows import _at_past, _past, walk_path
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.published_state import MOVING, moving, opened_variances
+from fusiond.estimators.tilt_axes_carried import turn_covariance
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import MOUNTING, mounting
@@ -186,6 +187,30 @@ def test_what_lies_between_two_measurements_is_multiplied_once() -> None:
     assert not bank.waits
     kept = bank.sensitivities.copy()
     settle(bank.bank, n)
+    assert np.array_equal(kept, bank.sensitivities)
+
+
+def test_what_turns_some_states_is_multiplied_by_those_alone() -> None:
+    """V <- T V and P <- T P T^T, where T has rows and columns of some states alone, and of these
+    not all are mixed."""
+    made, bank = faulty()
+    n, width = MODEL.size, MODEL.width
+    rng = np.random.default_rng(5)
+    slots = np.array([0, 1, 2, 14, 9, 11])
+    t = np.eye(6) + rng.standard_normal((6, 6)) * (rng.random((6, 6)) < 0.5)
+    t[2] = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    whole = np.eye(n)
+    whole[np.ix_(slots, slots)] = t
+    expected = whole @ bank.sensitivities
+    cov = np.zeros((width, width))
+    cov[:n, :n] = made.covariance
+    mix(bank.bank, n, slots, t)
+    turn_covariance(cov, slots, t)
+    assert bank.sensitivities == pytest.approx(expected, rel=1e-5, abs=1e-6)  # single precision
+    assert cov[:n, :n] == pytest.approx(whole @ made.covariance @ whole.T, rel=1e-9, abs=1e-12)
+    assert np.array_equal(cov, cov.T)
+    kept = bank.sensitivities.copy()
+    mix(bank.bank, n, slots, np.eye(6))
     assert np.array_equal(kept, bank.sensitivities)
 
 

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.base import AS_STATED, Estimator, Outcome, gate_threshold
 from fusiond.estimators.federated.bank import combine
 from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection, Record
 from fusiond.estimators.federated.options import FederatedOptions, local_of
@@ -58,7 +58,7 @@ class _Own(NamedTuple):
     records: tuple[Record, ...]
 
 
-class FederatedFilter(ErrorStateFilter):
+class FederatedFilter(Estimator):
     """Common part of the modes; `names` are the local filters.
 
     `_bank` (k, width, width) and `_bank_dxs` (k, n) are estimates to be fused, `_factors` (N,) the

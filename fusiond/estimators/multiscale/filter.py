@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.base import AS_STATED, Estimator, Outcome, gate_threshold
 from fusiond.estimators.memory import RECORDED, USED
 from fusiond.estimators.multiscale.block import (
     Block,
@@ -64,7 +64,7 @@ class _Open(NamedTuple):
     starting: bool
 
 
-class MultiscaleEstimator(ErrorStateFilter):
+class MultiscaleEstimator(Estimator):
     """Block filter of paper 001 (`fusiond.estimators.base.Estimator`).
 
     `scales` N is 1 to 4; `wavelet` a PyWavelets name, orthonormal (ValueError if not).

@@ -23,7 +23,7 @@ from fusiond.aiding.bearing import BearingMeasurement
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
-from fusiond.estimators.base import ErrorStateFilter
+from fusiond.estimators.base import Estimator
 from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.selection import best_four
@@ -260,7 +260,7 @@ def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
     return buffer
 
 
-class Transitions(ErrorStateFilter):
+class Transitions(Estimator):
     """The filters' own propagation, asked for the transition and noise of a second."""
 
     carries_transition = True
