@@ -312,7 +312,7 @@ def test_what_nothing_has_moved_is_left_out() -> None:
     drifted, rng = run("position_drift", np.array([1.5, 0.0, 0.0])), np.random.default_rng(1)
     assert drifted.hypotheses is not None
     drifted.hypotheses.judge(LAST_NS)
-    drifted.update(aids(LAST_NS + runs.SECOND, rng, "", np.zeros(3))[1])
+    drifted.update(measurements(LAST_NS + runs.SECOND, rng, "", np.zeros(3))[1])
     _, less, nothing = behind(drifted)
     assert less < of_over
     assert not nothing
