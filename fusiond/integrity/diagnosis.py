@@ -34,13 +34,10 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import (
-    DECIDED,
-    RESTARTS,
-)
+from fusiond.estimators.fault_bank import DECIDED, POSITION_RAMP, RESTARTS
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
-from fusiond.integrity.catalogue import Kind
+from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.fault_finding import Finding, Lasting
 from fusiond.integrity.service import (
@@ -52,6 +49,7 @@ from fusiond.integrity.service import (
     Service,
     value_of,
 )
+from fusiond.integrity.shared_error import begun_anew
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -204,8 +202,8 @@ class Diagnosis:
         if bank is not None:
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
             if found is not None and measured and used:
-                if identified(found):
-                    correction = self._decide(t_ns, bank, found)
+                if identified(found) and self._can_decide(aid, found):
+                    correction = self._decide(aid, e, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
         if not used:
@@ -239,25 +237,39 @@ class Diagnosis:
                 bank.begin_again(aid, estimator.nav, estimator.step)
         return correction
 
-    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
+    def _can_decide(self, aid: Aid, found: Array) -> bool:
+        """False of a position's fault before the position of that instant has come."""
+        kind = self._kinds[int(found.item(BEST)) // RESTARTS]
+        return kind.of != PLACE or aid.locates
+
+    def _decide(self, aid: Aid, estimator: Estimator, bank: Hypotheses, found: Array) -> Correction:
         """Faults that are identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         fits = np.array([each.log_likelihood for each in taken])
         weights = np.exp(fits - fits.max())
         weights /= weights.sum()
-        mean, spread = np.zeros(bank.n), np.zeros((bank.n, bank.n))
-        for w, each in zip(weights, taken, strict=True):
-            mean += w * each.mean
-        for w, each in zip(weights, taken, strict=True):
-            apart = each.mean - mean
-            spread += w * (each.spread + np.outer(apart, apart))
-        finding = self._finding(t_ns, max(taken, key=lambda each: each.log_odds))
+        mean, spread = _mixed(weights, [(each.mean, each.spread) for each in taken])
+        finding = self._finding(aid.t_ns, max(taken, key=lambda each: each.log_odds))
+        if finding.kind.of == PLACE:
+            size, variance = _mixed(weights, [self._jump(each, aid.t_ns) for each in taken])
+            if slots := begun_anew(aid, estimator, size, variance):
+                sd = tuple(np.sqrt(np.diagonal(variance)).tolist())
+                kind = changed_kind(finding.kind.device)
+                finding = finding._replace(kind=kind, size=tuple(size.tolist()), sd=sd)
+                mean[slots] = -estimator.xi[slots]
+                spread[slots, slots] += estimator.model.noise[2, slots]
         others = [f for f in self.findings if f.kind.text != finding.kind.text]
         self.findings = (*others, finding)
         if not finding.kind.corrected:
             self._leave_out(finding, bank, fits.max())
         return Correction(mean, spread)
+
+    def _jump(self, told: Estimated, t_ns: int) -> tuple[Array, Array]:
+        """By how much (m) positions are off by now, and its covariance."""
+        runs_away = self._kinds[told.kind].signature == POSITION_RAMP
+        for_s = t_ns * 1e-9 - told.onset_s if runs_away else 1.0
+        return told.size * for_s, told.covariance * for_s**2
 
     def _finding(self, t_ns: int, told: Estimated) -> Finding:
         kind = self._kinds[told.kind]
@@ -362,6 +374,15 @@ class Diagnosis:
             return
         known = self._agreement.get(aid.device, Agreement())
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
+
+
+def _mixed(weights: Array, parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Mean and covariance of a mixture."""
+    mean = np.sum([w * part[0] for w, part in zip(weights, parts, strict=True)], axis=0)
+    spread = np.zeros((len(mean), len(mean)))
+    for w, (one, own) in zip(weights, parts, strict=True):
+        spread += w * (own + np.outer(one - mean, one - mean))
+    return mean, spread
 
 
 def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
