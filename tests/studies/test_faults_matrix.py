@@ -19,7 +19,7 @@ from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults.aid_faults import carried_off, step, velocity_bias
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
-from fusiond.studies.faults.judge import LIE_S, Sample, longest_lie_s
+from fusiond.studies.faults.judge import LIE_S, NAVIGATING, Sample, longest_lie_s
 from fusiond.studies.faults.library import FAULTS, Fault
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
@@ -35,6 +35,10 @@ from fusiond.studies.faults.runs import (
     run_row,
 )
 from fusiond.studies.faults.tables import TABLES, put_into
+
+NOT_COUNTED = pytest.mark.xfail(
+    strict=True, reason="a lie in mode coasting, which did not count: docs/faults.md"
+)
 
 # Fault and phase; the event that names it; within how many seconds of its end the mode is
 # `navigating` again with errors inside five sigma (None: it lasts to the end of the drive).
@@ -53,11 +57,12 @@ ROWS = [
     ("gyro_bias_1_deg_s", "navigating", "sensor_fault", None),
     ("gyro_spike_in_range", "navigating", "imu_spike", 3.0),
     ("imu_stuck_15s", "navigating", "imu_repeated", 20.0),
+    ("imu_silent_5s_bend", "navigating", "imu_gap", 5.0),
     ("imu_stamps_reversed", "aligning", "imu_time", None),
-    ("heading_off_by_90_deg", "aligning", "heading_contradicted", None),
+    pytest.param(
+        *("heading_off_by_90_deg", "aligning", "heading_contradicted", None), marks=NOT_COUNTED
+    ),
 ]
-
-
 LIES = pytest.mark.xfail(strict=True, reason="a lie that is not mended: docs/faults.md")
 
 
@@ -140,8 +145,8 @@ def test_what_is_not_told_yet_is_left_open(fault: str, phase: str, drive: int) -
         ("drift_0.1_m_s", "navigating", 65),
         pytest.param("drift_0.1_m_s", "navigating", 62, marks=LIES),
         ("fix_frozen", "navigating", 65),
-        ("velocity_reversed", "coasting", 65),
-        ("gyro_bias_1_deg_s", "coasting", 61),
+        pytest.param("velocity_reversed", "coasting", 65, marks=NOT_COUNTED),
+        pytest.param("gyro_bias_1_deg_s", "coasting", 61, marks=NOT_COUNTED),
     ],
 )
 def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) -> None:
@@ -166,6 +171,17 @@ def twice_carried_off(whole: Recording) -> Recording:
         found = carried_off(found, begin_s, MOVED_S, AWAY_M_S)
         found = step(found, begin_s + MOVED_S, 1000.0, AWAY_M_S * MOVED_S)
     return found
+
+
+@pytest.mark.parametrize(
+    ("fault", "phase", "drive"),
+    [("velocity_reversed", "coasting", 65), ("gyro_bias_1_deg_s", "coasting", 61)],
+)
+def test_what_lies_while_coasting_is_not_vouched_for(fault: str, phase: str, drive: int) -> None:
+    """Mode `navigating` comes when sigma holds again."""
+    found = course_of(placed(FAULTS[fault], drive), phase, seed=drive % 65)  # type: ignore[arg-type]
+    vouched = [s if s.mode == NAVIGATING else replace(s, ratios=()) for s in found.samples]
+    assert longest_lie_s(vouched) <= LIE_S
 
 
 def test_a_receiver_that_sets_off_twice_while_the_vehicle_stands_is_not_followed() -> None:
