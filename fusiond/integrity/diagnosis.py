@@ -49,7 +49,7 @@ from fusiond.integrity.service import (
     Service,
     value_of,
 )
-from fusiond.integrity.shared_error import begun_anew
+from fusiond.integrity.shared_error import renewed_slots
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -253,7 +253,7 @@ class Diagnosis:
         finding = self._finding(aid.t_ns, max(taken, key=lambda each: each.log_odds))
         if finding.kind.of == PLACE:
             size, variance = _mixed(weights, [self._jump(each, aid.t_ns) for each in taken])
-            if slots := begun_anew(aid, estimator, size, variance):
+            if slots := renewed_slots(aid, estimator, size, variance):
                 sd = tuple(np.sqrt(np.diagonal(variance)).tolist())
                 kind = changed_kind(finding.kind.device)
                 finding = finding._replace(kind=kind, size=tuple(size.tolist()), sd=sd)
@@ -265,11 +265,11 @@ class Diagnosis:
             self._leave_out(finding, bank, fits.max())
         return Correction(mean, spread)
 
-    def _jump(self, told: Estimated, t_ns: int) -> tuple[Array, Array]:
+    def _jump(self, one: Estimated, t_ns: int) -> tuple[Array, Array]:
         """By how much (m) positions are off by now, and its covariance."""
-        runs_away = self._kinds[told.kind].signature == POSITION_RAMP
-        for_s = t_ns * 1e-9 - told.onset_s if runs_away else 1.0
-        return told.size * for_s, told.covariance * for_s**2
+        runs_away = self._kinds[one.kind].signature == POSITION_RAMP
+        for_s = t_ns * 1e-9 - one.onset_s if runs_away else 1.0
+        return one.size * for_s, one.covariance * for_s**2
 
     def _finding(self, t_ns: int, told: Estimated) -> Finding:
         kind = self._kinds[told.kind]

@@ -34,11 +34,14 @@ PLACE = slice(6, 9)
 """Of the position in the error state."""
 
 
-def begun_anew(aid: Aid, estimator: Estimator, jump: Array, variance: Array) -> list[int]:
-    """Slots of the error that a position shares with those before it, if it is likelier that this
-    has begun anew than that a fault has made them `jump` (3,) (m, NED) of such a variance; none
-    else."""
-    place = next((c for c in aid.candidates() if isinstance(c, PositionCandidate)), None)
+def renewed_slots(
+    measurement: Aid, estimator: Estimator, jump: Array, variance: Array
+) -> list[int]:
+    """Slots of a shared error that has been renewed.
+
+    None, unless that is likelier than a fault of positions that `jump` (3,) (m, NED) with such a
+    variance."""
+    place = next((c for c in measurement.candidates() if isinstance(c, PositionCandidate)), None)
     if place is None:
         return []
     model = estimator.model

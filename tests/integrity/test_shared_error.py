@@ -7,7 +7,7 @@ import pytest
 
 from fusiond.aiding.position import PositionAid
 from fusiond.estimators.base import Estimator
-from fusiond.integrity.shared_error import begun_anew
+from fusiond.integrity.shared_error import renewed_slots
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults.scenes import CODE, SHARING, Receiver, Vehicle
@@ -37,7 +37,7 @@ def changed(
         bias_share=(share,) * 3,
     )
     jump = np.array([north_m, 0.0, 0.0])
-    return bool(begun_anew(fix, of, jump, JUMP_SD_M**2 * np.eye(3)))
+    return bool(renewed_slots(fix, of, jump, JUMP_SD_M**2 * np.eye(3)))
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def changed(
         (-6.0, -6.0, False),
     ],
 )
-def test_what_comes_back_to_where_it_may_be_has_begun_anew(
+def test_what_comes_back_to_where_it_may_be_has_renewed_slots(
     was_m: float, jump_m: float, expected: bool
 ) -> None:
     assert changed(estimator(SHARING, was_m), jump_m) is expected

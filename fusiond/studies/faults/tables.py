@@ -107,7 +107,7 @@ def matrix(found: Rows) -> str:
 
 
 def _lie(row: Mapping[str, Any]) -> str:
-    """How long it lied at most, and in which modes it was beyond five sigma."""
+    """The longest lie, and the modes of all seconds beyond five sigma."""
     lie_s, modes = number(row["longest_lie_s"], "-"), ", ".join(row["lie_modes"])
     return f"{lie_s} ({modes})" if modes else lie_s
 
