@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import DECIDED, POSITION_RAMP, RESTARTS
+from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
@@ -249,14 +249,21 @@ class Diagnosis:
         fits = np.array([each.log_likelihood for each in taken])
         weights = np.exp(fits - fits.max())
         weights /= weights.sum()
-        mean, spread = _mixed(weights, [(each.mean, each.spread) for each in taken])
+        mean, spread = np.zeros(bank.n), np.zeros((bank.n, bank.n))
+        for w, each in zip(weights, taken, strict=True):
+            mean += w * each.mean
+        for w, each in zip(weights, taken, strict=True):
+            apart = each.mean - mean
+            spread += w * (each.spread + np.outer(apart, apart))
         finding = self._finding(aid.t_ns, max(taken, key=lambda each: each.log_odds))
-        if finding.kind.of == PLACE:
-            size, variance = _mixed(weights, [self._jump(each, aid.t_ns) for each in taken])
-            if slots := renewed_slots(aid, estimator, size, variance):
-                sd = tuple(np.sqrt(np.diagonal(variance)).tolist())
+        steps = [each for each in taken if self._kinds[each.kind].signature == POSITION]
+        if steps:
+            step = max(steps, key=lambda each: each.log_likelihood)
+            less = float(fits.max()) - step.log_likelihood
+            if slots := renewed_slots(aid, estimator, step, less):
+                sd = tuple(np.sqrt(np.diagonal(step.covariance)).tolist())
                 kind = changed_kind(finding.kind.device)
-                finding = finding._replace(kind=kind, size=tuple(size.tolist()), sd=sd)
+                finding = finding._replace(kind=kind, size=tuple(step.size.tolist()), sd=sd)
                 mean[slots] = -estimator.xi[slots]
                 spread[slots, slots] += estimator.model.noise[2, slots]
         others = [f for f in self.findings if f.kind.text != finding.kind.text]
@@ -264,12 +271,6 @@ class Diagnosis:
         if not finding.kind.corrected:
             self._leave_out(finding, bank, fits.max())
         return Correction(mean, spread)
-
-    def _jump(self, one: Estimated, t_ns: int) -> tuple[Array, Array]:
-        """By how much (m) positions are off by now, and its covariance."""
-        runs_away = self._kinds[one.kind].signature == POSITION_RAMP
-        for_s = t_ns * 1e-9 - one.onset_s if runs_away else 1.0
-        return one.size * for_s, one.covariance * for_s**2
 
     def _finding(self, t_ns: int, told: Estimated) -> Finding:
         kind = self._kinds[told.kind]
@@ -374,15 +375,6 @@ class Diagnosis:
             return
         known = self._agreement.get(aid.device, Agreement())
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
-
-
-def _mixed(weights: Array, parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Mean and covariance of a mixture."""
-    mean = np.sum([w * part[0] for w, part in zip(weights, parts, strict=True)], axis=0)
-    spread = np.zeros((len(mean), len(mean)))
-    for w, (one, own) in zip(weights, parts, strict=True):
-        spread += w * (own + np.outer(one - mean, one - mean))
-    return mean, spread
 
 
 def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:

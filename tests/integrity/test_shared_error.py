@@ -7,6 +7,7 @@ import pytest
 
 from fusiond.aiding.position import PositionAid
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.hypotheses import Estimated
 from fusiond.integrity.shared_error import renewed_slots
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigator.navigator import Navigator
@@ -28,7 +29,11 @@ def estimator(receiver: Receiver, north_m: float = 0.0) -> Estimator:
 
 
 def changed(
-    of: Estimator, north_m: float, share: float = 1.0, bias: tuple[str, ...] = BLOCKS
+    of: Estimator,
+    north_m: float,
+    share: float = 1.0,
+    bias: tuple[str, ...] = BLOCKS,
+    less: float = 0.0,
 ) -> bool:
     at = 0.8, 0.1, 40.0
     fix = PositionAid(
@@ -36,8 +41,10 @@ def changed(
         bias=bias,
         bias_share=(share,) * 3,
     )
-    jump = np.array([north_m, 0.0, 0.0])
-    return bool(renewed_slots(fix, of, jump, JUMP_SD_M**2 * np.eye(3)))
+    jump, n = np.array([north_m, 0.0, 0.0]), of.model.size
+    known = JUMP_SD_M**2 * np.eye(3)
+    step = Estimated(0, 0.0, 20.0, 30.0, jump, known, np.zeros(n), np.zeros((n, n)))
+    return bool(renewed_slots(fix, of, step, less))
 
 
 @pytest.mark.parametrize(
@@ -60,6 +67,11 @@ def test_fixes_that_share_little_jump_by_little() -> None:
     of = estimator(SHARING)
     assert changed(of, 6.0)
     assert not changed(of, 6.0, share=0.01)
+
+
+def test_what_a_drift_explains_better_is_a_drift() -> None:
+    assert changed(estimator(SHARING, 6.0), -6.0, less=2.0)
+    assert not changed(estimator(SHARING, 6.0), -6.0, less=20.0)
 
 
 def test_of_fixes_that_share_nothing_every_jump_is_a_fault() -> None:
