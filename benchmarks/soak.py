@@ -109,7 +109,7 @@ class Watch:
             "quiet_events": dict(told),
             "false_alarms_per_24_h": round(24.0 * alarms / max(hours, 1e-9), 2),
             "quiet_beyond_5_sigma_s": int((ratios > MOST_SIGMA).sum()),
-            "vouched_beyond_5_sigma_s": sum(s.beyond for s in course.samples),
+            "beyond_5_sigma_s": sum(s.beyond for s in course.samples),
             "modes": dict(Counter(s.mode for s in course.samples)),
         }
 

@@ -67,6 +67,7 @@ RECEIVER_PER_H, DELAYED_PER_H, SPOOFED_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1e-4, 1.
 TURNS_PER_H = 0.01
 """A unit works loose in its mount now and then in the life of a vehicle, not once an hour: what may
 have begun a moment ago is 0.2 deg of tilt for ever then, of a unit that knows it to 0.05."""
+POSITION_SD_M = (20.0, 20.0, 20.0)
 TOGETHER = "all receivers"
 """The device of a kind that is of all of them."""
 LAGGED_S = 0.5
@@ -161,7 +162,7 @@ def position_kinds(device: str) -> list[Kind]:
     return [
         of(
             *("position", f"{device} position is off", "m", POSITION, PLACE),
-            *((20.0, 20.0, 20.0), RECEIVER_PER_H),
+            *(POSITION_SD_M, RECEIVER_PER_H),
         ),
         of(
             *("position_drift", f"{device} position runs away", "m/s", POSITION_RAMP, PLACE),
@@ -289,6 +290,14 @@ def over_kind() -> Kind:
         bounded=True,
         axes=("",),
     )
+
+
+def changed_kind(device: str) -> Kind:
+    """That a device's positions have jumped within what they share: found beside the bank, which
+    takes it for a fault of them (fusiond.integrity.shared_error)."""
+    text = f"{device} position has changed within what its fixes share,"
+    of = "position_change", text, "m", FOLLOWED, OVER
+    return Kind(*of, (1.0, 1.0, 1.0), RECEIVER_PER_H, device=device)
 
 
 def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]:

@@ -34,13 +34,10 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import (
-    DECIDED,
-    RESTARTS,
-)
+from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
-from fusiond.integrity.catalogue import Kind
+from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.device_agreement import Agreement
 from fusiond.integrity.fault_finding import Finding, Lasting
 from fusiond.integrity.service import (
@@ -52,6 +49,7 @@ from fusiond.integrity.service import (
     Service,
     value_of,
 )
+from fusiond.integrity.shared_error import renewed_slots
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -208,8 +206,8 @@ class Diagnosis:
         if bank is not None:
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
             if found is not None and measured and used:
-                if identified(found):
-                    correction = self._decide(t_ns, bank, found)
+                if identified(found) and self._can_decide(measurement, found):
+                    correction = self._decide(measurement, e, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[measurement.source]
         if not used:
@@ -243,7 +241,14 @@ class Diagnosis:
                 bank.begin_again(measurement, estimator.nav, estimator.step)
         return correction
 
-    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
+    def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
+        """False of a position's fault before the position of that instant has come."""
+        kind = self._kinds[int(found.item(BEST)) // RESTARTS]
+        return kind.of != PLACE or measurement.locates
+
+    def _decide(
+        self, measurement: AidingMeasurement, estimator: Estimator, bank: Hypotheses, found: Array
+    ) -> Correction:
         """Faults that are identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
@@ -256,7 +261,17 @@ class Diagnosis:
         for w, each in zip(weights, taken, strict=True):
             apart = each.mean - mean
             spread += w * (each.spread + np.outer(apart, apart))
-        finding = self._finding(t_ns, max(taken, key=lambda each: each.log_odds))
+        finding = self._finding(measurement.t_ns, max(taken, key=lambda each: each.log_odds))
+        steps = [each for each in taken if self._kinds[each.kind].signature == POSITION]
+        if steps:
+            step = max(steps, key=lambda each: each.log_likelihood)
+            less = float(fits.max()) - step.log_likelihood
+            if slots := renewed_slots(measurement, estimator, step, less):
+                sd = tuple(np.sqrt(np.diagonal(step.covariance)).tolist())
+                kind = changed_kind(finding.kind.device)
+                finding = finding._replace(kind=kind, size=tuple(step.size.tolist()), sd=sd)
+                mean[slots] = -estimator.xi[slots]
+                spread[slots, slots] += estimator.model.noise[2, slots]
         others = [f for f in self.findings if f.kind.text != finding.kind.text]
         self.findings = (*others, finding)
         if not finding.kind.corrected:

@@ -133,6 +133,7 @@ class Series:
         self.out = True
         forget_lately(self.noise)
         self.failed = self.passed = 0
+        self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
 
     def gated(self, t_ns: int, explained: bool) -> None:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""

@@ -418,7 +418,8 @@ class Navigator:
             return Solution(t_ns, mode, reason, bound=self._protection.unknown())
         gap_ns = round(self.config.imu.gap_s * 1e9)
         bound = self._protection.bound() if self._protection.watches else NO_BOUND
-        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound)
+        drives = self.config.plausibility.manoeuvre
+        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound, drives)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """Mode at `t_ns`, and why."""

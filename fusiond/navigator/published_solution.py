@@ -1,4 +1,13 @@
-"""The estimator's state as a solution, at its own instant or a little later."""
+"""The estimator's state as a solution, at its own instant or later.
+
+Once the inertial unit is silent for longer than a solution is carried ahead by its last sample
+nobody knows what the vehicle does. For each second of that, one sigma is that what it did last goes
+on or ends, and that it drives as vehicles of its class do (`[plausibility]`, manoeuvre a):
+
+    velocity  |a_last| + a      position  |v| + velocity t / 2      yaw  |w_last| + a / |v|
+
+and a road is banked for its bends, by (|a_last| + a) / g at most, as soon as one lasts.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +15,17 @@ import math
 
 import numpy as np
 
+from fusiond.aiding.base import Vector3
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import published_ahead
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M, Bound, Mode, Solution
-from fusiond.navigation.strapdown import NAV_SIZE
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
 
 _SIZE = NAV_SIZE + 3
+SLOW_M_S = 5.0
+"""A car turns by its steering, not faster the slower it is: 0.75 m/s^2 are 9 deg/s then."""
 
 
 def solution_of(
@@ -23,9 +36,11 @@ def solution_of(
     mode: Mode,
     reason: str,
     bound: Bound,
+    drives: Vector3,
 ) -> Solution:
     """The solution at `t_ns`; where that is later than the estimator's instant, carried ahead by
-    holding the rates of the newest sample, for `most_ns` at most."""
+    holding the rates of the newest sample, for `most_ns` at most. `drives`: as the
+    `manoeuvre` of fusiond.configuration.plausibility."""
     ahead_ns = min(t_ns - estimator.t_ns, most_ns)
     ahead_s = ahead_ns * 1e-9 if ahead_ns > 0 and imu.end else 0.0
     e, model, errors, out = estimator, estimator.model, estimator.sensor_errors, np.empty(_SIZE)
@@ -36,6 +51,9 @@ def solution_of(
     )
     lat, lon, height, v_n, v_e, v_d, _, _, _, _, roll, pitch, yaw = out.tolist()
     sd, bias = e.sigmas().tolist(), errors.tolist()
+    silent_s = (t_ns - e.t_ns) * 1e-9 - ahead_s
+    if silent_s > 0.0:
+        _widen_by_silence(sd, (v_n, v_e, v_d), e, silent_s, drives)
     for k in model.unstated:
         sd[k] = math.nan
     if sd[2] > HEIGHT_KNOWN_SD_M or (model.hold_height and abs(height) < HELD_UNKNOWN_M):
@@ -56,6 +74,19 @@ def solution_of(
         (bias[3], bias[4], bias[5]),
         bound,
     )
+
+
+def _widen_by_silence(sd: list[float], v: Vector3, e: Estimator, s: float, drives: Vector3) -> None:
+    """Add to sigma (9,) what the vehicle may have done for `s` seconds."""
+    step, (north, east, down), (level, vertical, lasts_s) = e.step, v, drives
+    pull = math.hypot(step.item(STEP_SMOOTH_N), step.item(STEP_SMOOTH_N + 1)) + level
+    banked = min(s / lasts_s, 1.0) * pull / STANDARD_GRAVITY_M_S2
+    turned = abs(step.item(STEP_SMOOTH_RATE_B + 2)) + level / max(math.hypot(north, east), SLOW_M_S)
+    for row, (speed, a) in enumerate(((north, pull), (east, pull), (down, vertical))):
+        sd[row] = math.hypot(sd[row], (abs(speed) + 0.5 * a * s) * s)
+        sd[3 + row] = math.hypot(sd[3 + row], a * s)
+    for row, angle in enumerate((banked, banked, turned * s)):
+        sd[6 + row] = min(math.hypot(sd[6 + row], angle), math.pi)
 
 
 def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:

@@ -123,6 +123,18 @@ def test_nothing_says_endlessly_that_a_fault_is_over() -> None:
     assert one.over == MOST_SURE
 
 
+def test_the_end_of_one_fault_is_no_evidence_of_the_end_of_the_next() -> None:
+    one = series()
+    one.exclude(0, "a fault")
+    for k in range(1, 20):
+        one.looked_at(k * S, passes=True, lasting=100.0)
+    assert not one.out
+    one.exclude(40 * S, "another fault")
+    for k in range(41, 61):
+        one.looked_at(k * S, passes=False, lasting=-100.0)
+        assert (one.out, one.reason) == (True, "another fault")
+
+
 def test_what_was_not_heard_of_for_long_is_judged_anew() -> None:
     one = series()
     one.received(S)

@@ -51,7 +51,7 @@ def verdict(of: Course) -> str:
 
 def test_two_seconds_beyond_are_no_lie_and_three_are() -> None:
     assert verdict(course(range(12, 14))) == "survived"
-    assert verdict(course(range(12, 15))) == "silent lie"
+    assert verdict(course(range(12, 15))) == "lie"
 
 
 def test_seconds_beyond_that_are_apart_do_not_add_up() -> None:
@@ -65,7 +65,7 @@ def test_each_quantity_can_lie(quantity: int) -> None:
     ratios = tuple(5.1 if k == quantity else 0.0 for k in range(len(QUANTITIES)))
     samples = [Sample(float(t), "navigating", ratios) for t in range(1, 5)]
     found = judge(Course(samples, ()), course(), 1.0, 2.0)
-    assert found["verdict"] == "silent lie"
+    assert found["verdict"] == "lie"
     assert found["largest_ratio_of"] == QUANTITIES[quantity]
 
 
@@ -82,18 +82,29 @@ def test_exactly_five_sigma_is_no_lie() -> None:
     assert longest_lie_s(samples) == 0.0
 
 
-@pytest.mark.parametrize("mode", ["coasting", "invalid", "aligning"])
-def test_another_mode_does_not_vouch(mode: str) -> None:
+@pytest.mark.parametrize("mode", ["coasting", "invalid"])
+def test_a_lie_is_one_in_any_mode_that_publishes(mode: str) -> None:
     found = judge(course(range(12, 30), mode), course(), BEGIN_S, END_S)
-    assert found["verdict"] == "degraded and said so"
+    assert found["verdict"] == "lie"
+    assert found["lie_modes"] == {mode: 18}
+    assert found["longest_lie_s"] == 18.0
+    assert (found["largest_ratio"], found["largest_ratio_of"]) == (6.0, "yaw")
     assert found["noticed_s"] == 2.0
-    assert found["largest_horizontal_m"] == 1.0  # what no mode vouched for does not count
+    assert found["largest_horizontal_m"] == 1.0  # errors in metres are those of `navigating`
+
+
+def test_what_publishes_nothing_does_not_lie() -> None:
+    silent = [Sample(s.t_s, "aligning") if 12.0 <= s.t_s < 30.0 else s for s in course().samples]
+    found = judge(Course(silent, ()), course(), BEGIN_S, END_S)
+    assert found["verdict"] == "degraded and said so"
+    assert found["lie_modes"] == {}
+    assert (found["noticed_s"], found["recovered_s"]) == (2.0, 10.0)
 
 
 def test_a_lie_with_an_event_is_a_lie() -> None:
     event = Event(11.0, "verdict_too_small", "gnss")
     found = judge(course(range(12, 30), events=(event,)), course(), BEGIN_S, END_S)
-    assert found["verdict"] == "silent lie"
+    assert found["verdict"] == "lie"
     assert found["noticed_s"] == 1.0
 
 
@@ -119,7 +130,7 @@ def test_what_cannot_be_compared_is_beyond() -> None:
     assert axis_ratio(-3.0, 2.0) == 1.5
     samples = [Sample(float(t), "navigating", (math.inf,) * 5, math.nan) for t in range(1, 9)]
     found = judge(Course(samples, ()), course(), 1.0, 2.0)
-    assert found["verdict"] == "silent lie"
+    assert found["verdict"] == "lie"
     assert found["largest_ratio"] is None
     assert found["largest_horizontal_m"] is None
 

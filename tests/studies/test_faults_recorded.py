@@ -54,10 +54,10 @@ def test_nothing_wrong_is_inside_and_a_step_is_told(place: Place) -> None:
     assert found["verdict"] == "degraded and said so", found
     assert found["noticed_s"] < 2.0
     assert "isolated" in {event["code"] for event in found["events"]}
-    text = TABLES["recorded"]([quiet, {**found, "verdict": "silent lie"}])
-    assert "| step_50m, at 230 s | navigating | silent lie |" in text
+    text = TABLES["recorded"]([quiet, {**found, "verdict": "lie"}])
+    assert "| step_50m, at 230 s | navigating | lie |" in text
     assert "none, at" not in text
-    assert text.endswith("2 rows: 1 survived, 1 silent lie.\n")
+    assert text.endswith("2 rows: 1 survived, 1 lie.\n")
     assert np.isfinite(found["recovered_s"])
 
 

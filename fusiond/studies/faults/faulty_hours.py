@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults.hours import (
     HOUR_S,
     KINDS,
@@ -31,6 +30,7 @@ from fusiond.studies.faults.hours import (
     beyond_s,
     named,
     resident_mb,
+    stated_per_h,
     tests_of,
 )
 from fusiond.studies.faults.judge import (
@@ -116,12 +116,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     happened = happenings(kind, seed, duration_s)
     for happening in happened:
         recording = happening.put_into(recording)
-    doubts: set[int] = set()
-
-    def watch(navigator: Navigator) -> None:
-        doubts.update(f.t_ns for f in navigator.timeline.diagnosis.findings)
-
-    course = navigate(config, recording, truth, watch)
+    course = navigate(config, recording, truth)
     modes = [sample.mode for sample in course.samples]
 
     def calm(t_s: float, settled_s: float = SETTLED_S) -> bool:
@@ -137,8 +132,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         return event.code not in USUAL and quiet(event.t_s, judged)
 
     aligned = course.samples[modes.index(NAVIGATING) if NAVIGATING in modes else len(modes) :]
-    samples = [s if calm(s.t_s) else replace(s, mode="") for s in aligned]
-    vouched = [s.ratios for s in samples if s.mode == NAVIGATING]
+    samples = [s if calm(s.t_s) else replace(s, mode="", ratios=()) for s in aligned]
     told = Counter(named(e.code, e.text) for e in course.events if alarms(e))
     ends = [*(h.begin_s for h in happened[1:]), duration_s]
     return {
@@ -150,16 +144,16 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
             for happening, until_s in zip(happened, ends, strict=False)
             if happening.begin_s < len(modes)
         ],
-        "hours": len(vouched) / 3600.0,
+        "hours": sum(s.mode == NAVIGATING for s in samples) / 3600.0,
         "told": dict(told),
-        "doubts": sum(quiet(t_ns * 1e-9) for t_ns in doubts),
+        "stated_per_h": stated_per_h(config),
         "tests": tests_of(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
         "judged": tests_of(
             r for r in recording.received if quiet(r.seen_ns * 1e-9, SETTLED_S + JUDGED_S)
         ),
         "limits": kind.drive.second,
         "not_navigating_s": sum(s.mode not in ("", NAVIGATING) for s in samples),
-        "beyond_s": beyond_s(vouched),
+        "beyond_s": beyond_s([s.ratios for s in samples if s.ratios]),
         "longest_lie_s": longest_lie_s(samples),
         "resident_mb": resident_mb(),
         "crash": course.crash,

@@ -4,22 +4,22 @@ Vehicles of `KINDS`, each hour with its own noise of the configuration: IMU at 5
 1 Hz, RDSS every 11 s. What is told once the mode has been `navigating` is a false alarm, and stands
 beside what the test's own statement allows in so many tests:
 
-isolated              0.9999 of innovations pass a gate, and three in a row must fail it; a mean
-                      test gives one false alarm in a million (`isolation.FALSE_ALARM`): the two of
-                      them, at each innovation, at most
-doubt of the filter   a mean test with nothing to compare with, of the above, or the test of the
-                      tilt, one in a million (`tilt.LIMIT`) at each position and velocity
+isolated              a fault of a source is identified at odds of a thousand to one: so often as
+                      such faults are taken to begin (`fusiond.integrity.catalogue`), a thousandth.
+                      Three gates of 0.9999 that fail in a row are nothing beside it
+corrected             likewise of the inertial unit and of stamps, and that a source's fault is
+                      over, as often as one begins
 verdict               alpha, begun: `BEGUN`, as study `consistency` counts them
 protection            `false_alarm_per_hour` of `[integrity]`
 
-Tests at successive innovations share most of what they look at, so their false alarms come in
-clusters: the bounds are loose. Wheels have the drift that the filter allows for. RDSS is no matched
+Wheels have the drift that the filter allows for. RDSS is no matched
 source: it is simulated with less than its configured bias and height error, so that `cannot_tell`
 is true of it; what is told of its innovations is not counted as an alarm.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -33,6 +33,9 @@ from scipy.stats import chi2
 from drivers.measurements import PositionFix, WheelSpeed
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
+from fusiond.estimators.fault_bank import DECIDED
+from fusiond.integrity.catalogue import OVER
+from fusiond.navigator.assembly import kinds_of_config
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
@@ -49,15 +52,17 @@ from fusiond.studies.faults.recording import (
 )
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
-FALSE_ALARM = 1e-6
+FALSE = 1.0 / (1.0 + math.exp(DECIDED))
+"""Probability that a fault which is identified is none."""
 HOUR_S = 3600.0
 RATE_HZ, GNSS_HZ = 50.0, 1.0
 LIMITS_M = (40.0, 40.0)
 """As of study `protection`."""
 BEGUN = 0.015e-3
 """False verdicts begun an innovation with a window of 100 (docs/consistency.md)."""
-TILT = 1e-6
 CONFIDENCE = 0.99
+CORRECTED = ("sensor_fault", "fault_over")
+"""Events of faults that are taken out of the state."""
 USUAL = (
     *("aligned", "calibrated", "readmitted", "protection_restored", "verdict_consistent"),
     *("imu_sound", "imu_units_well"),
@@ -158,43 +163,46 @@ KINDS = {
 
 def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     """An hour of the kind that is the seed's turn: what was told, by event and source, how often
-    the filter was doubted, tests, seconds beyond five sigma by quantity, resident memory."""
+    in an hour may be, tests, seconds beyond five sigma by quantity, resident memory."""
     name = tuple(KINDS)[seed % len(KINDS)]
     kind = KINDS[name]
     config = kind.config()
     truth, recording = kind.recorded(config, seed, duration_s)
-    doubts: set[int] = set()
-
-    def watch(navigator: Navigator) -> None:
-        doubts.update(f.t_ns for f in navigator.timeline.diagnosis.findings)
-
-    course = navigate(config, recording, truth, watch)
+    course = navigate(config, recording, truth)
     since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
     told = Counter(
         named(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
     )
     after = [s for s in course.samples if s.t_s > since_s]
-    vouched = [s.ratios for s in after if s.mode == NAVIGATING]
+    stated = [s.ratios for s in after if s.ratios]
     return {
         "kind": name,
         "seed": seed,
         "hours": duration_s / 3600.0,
         "told": dict(told),
-        "doubts": len(doubts),
+        "stated_per_h": stated_per_h(config),
         "tests": tests_of(recording.received),
         "limits": kind.drive.second,
-        "not_navigating_s": len(after) - len(vouched),
-        "beyond_s": beyond_s(vouched),
-        "rms": np.sqrt(np.mean(np.square(vouched), axis=0)).round(3).tolist() if vouched else [],
+        "not_navigating_s": sum(s.mode != NAVIGATING for s in after),
+        "beyond_s": beyond_s(stated),
+        "rms": np.sqrt(np.mean(np.square(stated), axis=0)).round(3).tolist() if stated else [],
         "longest_lie_s": longest_lie_s(course.samples),
         "resident_mb": resident_mb(),
         "crash": course.crash,
     }
 
 
-def beyond_s(vouched: Sequence[Sequence[float]]) -> dict[str, int]:
+def stated_per_h(config: Config) -> dict[str, float]:
+    """False decisions an hour that odds and rates of the catalogue allow."""
+    kinds = kinds_of_config(config, Navigator(config).model)
+    of_sources = sum(kind.per_hour for kind in kinds if not kind.corrected)
+    of_unit = sum(kind.per_hour for kind in kinds if kind.corrected and kind.of != OVER)
+    return {"isolated": FALSE * of_sources, "corrected": FALSE * (of_unit + of_sources)}
+
+
+def beyond_s(stated: Sequence[Sequence[float]]) -> dict[str, int]:
     """Seconds beyond five sigma by quantity, of the ratios of each second."""
-    return {q: sum(not r[k] <= MOST_SIGMA for r in vouched) for k, q in enumerate(QUANTITIES)}
+    return {q: sum(not r[k] <= MOST_SIGMA for r in stated) for k, q in enumerate(QUANTITIES)}
 
 
 def resident_mb() -> float:
@@ -238,10 +246,15 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         judged: Counter[str] = sum(
             (Counter(row.get("judged", row["tests"])) for row in rows), Counter()
         )
-        n = sum(tests.values())
         alarms = {
-            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n, hours),
-            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n, hours),
+            **{
+                what: (
+                    _starting(told, *codes),
+                    sum(row["hours"] * row["stated_per_h"][what] for row in rows),
+                    hours,
+                )
+                for what, codes in (("isolated", ("isolated",)), ("corrected", CORRECTED))
+            },
             **{
                 f"verdict of {series}": (
                     sum(k for what, k in told.items() if _verdict_of(what) == series),
@@ -254,7 +267,7 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if rows[0]["limits"]:
             limit = Config().integrity.false_alarm_per_hour * hours
             alarms["protection"] = _starting(told, "protection"), limit, hours
-        known = ("isolated", "verdict_", "protection")
+        known = ("isolated", "verdict_", "protection", *CORRECTED)
         other = sum(k for what, k in told.items() if not what.startswith(known))
         alarms["anything else"] = other, 0.0, hours
         for what, (times, stated, heard) in alarms.items():
@@ -275,8 +288,8 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _starting(told: Counter[str], word: str) -> int:
-    return sum(k for what, k in told.items() if what.startswith(word))
+def _starting(told: Counter[str], *words: str) -> int:
+    return sum(k for what, k in told.items() if what.startswith(words))
 
 
 def _verdict_of(what: str) -> str:

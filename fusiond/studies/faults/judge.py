@@ -10,7 +10,8 @@ finite number, or sigma is not positive, the ratio is infinite.
 A sample stands for the time until the next. The verdict is the first of these that holds:
 
 `crashed`       an exception left the navigator
-`silent lie`    mode `navigating` and some ratio above 5, unbroken for over 2 s
+`lie`           some ratio above 5, unbroken for over 2 s, in any mode that publishes a solution:
+                `coasting` and `invalid` state a sigma, too
 `degraded and said so`   the fault was noticed
 `survived`      none of them
 
@@ -32,7 +33,7 @@ MOST_SIGMA = 5.0
 LIE_S = 2.0
 SETTLED_SAMPLES = 5
 NAVIGATING = "navigating"
-Verdict = Literal["crashed", "silent lie", "degraded and said so", "survived"]
+Verdict = Literal["crashed", "lie", "degraded and said so", "survived"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,8 @@ class Sample:
 
     @property
     def beyond(self) -> bool:
-        """True if the mode vouches for an error that sigma does not."""
-        return self.mode == NAVIGATING and any(not r <= MOST_SIGMA for r in self.ratios)
+        """True if an error is published that sigma does not cover, in whatever mode."""
+        return any(not r <= MOST_SIGMA for r in self.ratios)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +128,11 @@ def recovered_s(samples: Sequence[Sample], end_s: float) -> float | None:
 
 def judge(course: Course, reference: Course, begin_s: float, end_s: float) -> dict[str, Any]:
     """The figures of a row: a fault from `begin_s` to `end_s`. Largest errors are those in mode
-    `navigating` from the begin on."""
-    vouched = [s for s in course.samples if s.mode == NAVIGATING and s.t_s >= begin_s]
+    `navigating` from the begin on, the largest ratio that of any mode."""
+    since = [s for s in course.samples if s.t_s >= begin_s]
+    vouched = [s for s in since if s.mode == NAVIGATING]
     worst, of = max(
-        ((r, q) for s in vouched for r, q in zip(s.ratios, QUANTITIES, strict=True)),
+        ((r, q) for s in since if s.ratios for r, q in zip(s.ratios, QUANTITIES, strict=True)),
         default=(0.0, ""),
     )
     noticed = noticed_s(course, reference, begin_s)
@@ -139,7 +141,7 @@ def judge(course: Course, reference: Course, begin_s: float, end_s: float) -> di
     if course.crash is not None:
         verdict = "crashed"
     elif lie_s > LIE_S:
-        verdict = "silent lie"
+        verdict = "lie"
     else:
         verdict = "survived" if noticed is None else "degraded and said so"
     meanwhile = [s.mode for s in course.samples if begin_s <= s.t_s <= max(end_s, begin_s + 1.0)]
@@ -157,6 +159,7 @@ def judge(course: Course, reference: Course, begin_s: float, end_s: float) -> di
         "largest_ratio_of": of,
         "longest_lie_s": lie_s,
         "beyond_s": sum(s.beyond for s in course.samples),
+        "lie_modes": dict(Counter(s.mode for s in course.samples if s.beyond)),
         "recovered_s": recovered_s(course.samples, end_s),
         "crash": course.crash,
     }
