@@ -356,6 +356,7 @@ class ErrorStateFilter:
         if aid.screened:
             s = self._screen(aid, rows, cov, dx)
             codes = tuple(s.codes.tolist())
+            self._leave(aid, codes)
             return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
         y = np.zeros(z.shape[0])
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
@@ -381,6 +382,15 @@ class ErrorStateFilter:
             self.hypotheses.conclude()
             others.append(self.hypotheses.sensitivities)
         renew(renewal, self.model, self._covs, others)
+        if renewal.estimate is not None:
+            self.xi[self.model.slots_of_all(renewal.blocks)] = renewal.estimate
+
+    def _leave(self, aid: Linearised, codes: tuple[int, ...]) -> None:
+        """Clone what a screened aid, of whose rows `codes` tell, leaves to the next."""
+        if aid.screened:
+            renewal = aid.leaves(self._view, codes)
+            if renewal is not None:
+                self._renew(renewal)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -62,7 +62,9 @@ class KalmanEstimator(ErrorStateFilter):
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; `noise` (3,) times its variances."""
-        return self._fold_in(aid, noise)
+        outcome = self._fold_in(aid, noise)
+        self._leave(aid, outcome.rows)
+        return outcome
 
     def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         if aid.screened and aid.renewal is not None:

@@ -83,10 +83,16 @@ class SeparatedEstimator(KalmanEstimator):
         self._fold_into_subsets(aid, innovation)
         if not held:
             self._take_out()
+        self._leave_all(aid, outcome.rows)
         return outcome
 
     def _renew(self, renewal: Renewal) -> None:
-        """Nothing more: `update` does it before it linearises."""
+        """Nothing more: `update` does it before it linearises, and behind the subsets."""
+
+    def _leave_all(self, aid: Linearised, codes: tuple[int, ...]) -> None:
+        """Clone what an aid leaves to the next, in the subsets, too."""
+        if aid.screened and (renewal := aid.leaves(self.state, codes)) is not None:
+            super()._renew(renewal)
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is
@@ -95,6 +101,7 @@ class SeparatedEstimator(KalmanEstimator):
         innovation = self._linearise(aid)
         if not isinstance(innovation, NotApplicable):
             self._fold_into_subsets(aid, innovation)
+        self._leave_all(aid, outcome.rows)
         return outcome
 
     def adopt(self, mean: Array, spread: Array) -> None:

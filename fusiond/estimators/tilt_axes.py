@@ -143,11 +143,12 @@ class TiltAxesFilter(KalmanEstimator):
             return self._turn_in(aid)
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
-            return self._fold_in(aid, noise)
+            return super().update(aid, noise)
         before = self._estimate()
         outcome = self._fold_in(aid, noise)
         if outcome.name == "fused":
             self._carry_over(before)
+        self._leave(aid, outcome.rows)
         return outcome
 
     def _turn_in(self, aid: Linearised) -> Outcome:
