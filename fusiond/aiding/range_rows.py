@@ -146,14 +146,14 @@ def range_rows(
             range_row += 1
         if cloned and anchored(values, i, before):
             g = h[rate_row]
-            w0, w1, w2, there, grown, r[rate_row] = since_anchor(
-                values, i, before, ax, ay, az, scale
-            )
+            there, grown, r[rate_row] = since_anchor(values, i, before, ax, ay, az, scale)
             z[rate_row] = (distance - there) + xi[carrier[0]] - grown
             g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
             g[6], g[7], g[8] = -u0, -u1, -u2
             _hold(active, g)
-            g[anchor[0]], g[anchor[1]], g[anchor[2]] = -w0, -w1, -w2
+            g[anchor[0]] = sl * co * u0 + so * u1 + cl * co * u2
+            g[anchor[1]] = sl * so * u0 - co * u1 + cl * so * u2
+            g[anchor[2]] = sl * u2 - cl * u0
             g[carrier[0]] = -1.0
             rate_row += 1
         elif math.isfinite(values[RATE, i]) or values[SPAN, i] > 0.0:
