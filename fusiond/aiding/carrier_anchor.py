@@ -37,7 +37,8 @@ do not see. It shows in their residuals v of z, and is taken off,
 
     z <- z - b,   V <- V + (q thin)^2 dt,   K = V / (f V + s^2),   b <- b + K v,   V <- (1 - K f) V
 
-with f = 1 - h; so the noise of a row is that of its own epoch and V. q is what atmosphere, orbit
+with f = 1 - h, and of b again what least squares see is left out: the gains differ, and what they
+made of a displacement would be followed by the place, unseen, for ever. So the noise of a row is that of its own epoch and V. q is what atmosphere, orbit
 and clock do beside their models, as a walk, thin 1 at the zenith; B walks by it, too. Residuals d
 of what z has changed by since the epoch before show how noisy this receiver's phases are,
 
@@ -200,7 +201,7 @@ def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
     n = values.shape[1]
     rows, z, d = np.empty((n, 4)), np.empty(n), np.empty(n)
     told, inverse = np.zeros((4, 4)), np.empty((4, 4))
-    of_z, of_d = np.zeros(4), np.zeros(4)
+    of_z, of_d, of_b = np.zeros(4), np.zeros(4), np.zeros(4)
     scale = phase_scale(left)
     many = 0
     for k in range(n):
@@ -242,6 +243,14 @@ def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
         gain = state[_V] / (f * state[_V] + scale * s)
         state[_OFFSET] += gain * v
         state[_V] *= 1.0 - gain * f
+        for i in range(4):
+            of_b[i] += rows[k, i] / s * state[_OFFSET]
+    for k in range(n):
+        state = left[int(values[SLOT, k])]
+        if state[_ALIVE] > 0.0:
+            for i in range(4):
+                for j in range(4):
+                    state[_OFFSET] -= rows[k, i] * inverse[i, j] * of_b[j]
     left[0, _SUM] += squares
     left[0, _COUNT] += many - 4.0
     if left[0, _COUNT] > MOST_COUNT:
