@@ -188,8 +188,8 @@ class Aid:
         return None
 
     def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
-        """What it leaves to the next one, when the filter has looked at it and made `codes` of its
-        rows: a clone of `state`."""
+        """Clone of `state` for the next one, when the filter has looked at it and made `codes` of
+        its rows."""
         return None
 
     @property

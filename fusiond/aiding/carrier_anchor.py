@@ -38,9 +38,10 @@ do not see. It shows in their residuals v of z, and is taken off,
     z <- z - b,   V <- V + (q thin)^2 dt,   K = V / (f V + s^2),   b <- b + K v,   V <- (1 - K f) V
 
 with f = 1 - h, and of b again what least squares see is left out: the gains differ, and what they
-made of a displacement would be followed by the place, unseen, for ever. So the noise of a row is that of its own epoch and V. q is what atmosphere, orbit
-and clock do beside their models, as a walk, thin 1 at the zenith; B walks by it, too. Residuals d
-of what z has changed by since the epoch before show how noisy this receiver's phases are,
+made of a displacement would be followed by the place, unseen, for ever. So the noise of a row is
+that of its own epoch and V. q is what atmosphere, orbit and clock do beside their models, as a
+walk, thin 1 at the zenith; B walks by it, too. Residuals d of what z has changed by since the epoch
+before show how noisy this receiver's phases are,
 
     scale = (20 + sum d^2 / 2 s^2) / (20 + sum (n - 4)),       s^2 <- scale s^2
 
@@ -74,7 +75,7 @@ Array = NDArray[np.float64]
 # Rows of an epoch's values (n columns, one a satellite).
 BASIC, VALUES = 10, 19
 X, VX, RANGE, RATE, RANGE_VARIANCE, RATE_VARIANCE, SHARED = 0, 3, 6, 7, 8, 9, 10
-SPAN, CARRIER, CARRIER_VARIANCE, WANDER, SLOT, ISSUE = 13, 14, 15, 16, 17, 18
+SPAN, CARRIER, CARRIER_VARIANCE, WALK, SLOT, ISSUE = 13, 14, 15, 16, 17, 18
 
 SLOTS, COLUMNS = 3 * 64, 9
 """Of what an epoch leaves: a row a satellite, by its slot."""
@@ -131,7 +132,7 @@ def since_anchor(
     x, y, z = row[_X] - px, row[_X + 1] - py, row[_X + 2] - pz
     distance = math.sqrt(x * x + y * y + z * z)
     grown = values[CARRIER, k] - row[_CARRIER] + row[_OFFSET]
-    walked = values[WANDER, k] * values[WANDER, k] * values[SPAN, k]
+    walked = values[WALK, k] * values[WALK, k] * values[SPAN, k]
     variance = scale * values[CARRIER_VARIANCE, k] + row[_V] + walked
     return distance, grown, variance
 
@@ -158,8 +159,10 @@ def _inverse(a: Array, out: Array, more: float) -> None:
 
 @compiled("void(f8[::1], f8, f8, f8, f8[::1], f8[:, ::1])", allocates=True)
 def antenna(nav: Array, l0: float, l1: float, l2: float, place: Array, of_error: Array) -> None:
-    """Write the `place` (3,) of an antenna with the lever arm l (m, body axes), ECEF, and what of
-    the navigation errors (3, 9) it is off by, true minus computed."""
+    """Write the place of an antenna (3,), ECEF, and its error's part of the navigation errors.
+
+    That (3, 9) is true minus computed; l the lever arm (m, body axes).
+    """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
     a0 = c00 * l0 + c01 * l1 + c02 * l2
     a1 = c10 * l0 + c11 * l1 + c12 * l2
@@ -194,65 +197,88 @@ def _sight(values: Array, k: int, place: Array, row: Array) -> float:
     return distance
 
 
+@compiled(
+    "i8(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])",
+    allocates=True,
+)
+def _fit(
+    values: Array,
+    place: Array,
+    anchor: Array,
+    left: Array,
+    sights: Array,
+    z: Array,
+    inverse: Array,
+) -> int:
+    """Write H (n, 4), residuals z (2, n) of carriers and of their changes, and the inverse of
+    H^T W H + I; of how many satellites. `left` has what the next epoch's changes are from."""
+    information, of_z, solved = np.zeros((4, 4)), np.zeros((2, 4)), np.empty(4)
+    count = 0
+    for k in range(values.shape[1]):
+        state = left[int(values[SLOT, k])]
+        if state[_ALIVE] == 0.0:
+            continue
+        count += 1
+        distance = _sight(values, k, place, sights[k])
+        x, y, w = state[_X] - anchor[0], state[_X + 1] - anchor[1], state[_X + 2] - anchor[2]
+        there = math.sqrt(x * x + y * y + w * w)
+        whole = distance - there - (values[CARRIER, k] - state[_CARRIER])
+        z[0, k], z[1, k] = whole - state[_OFFSET], whole - state[_LAST]
+        state[_LAST] = whole
+        state[_V] += values[WALK, k] * values[WALK, k] * values[SPAN, k]
+        for i in range(4):
+            weighted = sights[k, i] / values[CARRIER_VARIANCE, k]
+            of_z[0, i] += weighted * z[0, k]
+            of_z[1, i] += weighted * z[1, k]
+            for j in range(4):
+                information[i, j] += weighted * sights[k, j]
+    _inverse(information, inverse, 1.0)
+    for kind in range(2):
+        for i in range(4):
+            solved[i] = 0.0
+            for j in range(4):
+                solved[i] += inverse[i, j] * of_z[kind, j]
+        for k in range(values.shape[1]):
+            if left[int(values[SLOT, k]), _ALIVE] > 0.0:
+                for i in range(4):
+                    z[kind, k] -= sights[k, i] * solved[i]
+    return count
+
+
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", allocates=True)
 def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
     """Take what carriers' residuals tell at an epoch into the rows of `left` of those that are
     anchored: constants, and how noisy phases are; from the antenna's `place` and at the anchor."""
     n = values.shape[1]
-    rows, z, d = np.empty((n, 4)), np.empty(n), np.empty(n)
-    told, inverse = np.zeros((4, 4)), np.empty((4, 4))
-    of_z, of_d, of_b = np.zeros(4), np.zeros(4), np.zeros(4)
-    scale = phase_scale(left)
-    many = 0
-    for k in range(n):
-        state = left[int(values[SLOT, k])]
-        if state[_ALIVE] == 0.0:
-            continue
-        many += 1
-        distance = _sight(values, k, place, rows[k])
-        x, y, w = state[_X] - anchor[0], state[_X + 1] - anchor[1], state[_X + 2] - anchor[2]
-        grown = values[CARRIER, k] - state[_CARRIER]
-        z[k] = distance - math.sqrt(x * x + y * y + w * w) - grown
-        d[k] = z[k] - state[_LAST]
-        state[_LAST] = z[k]
-        z[k] -= state[_OFFSET]
-        state[_V] += values[WANDER, k] * values[WANDER, k] * values[SPAN, k]
-        for i in range(4):
-            weighted = rows[k, i] / values[CARRIER_VARIANCE, k]
-            of_z[i] += weighted * z[k]
-            of_d[i] += weighted * d[k]
-            for j in range(4):
-                told[i, j] += weighted * rows[k, j]
-    if many <= 4:
+    sights, z, inverse = np.empty((n, 4)), np.empty((2, n)), np.empty((4, 4))
+    of_b = np.zeros(4)
+    scale, squares = phase_scale(left), 0.0
+    count = _fit(values, place, anchor, left, sights, z, inverse)
+    if count <= ENOUGH:
         return
-    _inverse(told, inverse, 1.0)
-    squares = 0.0
     for k in range(n):
         state = left[int(values[SLOT, k])]
         if state[_ALIVE] == 0.0:
             continue
-        v, change, leverage = z[k], d[k], 0.0
+        s, leverage = values[CARRIER_VARIANCE, k], 0.0
         for i in range(4):
             for j in range(4):
-                v -= rows[k, i] * inverse[i, j] * of_z[j]
-                change -= rows[k, i] * inverse[i, j] * of_d[j]
-                leverage += rows[k, i] * inverse[i, j] * rows[k, j]
-        s = values[CARRIER_VARIANCE, k]
+                leverage += sights[k, i] * inverse[i, j] * sights[k, j]
         f = max(1.0 - leverage / s, 0.0)
-        squares += min(change * change / (2.0 * s), CLIPPED * scale)
+        squares += min(z[1, k] * z[1, k] / (2.0 * s), CLIPPED * scale)
         gain = state[_V] / (f * state[_V] + scale * s)
-        state[_OFFSET] += gain * v
+        state[_OFFSET] += gain * z[0, k]
         state[_V] *= 1.0 - gain * f
         for i in range(4):
-            of_b[i] += rows[k, i] / s * state[_OFFSET]
+            of_b[i] += sights[k, i] / s * state[_OFFSET]
     for k in range(n):
         state = left[int(values[SLOT, k])]
         if state[_ALIVE] > 0.0:
             for i in range(4):
                 for j in range(4):
-                    state[_OFFSET] -= rows[k, i] * inverse[i, j] * of_b[j]
+                    state[_OFFSET] -= sights[k, i] * inverse[i, j] * of_b[j]
     left[0, _SUM] += squares
-    left[0, _COUNT] += many - 4.0
+    left[0, _COUNT] += count - 4.0
     if left[0, _COUNT] > MOST_COUNT:
         left[0, _SUM] *= 0.5
         left[0, _COUNT] *= 0.5
@@ -317,17 +343,19 @@ def go_on(
 
 @compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])", allocates=True)
 def phase_noise(values: Array, place: Array, left: Array, noise: Array) -> None:
-    """Write the covariance (4, 4) of what the phases of an anchor epoch add to B and C, and to
-    `left` the variance of each satellite's constant."""
-    told, inverse, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
+    """Write the covariance (4, 4) of what an anchor's phases add to B and C.
+
+    To `left` goes the variance of each satellite's constant.
+    """
+    information, inverse, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
     scale = phase_scale(left)
     for k in range(values.shape[1]):
         if math.isfinite(values[CARRIER, k]):
             _sight(values, k, place, row)
             for i in range(4):
                 for j in range(4):
-                    told[i, j] += row[i] * row[j] / (scale * values[CARRIER_VARIANCE, k])
-    _inverse(told, inverse, 1.0)
+                    information[i, j] += row[i] * row[j] / (scale * values[CARRIER_VARIANCE, k])
+    _inverse(information, inverse, 1.0)
     for k in range(values.shape[1]):
         if math.isfinite(values[CARRIER, k]):
             _sight(values, k, place, row)
@@ -341,6 +369,6 @@ def phase_noise(values: Array, place: Array, left: Array, noise: Array) -> None:
             total = 0.0
             for p in range(4):
                 for q in range(4):
-                    total += inverse[i, p] * told[p, q] * inverse[j, q]
+                    total += inverse[i, p] * information[p, q] * inverse[j, q]
             noise[i, j] = noise[j, i] = total
         noise[i, i] += FLOOR_M * FLOOR_M

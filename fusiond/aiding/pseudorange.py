@@ -99,7 +99,7 @@ _BLOCKS = (
     *((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS, RANGE_SHARED),
     *((CARRIER_ANCHOR,), (CARRIER_CLOCK,)),
 )
-_ANEW = np.zeros((4, 4))
+_NOTHING_KEPT = np.zeros((4, 4))
 NO_CLOCK = -1
 """In place of a clock offset: the range knows no receiver clock."""
 
@@ -320,7 +320,7 @@ class PseudorangeAid(Aid):
 
     def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
         slots = state.model.slots_of_all(_CLONED)
-        if len(slots) != len(_ANEW):
+        if len(slots) != len(_NOTHING_KEPT):
             return None
         anchor, place = state.xi[slots[:3]], np.empty(4)
         cloned = bool((anchor**2).sum() > ON_EARTH_M**2)
@@ -333,4 +333,4 @@ class PseudorangeAid(Aid):
             return None
         noise = np.empty((4, 4))
         phase_noise(self.values, place, self.left, noise)
-        return Renewal(_CLONED, _ANEW, noise, of_navigation, place)
+        return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)

@@ -82,7 +82,7 @@ EARTH_RATE_RAD_S = 7.2921151467e-5
 LOWEST_RADIUS_M = 6.3e6
 """A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
 
-WANDER_M_SQRT_S = 0.002
+WALK_M_SQRT_S = 0.002
 """Walk of a carrier at the zenith beside the models: satellites' clocks, 1e-12 to 3e-12 over 10 s,
 are 3 to 9 mm, ionosphere and troposphere 1 mm/s at most."""
 BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
@@ -104,7 +104,7 @@ ROW_COLUMNS = 30
 AID_ROWS = 19
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
-    COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER, CARRIER_VARIANCE, WANDER,
+    COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER, CARRIER_VARIANCE, WALK,
     SLOT, ISSUE,
     LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, TROPOSPHERE, IONOSPHERE, TOTAL_VARIANCE,
     LASTING,
@@ -279,7 +279,7 @@ def range_rows(
         out[CARRIER_SPAN, k] = carriers[k, SPAN]
         out[CARRIER, k] = carriers[k, LENGTH] + SPEED_OF_LIGHT_M_S * states[k, 6] - tropo + iono
         out[CARRIER_VARIANCE, k] = carriers[k, LENGTH_VARIANCE] * thin * thin
-        out[WANDER, k] = WANDER_M_SQRT_S * thin
+        out[WALK, k] = WALK_M_SQRT_S * thin
         code = noise[CODE_ZENITH] * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno

@@ -22,7 +22,7 @@ CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
 """Place of an antenna (ECEF, m) at the epoch from which carriers are counted, and how much their
 clock has gone since (m): fusiond.aiding.carrier_anchor."""
 CARRIER_WALK = 0.002**2
-"""What all carriers do beside their models (m^2/s), as fusiond.gnss.range_kernel has of each; a sky
+"""Walk of all carriers beside their models (m^2/s), as fusiond.gnss.range_kernel has of each; a sky
 makes about as much a displacement of it as a satellite has at the zenith."""
 SAR_MISALIGNMENT = "sar_misalignment"
 # One sigma (rad) of how a SAR antenna is mounted where nothing else says it: 0.1 deg, about what

@@ -75,7 +75,7 @@ def aid(
     nothing, one = np.full(n, np.nan), np.ones(n)
     values = epoch_values(satellites, np.zeros_like(satellites), nothing, 0.0 * one, one, one)
     values[an.SPAN], values[an.CARRIER], values[an.CARRIER_VARIANCE] = span, length, SIGMA_M**2
-    values[an.WANDER], values[an.SLOT] = 0.002, np.arange(1.0, n + 1.0)
+    values[an.WALK], values[an.SLOT] = 0.002, np.arange(1.0, n + 1.0)
     names = tuple(f"G{k + 1:02d}" for k in range(n))
     zeros = np.zeros(n, np.int64)
     return PseudorangeAid(
@@ -244,7 +244,7 @@ def test_noise_and_constants_are_learned(sigma_m: float) -> None:
     squares, xi, before = [], np.zeros(of.size), nothing_left()
     for epoch in range(400):
         now = aid(0.1 * epoch, satellites, noisy(), before, 0.1)
-        now.values[an.WANDER] = 0.0
+        now.values[an.WALK] = 0.0
         if epoch % 40 > 1:
             z, _, r = rows(of, nav, xi, now)
             left_out = sights(nav, satellites)
