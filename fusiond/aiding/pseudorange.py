@@ -77,6 +77,7 @@ from fusiond.aiding.carrier_anchor import (
     VALUES,
     VX,
     X,
+    anchor_s,
     anchored,
     antenna,
     go_on,
@@ -331,6 +332,6 @@ class PseudorangeAid(Aid):
         of = self._ranges, t_s, cloned, place, anchor, self.before, self.left
         if not go_on(self.values, of_rows, *of):
             return None
-        noise = np.empty((4, 4))
-        phase_noise(self.values, place, self.left, noise)
+        noise, last_s = np.empty((4, 4)), anchor_s(self.before)
+        phase_noise(self.values, place, max(t_s - last_s, 0.0), self.left, noise)
         return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
