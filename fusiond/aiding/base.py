@@ -32,7 +32,6 @@ Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
 """Choice of when the error estimate is fed back into the navigation state: right after the
 measurement; not before a measurement says so; or now, all that was held."""
-NOTHING_LEFT = np.zeros(10)
 POSITION, VELOCITY, NO_SLIP, SPEED = range(1, 5)
 """Kinds of packed rows, of which positions and velocities always apply."""
 LENT_ROWS = 3
@@ -61,7 +60,7 @@ class Innovation(NamedTuple):
 
 class State(NamedTuple):
     """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
-    (35,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
+    (28,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
     point, the truth). `lent` is what a filter lends measurements to write their innovations to, by
     the number of rows: it holds until the next innovation is asked for."""
 
@@ -98,11 +97,14 @@ class State(NamedTuple):
 class Renewal(NamedTuple):
     """Errors that successive measurements share become in part others at an instant: those of the
     `blocks`, t in units of their initial sigmas, are R t + w from then on, R `kept` and cov(w)
-    `new` (k, k)."""
+    `new` (k, k). A clone has a part of the navigation errors, too: `of_navigation` (k, 9) times
+    them, in the states' units, and its `estimate` (k,) is given."""
 
     blocks: tuple[str, ...]
     kept: Array
     new: Array
+    of_navigation: Array | None = None
+    estimate: Array | None = None
 
 
 class Packed(NamedTuple):
@@ -178,18 +180,18 @@ class AidingMeasurement:
 
     @property
     def remembers(self) -> bool:
-        """True if its innovation needs what an earlier one left, which another state than the
-        filter's own has not."""
+        """True if its innovation goes by an instant of which the state keeps a clone: the clone and
+        the position are known by their difference, many digits better than each."""
         return False
-
-    @property
-    def remembered(self) -> Array:
-        """(10,): what an earlier one left, where it `remembers` (fusiond.aiding.range_rows)."""
-        return NOTHING_LEFT
 
     @property
     def renewal(self) -> Renewal | None:
         """Change of the errors that successive ones share, at its instant."""
+        return None
+
+    def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
+        """Clone of `state` for the next one, when the filter has looked at it and made `codes` of
+        its rows."""
         return None
 
     @property
@@ -271,9 +273,8 @@ class Linearised(Protocol):
     @property
     def remembers(self) -> bool: ...
     @property
-    def remembered(self) -> Array: ...
-    @property
     def renewal(self) -> Renewal | None: ...
+    def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
 

@@ -25,26 +25,9 @@ each range, S:
 
     rho^ += S n^,    z_rho -= S dn;    without these blocks S S^T goes to the noise, by row
 
-The carrier of a satellite, from epoch to epoch, gives its mean rate over the last dt, which takes
-the Doppler's place. With q = s' - v~, v~ the antenna's mean velocity over dt, and m what the clock
-has moved by more than its drift (phases walk), the same for all satellites
-
-    rate^ = u . q - (dt / 2) (u . s'' + (|q|^2 - (u . q)^2) / rho) + d^ + m,
-    z = -u . dv + (y x u) . phi + (dt / 2) (C^T u) . f + .. - dd - m + v
-    v~ = v - w + (p - p') / dt + (a - a') / dt,     y = v~ - v + (0, 0, g dt / 2)
-
-w is how much the IMU alone has changed the velocity since the start, p its integral, primes those
-at the epoch before: so feedback in between, which moves v, leaves the difference alone. y is what
-of v~ - v turns with the attitude, f the force error of the accelerometers, even over dt.
-
-Of m the Dopplers of the same satellites know: each z less that of its Doppler is -m, with the
-Doppler's noise, and says nothing else that the carriers do not say better. With their weights w_k
-
-    m^ = -sum w_k (z_k - z_Doppler,k) / W,     W = sum w_k + 1 / (1 m/s)^2,     z += m^
-
-what is left of m has the variance 1 / W in all carriers of the epoch (block `CARRIER_CLOCK`, of
-unit variance), so that the drift is known as well as Dopplers have it, whatever the number of
-carriers. H less its weighted mean beyond the Dopplers' goes with it.
+The carrier of a satellite that has been followed since an anchor epoch takes the Doppler's place:
+it tells the way since then (fusiond.aiding.carrier_anchor), of which a clone of the antenna's place
+at the anchor and the carriers' clock are states. At the anchor the Dopplers serve.
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
@@ -79,27 +62,31 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.heading_history import HeadingHistory
-from fusiond.aiding.range_rows import (
+from fusiond.aiding.carrier_anchor import (
     BASIC,
-    LEFT,
+    CARRIER,
+    COLUMNS,
+    ON_EARTH_M,
     RANGE,
     RANGE_VARIANCE,
     RATE,
     RATE_VARIANCE,
     SHARED,
-    SOUND,
+    SLOTS,
     SPAN,
     VALUES,
     VX,
-    WRONG,
     X,
-    by_clock,
-    measured,
-    range_rows,
+    anchor_s,
+    anchored,
+    antenna,
+    go_on,
+    phase_noise,
 )
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
-from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
+from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, CLOCK_DRIFT, CLOCK_OFFSET
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -108,38 +95,46 @@ RANGE_BIAS = ("range_bias", "range_bias_down")
 """Blocks of the displacement: north and east, down."""
 RANGE_SHARED = ("range_ionosphere", "range_troposphere", "range_beidou_2")
 """Blocks, of one state each, of what the models leave in all ranges."""
-CARRIER_CLOCK = "carrier_clock"
-_BLOCKS = ((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS, RANGE_SHARED, (CARRIER_CLOCK,))
+_CLONED = (CARRIER_ANCHOR, CARRIER_CLOCK)
+_BLOCKS = (
+    *((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS, RANGE_SHARED),
+    *((CARRIER_ANCHOR,), (CARRIER_CLOCK,)),
+)
+_NOTHING_KEPT = np.zeros((4, 4))
 NO_CLOCK = -1
 """In place of a clock offset: the range knows no receiver clock."""
 
 
 def epoch_values(position: ArrayLike, velocity: ArrayLike, *rows: ArrayLike) -> Array:
-    """The values of an epoch of n satellites as the measurement takes them (17, n): positions,
+    """The values of an epoch of n satellites as the measurement takes them (19, n): positions,
     velocities (n, 3), and as `rows` (n,) ranges, rates, and their variances; no shared errors, no
     carriers. ValueError for other shapes."""
     parts = [np.asarray(part, float).T for part in (position, velocity, *rows)]
     if any(part.shape[-1:] != parts[-1].shape for part in parts):
         raise ValueError(f"shapes differ: {[part.T.shape for part in parts]}")
     basic = np.vstack(parts)
-    return np.vstack([basic, np.zeros((VALUES - BASIC, basic.shape[1]))])
+    values = np.vstack([basic, np.zeros((VALUES - BASIC, basic.shape[1]))])
+    values[CARRIER] = np.nan
+    return values
 
 
 def nothing_left() -> Array:
-    """(10,): no epoch before."""
-    return np.zeros(LEFT)
+    """(SLOTS, 9): no epoch before."""
+    return np.zeros((SLOTS, COLUMNS))
 
 
 @immutable(eq=False)
 class PseudorangeMeasurement(AidingMeasurement):
     """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
 
-    `values` (17, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
+    `values` (19, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
     turned to the axes at reception, m, m/s), `ranges` (m), `rates` (m/s; positive: going away) and
     their variances (m^2, (m/s)^2), what one sigma of each of three shared errors adds (m), and of
-    the carrier: seconds since the epoch before (0: none), mean rate, its variance, and the
-    satellite's acceleration away (m/s^2); NaN is not measured. `before` and `left` (10,) are what
-    the last epoch left and this one leaves, whatever has evaluated them last. `clock` (n,): which
+    the carrier: seconds for which it has been followed since the epoch before (0: not), its range
+    but for a constant (m), its variance (m^2), how it walks beside the models (m/sqrt(s)), the
+    satellite's slot and its ephemeris' number; NaN is not measured. `before` and `left`
+    (SLOTS, 9) are what the last epoch left and this one leaves, whatever filter has been there
+    last (fusiond.aiding.carrier_anchor). `clock` (n,): which
     of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
     satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
     `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
@@ -182,11 +177,12 @@ class PseudorangeMeasurement(AidingMeasurement):
 
     @property
     def remembers(self) -> bool:
-        return self.before.item(0) > 0.0 and bool((self.values[SPAN] > 0.0).any())
+        return bool(self._anchored().any())
 
-    @property
-    def remembered(self) -> Array:
-        return self.before
+    def _anchored(self) -> NDArray[np.bool_]:
+        """(n,): carriers that have been followed since the anchor."""
+        n = len(self.satellites)
+        return np.fromiter((anchored(self.values, k, self.before) for k in range(n)), bool, n)
 
     @property
     def renewal(self) -> Renewal | None:
@@ -230,16 +226,18 @@ class PseudorangeMeasurement(AidingMeasurement):
 
     @property
     def labels(self) -> list[tuple[str, str]]:
-        """Satellite and `range`, `rate` or `carrier` of each row."""
-        spans = (self.values[SPAN] > 0.0).tolist()
+        """Satellite and `range`, `rate` or `carrier` of each row, in a filter with the clone."""
+        spans, by_carrier = (self.values[SPAN] > 0.0).tolist(), self._anchored().tolist()
         found = [
             (name, "range")
             for name, value in zip(self.satellites, self.ranges.tolist(), strict=True)
             if math.isfinite(value)
         ]
         return found + [
-            (name, "carrier" if span else "rate")
-            for name, value, span in zip(self.satellites, self.rates.tolist(), spans, strict=True)
+            (name, "carrier" if carrier else "rate")
+            for name, value, span, carrier in zip(
+                self.satellites, self.rates.tolist(), spans, by_carrier, strict=True
+            )
             if span or math.isfinite(value)
         ]
 
@@ -262,12 +260,11 @@ class PseudorangeMeasurement(AidingMeasurement):
         )
 
     def without_attitude(self, way: HeadingHistory) -> PseudorangeMeasurement:
-        """Rates are the Dopplers': what a carrier says is the mean since the epoch before, and
-        nothing tells how the velocity has changed meanwhile."""
+        """Rates are the Dopplers': no place is cloned where no attitude is known."""
         values, arm = self.values.copy(), level_arm_m(self.lever)
         values[RANGE_VARIANCE] += arm**2
         values[RATE_VARIANCE] += (CORNER_RAD_S * arm) ** 2
-        values[SPAN] = 0.0
+        values[SPAN], values[CARRIER] = 0.0, np.nan
         lever, nothing = (0.0, 0.0, self.lever[2]), nothing_left()
         return replace(self, values=values, lever=lever, before=nothing, left=nothing)
 
@@ -289,7 +286,7 @@ class PseudorangeMeasurement(AidingMeasurement):
         if not self._r.size:
             return NotApplicable("no_satellites")
         clocks = self._clocks
-        offsets, drifts, displacement, shared, carrier = model.slots_of_each(*_BLOCKS)
+        offsets, drifts, displacement, shared, anchor, carrier = model.slots_of_each(*_BLOCKS)
         if clocks > offsets.size or (clocks and not drifts.size):
             return NotApplicable("no_clock_state")
         rows = self._r.size
@@ -306,12 +303,12 @@ class PseudorangeMeasurement(AidingMeasurement):
             drifts,
             displacement,
             shared,
+            anchor,
             carrier,
             self.shape,
             *self.lever,
             self._ranges,
             self.before,
-            self.left,
             r,
             z,
             h,
@@ -321,3 +318,20 @@ class PseudorangeMeasurement(AidingMeasurement):
             place = np.einsum("ij,jk,ik->i", sight, state.covariance[6:9, 6:9], sight)
             self.seen.append((z[: self._ranges].copy(), place))
         return Innovation(z, h, r)
+
+    def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
+        slots = state.model.slots_of_all(_CLONED)
+        if len(slots) != len(_NOTHING_KEPT):
+            return None
+        anchor, place = state.xi[slots[:3]], np.empty(4)
+        cloned = bool((anchor**2).sum() > ON_EARTH_M**2)
+        of_navigation = np.zeros((4, 9))
+        antenna(state.nav, *self.lever, place[:3], of_navigation[:3])
+        place[3] = 0.0
+        of_rows, t_s = np.array(codes, np.int64), self.t_ns * 1e-9
+        of = self._ranges, t_s, cloned, place, anchor, self.before, self.left
+        if not go_on(self.values, of_rows, *of):
+            return None
+        noise, last_s = np.empty((4, 4)), anchor_s(self.before)
+        phase_noise(self.values, place, max(t_s - last_s, 0.0), self.left, noise)
+        return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)

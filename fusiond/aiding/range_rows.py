@@ -7,39 +7,32 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.navigation.compiled import compiled
-from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M, gravity
-from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR
-from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import (
-    HEIGHT,
-    LAT,
-    LON,
-    Q0,
-    STEP_CHANGED_N,
-    STEP_MOVED_N,
-    STEP_RATE_B,
-    STEP_SECONDS,
-    VN,
+from fusiond.aiding.carrier_anchor import (
+    CARRIER_VARIANCE,
+    ON_EARTH_M,
+    RANGE,
+    RANGE_VARIANCE,
+    RATE,
+    RATE_VARIANCE,
+    SHARED,
+    SPAN,
+    VX,
+    X,
+    anchored,
+    phase_scale,
+    since_anchor,
 )
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
+from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, STEP_RATE_B, VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 UNUSED_VARIANCE = 1e6
-"""(m/s)^2, of a rate that only a carrier gives and nothing is known of the epoch before."""
-CARRIER_CLOCK_M_S = 1.0
-"""One sigma of what a clock's phase adds to the mean drift between two epochs, where no Doppler
-tells: 0.1 m by the root of a second are 0.45 m/s over 50 ms."""
-SAME_SPAN_S = 1e-3
-"""The IMU's time since the epoch before is that between the epochs, or it is of another start. A
-microsecond's rounding is less, an IMU's sample more."""
-# Rows of an epoch's values.
-BASIC, VALUES = 10, 17
-X, VX, RANGE, RATE, RANGE_VARIANCE, RATE_VARIANCE, SHARED = 0, 3, 6, 7, 8, 9, 10
-SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL = 13, 14, 15, 16
-# What an epoch leaves to the next: seconds, changed velocity, its integral, the lever arm (NED).
-LEFT = 10
+"""(m/s)^2, of a rate that nothing has measured, of a carrier that has no anchor."""
 
 
 @compiled("void(b1[::1], f8[::1])", forceinline=True)
@@ -52,8 +45,8 @@ def _hold(active: NDArray[np.bool_], g: Array) -> None:
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
-    "i8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8, i8, f8[::1], f8[::1], f8[::1], f8[::1],"
-    "f8[:, ::1])"
+    "i8[::1], i8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8, i8, f8[:, ::1], f8[::1],"
+    "f8[::1], f8[:, ::1])"
 )
 def range_rows(
     nav: Array,
@@ -67,6 +60,7 @@ def range_rows(
     drifts: Indices,
     displacement: Indices,
     shared: Indices,
+    anchor: Indices,
     carrier: Indices,
     shape: Array,
     l0: float,
@@ -74,18 +68,17 @@ def range_rows(
     l2: float,
     rate_row: int,
     before: Array,
-    left: Array,
     r: Array,
     z: Array,
     h: Array,
 ) -> None:
-    """Write z (m,), r (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates,
-    of which `rate_row` is the first.
+    """Write z (m,), r (m,) and H (m, n), zero before: rows of the finite ranges, then of rates and
+    carriers, of which `rate_row` is the first.
 
-    Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors and of
-    the carriers' clock; none where the model has no such state. `before` and `left` (10,): what the
-    last epoch left and this one leaves; of 0 s where there is nothing. `shape` (3, 3) is what a
-    unit of each of the displacement's states displaces.
+    Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors, of
+    the carriers' anchor and of their clock; none where the model has no such state. `before`
+    (SLOTS, 9): what the last epoch left to this one. `shape` (3, 3) is what a unit of each
+    of the displacement's states displaces.
     """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
     a0 = c00 * l0 + c01 * l1 + c02 * l2
@@ -97,12 +90,6 @@ def range_rows(
     b1 = c10 * t0 + c11 * t1 + c12 * t2
     b2 = c20 * t0 + c21 * t1 + c22 * t2
     v0, v1, v2 = nav[VN] + b0, nav[VN + 1] + b1, nav[VN + 2] + b2
-    left[0] = step[STEP_SECONDS]
-    for j in range(3):
-        left[1 + j], left[4 + j] = step[STEP_CHANGED_N + j], step[STEP_MOVED_N + j]
-    left[7], left[8], left[9] = a0, a1, a2
-    weight = gravity(nav[LAT], nav[HEIGHT])
-    gone = left[0] - before[0] if before[0] > 0.0 else 0.0
     sl, cl = math.sin(nav[LAT]), math.cos(nav[LAT])
     so, co = math.sin(nav[LON]), math.cos(nav[LON])
     root = math.sqrt(1.0 - ECCENTRICITY_SQUARED * sl * sl)
@@ -117,10 +104,12 @@ def range_rows(
         if 0 <= column_of[slot] - RATE_ERROR < 3:
             begin, end = slot, max(end, slot + 1)
 
-    # Of the carriers' clock: its weight, and weighted what carriers say more than their Dopplers.
-    weight_m, more_z = 1.0 / (CARRIER_CLOCK_M_S * CARRIER_CLOCK_M_S), 0.0
-    t0 = t1 = t2 = f0 = f1 = f2 = 0.0
-    first_rate = rate_row
+    ax, ay, az = 0.0, 0.0, 0.0
+    cloned = anchor.shape[0] == 3 and carrier.shape[0] == 1
+    if cloned:
+        ax, ay, az = xi[anchor[0]], xi[anchor[1]], xi[anchor[2]]
+        cloned = ax * ax + ay * ay + az * az > ON_EARTH_M * ON_EARTH_M
+    scale = phase_scale(before)
 
     range_row = 0
     for i in range(clock.shape[0]):
@@ -155,41 +144,35 @@ def range_rows(
                     r[range_row] += one * one
             z[range_row] = innovation
             range_row += 1
-        span = values[SPAN, i]
-        if math.isfinite(values[RATE, i]) or span > 0.0:
+        if cloned and anchored(values, i, before):
+            g = h[rate_row]
+            there, grown, r[rate_row] = since_anchor(values, i, before, ax, ay, az, scale)
+            z[rate_row] = (distance - there) + xi[carrier[0]] - grown
+            g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
+            g[6], g[7], g[8] = -u0, -u1, -u2
+            _hold(active, g)
+            g[anchor[0]] = sl * co * u0 + so * u1 + cl * co * u2
+            g[anchor[1]] = sl * so * u0 - co * u1 + cl * so * u2
+            g[anchor[2]] = sl * u2 - cl * u0
+            g[carrier[0]] = -1.0
+            rate_row += 1
+        elif math.isfinite(values[RATE, i]) or values[SPAN, i] > 0.0:
             g = h[rate_row]
             e0, e1, e2 = values[VX, i], values[VX + 1, i], values[VX + 2, i]
             e0n = -sl * co * e0 - sl * so * e1 + cl * e2
             e1n = -so * e0 + co * e1
             e2n = -cl * co * e0 - cl * so * e1 - sl * e2
             q0, q1, q2 = e0n - v0, e1n - v1, e2n - v2
-            d0, d1, d2 = b0, b1, b2
-            known = carrier.shape[0] == 1 and span > 0.0 and abs(gone - span) < SAME_SPAN_S
-            if known:
-                k0 = left[1] - (left[4] - before[4]) / span + b0 - (a0 - before[7]) / span
-                k1 = left[2] - (left[5] - before[5]) / span + b1 - (a1 - before[8]) / span
-                k2 = left[3] - (left[6] - before[6]) / span + b2 - (a2 - before[9]) / span
-                q0, q1, q2 = q0 + k0, q1 + k1, q2 + k2
-                # What turns with the attitude of v~: b in it, less what the force has changed.
-                d0, d1, d2 = b0 - k0, b1 - k1, b2 - k2 + 0.5 * weight * span
             along = u0 * q0 + u1 * q1 + u2 * q2
-            if known:
-                bend = values[PULL, i] + (q0 * q0 + q1 * q1 + q2 * q2 - along * along) / distance
-                innovation = along - 0.5 * span * bend - values[CARRIER_RATE, i]
-                r[rate_row] = values[CARRIER_VARIANCE, i]
-                g[carrier[0]] = -1.0
-            elif math.isfinite(values[RATE, i]):
-                innovation = along - values[RATE, i]
-                r[rate_row] = values[RATE_VARIANCE, i]
-            else:
-                innovation = 0.0
-                r[rate_row] = UNUSED_VARIANCE
+            innovation, r[rate_row] = 0.0, UNUSED_VARIANCE
+            if math.isfinite(values[RATE, i]):
+                innovation, r[rate_row] = along - values[RATE, i], values[RATE_VARIANCE, i]
             k0 = (along * u0 - q0) / distance
             k1 = (along * u1 - q1) / distance
             k2 = (along * u2 - q2) / distance
-            g[0] = d1 * u2 - d2 * u1 + k1 * a2 - k2 * a1
-            g[1] = d2 * u0 - d0 * u2 + k2 * a0 - k0 * a2
-            g[2] = d0 * u1 - d1 * u0 + k0 * a1 - k1 * a0
+            g[0] = b1 * u2 - b2 * u1 + k1 * a2 - k2 * a1
+            g[1] = b2 * u0 - b0 * u2 + k2 * a0 - k0 * a2
+            g[2] = b0 * u1 - b1 * u0 + k0 * a1 - k1 * a0
             g[3], g[4], g[5] = -u0, -u1, -u2
             # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
             p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
@@ -208,42 +191,12 @@ def range_rows(
                     g[slot] = n2 * l0 - n0 * l2
                 elif axis == 2:
                     g[slot] = n0 * l1 - n1 * l0
-            if known:
-                half = 0.5 * span
-                for slot in range(CORE_SIZE, column_of.shape[0]):
-                    axis = column_of[slot] - FORCE_ERROR
-                    if 0 <= axis < 3:
-                        g[slot] = half * (n0 if axis == 0 else n1 if axis == 1 else n2)
-                if math.isfinite(values[RATE, i]):
-                    now = u0 * (e0n - v0) + u1 * (e1n - v1) + u2 * (e2n - v2) - values[RATE, i]
-                    w = 1.0 / (values[RATE_VARIANCE, i] + values[CARRIER_VARIANCE, i])
-                    weight_m += w
-                    more_z += w * (innovation - now)
-                    d0, d1, d2 = d0 - b0, d1 - b1, d2 - b2
-                    t0 += w * (d1 * u2 - d2 * u1)
-                    t1 += w * (d2 * u0 - d0 * u2)
-                    t2 += w * (d0 * u1 - d1 * u0)
-                    f0, f1, f2 = f0 + w * half * n0, f1 + w * half * n1, f2 + w * half * n2
             if clock[i] >= 0:
                 innovation += xi[drifts[0]]
                 g[drifts[0]] = -1.0
             _hold(active, g)
             z[rate_row] = innovation
             rate_row += 1
-    if carrier.shape[0] == 1:
-        for row in range(first_rate, rate_row):
-            g = h[row]
-            if g[carrier[0]] == 0.0:
-                continue
-            g[carrier[0]] = -1.0 / math.sqrt(weight_m)
-            z[row] -= more_z / weight_m + g[carrier[0]] * xi[carrier[0]]
-            for j in range(3):
-                if active[j]:
-                    g[j] -= (t0 if j == 0 else t1 if j == 1 else t2) / weight_m
-            for slot in range(CORE_SIZE, column_of.shape[0]):
-                axis = column_of[slot] - FORCE_ERROR
-                if 0 <= axis < 3:
-                    g[slot] -= (f0 if axis == 0 else f1 if axis == 1 else f2) / weight_m
 
 
 # What is wrong with the values of an epoch.

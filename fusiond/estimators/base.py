@@ -289,6 +289,7 @@ class Estimator:
         if measurement.screened:
             s = self._screen(measurement, rows, cov, dx)
             codes = tuple(s.codes.tolist())
+            self._leave(measurement, codes)
             return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
         y = np.zeros(z.shape[0])
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
@@ -314,6 +315,15 @@ class Estimator:
             self.hypotheses.conclude()
             others.append(self.hypotheses.sensitivities)
         renew(renewal, self.model, self._covs, others)
+        if renewal.estimate is not None:
+            self.xi[self.model.slots_of_all(renewal.blocks)] = renewal.estimate
+
+    def _leave(self, measurement: Linearised, codes: tuple[int, ...]) -> None:
+        """Clone what a screened measurement, of whose rows `codes` tell, leaves to the next."""
+        if measurement.screened:
+            renewal = measurement.leaves(self._view, codes)
+            if renewal is not None:
+                self._renew(renewal)
 
     def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
         """The measurement's innovation, linear in the error state."""

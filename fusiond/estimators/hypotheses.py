@@ -63,7 +63,7 @@ class Estimated(NamedTuple):
 
 class Hypotheses:
     """A bank of `table` in `bank`, beside a filter of `model`: `of` are its state (10,), parameters
-    (n,), last step (35,) and axes and clock of publication (3,), and `wider` (9,) the variances
+    (n,), last step (28,) and axes and clock of publication (3,), and `wider` (9,) the variances
     that what it publishes has beyond P's.
 
     Rows of one instant are judged once, together, unless something depends on it before the filter

@@ -61,7 +61,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import NOTHING_LEFT, Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
@@ -79,6 +79,7 @@ from fusiond.estimators.row_kernels import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.estimators.tilt_axes_carried import keep_down_rows, keep_downward
+from fusiond.models.blocks import CARRIER_ANCHOR
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -151,6 +152,7 @@ class InvariantFilter(TiltAxesFilter):
         super().__init__(model, gap_s, faults)
         self._settles = settles
         self._mounts = model.indices[MOUNTING]
+        self._clone = model.indices[CARRIER_ANCHOR]
         self._knows[[SETTLES, PLAIN, LARGE]] = settles, PLAIN_SD_RAD**2, LARGE_SD_RAD**2
         self._bent = False
         """True if the bank has missed updates: of a heading so wide that no effect is linear."""
@@ -248,9 +250,9 @@ class InvariantFilter(TiltAxesFilter):
     def _turn_in(self, measurement: Linearised) -> Outcome:
         """Fold one measurement in, or name why not, by an update in xi."""
         self.turned = 0.0
+        # A way that turns with the heading leaves no clone behind where it was.
+        self.xi[self._clone] = 0.0
         outcome = self._update(measurement)
-        if measurement.screened:  # what it leaves to the next is of the state that it has led to
-            measurement.innovation(self.state)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = False
         return outcome
@@ -297,7 +299,7 @@ class InvariantFilter(TiltAxesFilter):
             fed_back[DV : DV + 3] = self.nav[VN : VN + 3] - nav[VN : VN + 3]
             self.hypotheses.keep_fed_back(fed_back)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
-        turn_step(self.step, self.turned, NOTHING_LEFT)
+        turn_step(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _hypothesise(
@@ -343,7 +345,7 @@ class InvariantFilter(TiltAxesFilter):
             if rows is None:
                 nav, xi = self.without(self.nav, self.xi, error, turning)
                 step = self.step.copy()
-                turn_step(step, float(error[PHI + 2]), measurement.remembered)
+                turn_step(step, float(error[PHI + 2]))
                 found = measurement.innovation(State(nav, xi, step, self.model, self.covariance))
                 if isinstance(found, NotApplicable):
                     return found

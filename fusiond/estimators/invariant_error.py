@@ -18,11 +18,8 @@ from fusiond.navigation.error_model import CORE_SIZE, DR, DV, PHI
 from fusiond.navigation.rotation import quaternion_to_dcm, turn_to_dcm
 from fusiond.navigation.strapdown import (
     Q0,
-    STEP_CHANGED_N,
     STEP_DCM,
     STEP_FORCE_N,
-    STEP_MOVED_N,
-    STEP_SECONDS,
     STEP_SMOOTH_N,
 )
 
@@ -160,26 +157,10 @@ def take_out(
     feed_back(nav, xi, d)
 
 
-@compiled("void(f8[::1], f8, f8[::1])")
-def turn_step(step: Array, psi: float, before: Array) -> None:
-    """The last step (35,) is that of a vehicle that is turned by psi (rad), and has been so since
-    an epoch left `before` (10,; fusiond.aiding.range_rows), of 0 s where there is none.
-
-    What the IMU has changed since then turns with it, and so does the lever arm that there was: by
-    the position that is moved by more.
-    """
+@compiled("void(f8[::1], f8)")
+def turn_step(step: Array, psi: float) -> None:
+    """The last step (28,) is that of a vehicle that is turned by psi (rad)."""
     c, s = math.cos(psi), math.sin(psi)
-    if before[0] > 0.0:
-        gone = step[STEP_SECONDS] - before[0]
-        north, east = step[STEP_CHANGED_N] - before[1], step[STEP_CHANGED_N + 1] - before[2]
-        step[STEP_CHANGED_N] = before[1] + c * north - s * east
-        step[STEP_CHANGED_N + 1] = before[2] + s * north + c * east
-        north0, east0 = before[4] + before[1] * gone, before[5] + before[2] * gone
-        north, east = step[STEP_MOVED_N] - north0, step[STEP_MOVED_N + 1] - east0
-        step[STEP_MOVED_N] = north0 + c * north - s * east
-        step[STEP_MOVED_N + 1] = east0 + s * north + c * east
-        step[STEP_MOVED_N] += before[7] - (c * before[7] - s * before[8])
-        step[STEP_MOVED_N + 1] += before[8] - (s * before[7] + c * before[8])
     for first in (STEP_FORCE_N, STEP_SMOOTH_N):
         north, east = step[first], step[first + 1]
         step[first], step[first + 1] = c * north - s * east, s * north + c * east

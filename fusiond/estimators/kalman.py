@@ -66,7 +66,9 @@ class KalmanEstimator(Estimator):
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one measurement in, or name why not; `noise` (3,) times its variances."""
-        return self._fold_in(measurement, noise)
+        outcome = self._fold_in(measurement, noise)
+        self._leave(measurement, outcome.rows)
+        return outcome
 
     def _fold_in(self, measurement: Linearised, noise: Array) -> Outcome:
         if measurement.screened and measurement.renewal is not None:

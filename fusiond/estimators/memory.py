@@ -55,7 +55,7 @@ def scratch_size(width: int) -> int:
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
     (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
-    `wider`, nav (10,), the last step (35,), the `sums` (25,) of
+    `wider`, nav (10,), the last step (28,), the `sums` (25,) of
     fusiond.estimators.block_covariance, `xi` (n,), `dxs` (k, n), `covs` (k, width, width), the
     `bank` of fusiond.estimators.fault_bank; covariances before what has been added up, flat,
     `held`; `phi` (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares`

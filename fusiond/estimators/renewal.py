@@ -1,10 +1,12 @@
 r"""Errors that successive measurements share, where in part they become others.
 
     t <- R t + w       t in units of their initial sigmas
+    t <- R t + G e + w,  and what the states are is given: a clone of the navigation errors e
 
 of states with covariance P, error estimate and parameters, and of the sensitivities V of a bank's
-hypotheses: what of P and V belongs to t is multiplied by R, and P grows by w. Source: Groves, 2nd
-edition, 3.2.4.
+hypotheses: what of P and V belongs to t is multiplied by R, and P grows by w. A clone's P and V are
+what G makes of those of e. Source: Groves, 2nd edition, 3.2.4; Roumeliotis and Burdick, Stochastic
+cloning, ICRA 2002.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Renewal
 from fusiond.models.model import Model
+from fusiond.navigation.error_model import CORE_SIZE
 
 Array = NDArray[np.float64]
 
@@ -37,14 +40,26 @@ def renew(renewal: Renewal, model: Model, covs: Iterable[Array], others: Iterabl
     if found is None:
         return
     kept, new, slots = found
-    own = np.ix_(slots, slots)
+    own, cloned = np.ix_(slots, slots), renewal.of_navigation
     for cov in covs:
-        among = product(product(kept, cov[own]), kept.T) + new
-        cov[slots] = product(kept, cov[slots])
-        cov[:, slots] = cov[slots].T
+        rows = _carried(kept, cloned, cov, slots)
+        among = product(rows[:, slots], kept.T) + new
+        if cloned is not None:
+            among += product(rows[:, :CORE_SIZE], cloned.T)
+        cov[slots] = rows
+        cov[:, slots] = rows.T
         cov[own] = 0.5 * (among + among.T)
     for rows in others:
-        rows[slots] = product(kept, rows[slots].reshape(len(slots), -1)).reshape(rows[slots].shape)
+        found_rows = _carried(kept, cloned, rows.reshape(len(rows), -1), slots)
+        rows[slots] = found_rows.reshape(rows[slots].shape)
+
+
+def _carried(kept: Array, cloned: Array | None, rows: Array, slots: list[int]) -> Array:
+    """Rows (k, w) of the states in `slots` after it, of all `rows` (.., w) before it."""
+    found = product(kept, rows[slots])
+    if cloned is not None:
+        found += product(cloned, rows[:CORE_SIZE])
+    return found
 
 
 def product(a: Array, b: Array) -> Array:

@@ -86,10 +86,16 @@ class SeparatedEstimator(KalmanEstimator):
         self._fold_into_subsets(measurement, innovation)
         if not held:
             self._take_out()
+        self._leave_all(measurement, outcome.rows)
         return outcome
 
     def _renew(self, renewal: Renewal) -> None:
-        """Nothing more: `update` does it before it linearises."""
+        """Nothing more: `update` does it before it linearises, and behind the subsets."""
+
+    def _leave_all(self, measurement: Linearised, codes: tuple[int, ...]) -> None:
+        """Clone what a measurement leaves to the next, in the subsets, too."""
+        if measurement.screened and (renewal := measurement.leaves(self.state, codes)) is not None:
+            super()._renew(renewal)
 
     def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
         """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing
@@ -99,6 +105,7 @@ class SeparatedEstimator(KalmanEstimator):
         innovation = self._linearise(measurement)
         if not isinstance(innovation, NotApplicable):
             self._fold_into_subsets(measurement, innovation)
+        self._leave_all(measurement, outcome.rows)
         return outcome
 
     def adopt(self, mean: Array, spread: Array) -> None:

@@ -144,11 +144,12 @@ class TiltAxesFilter(KalmanEstimator):
             return self._turn_in(measurement)
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
-            return self._fold_in(measurement, noise)
+            return super().update(measurement, noise)
         before = self._estimate()
         outcome = self._fold_in(measurement, noise)
         if outcome.name == "fused":
             self._carry_over(before)
+        self._leave(measurement, outcome.rows)
         return outcome
 
     def _turn_in(self, measurement: Linearised) -> Outcome:

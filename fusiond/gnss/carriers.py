@@ -24,12 +24,10 @@ multiplies the model's variances of multipath and thermal noise, here and in the
 
 Neither depends on where the receiver is; what it delays between bands is left in I.
 
-The way from epoch to epoch, as a rate (m/s), and its variance:
-
-    (L_a(t) - L_a(t - dt)) / dt = mean range rate + clock,   2 s_L^2 / dt^2
-
-s_L by a model of C/N0 and a scale, learned in the same way from d(L_a - L_b) of variance
-2 (s_La^2 + s_Lb^2).
+What an epoch has of a carrier that is followed is L_a, its variance s_L^2, and for how long it has
+been followed since the satellite's epoch before: ways from an anchor epoch are made of that
+(fusiond.aiding.carrier_anchor). s_L by a model of C/N0 and a scale, learned in the same way from
+d(L_a - L_b) of variance 2 (s_La^2 + s_Lb^2).
 
 Refused, of each satellite: `lock_lost` (the receiver says so), `cycle_slip` (the carriers part by
 more than the ionosphere can, or the rate is not that of the Dopplers); of all at once:
@@ -66,7 +64,7 @@ _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V = range(KEPT_COLUMNS
 _SUM, _COUNT, _PHASES, _PHASE_COUNT = range(4)
 # What comes out; NaN: nothing known.
 OUT_COLUMNS = 6
-SLANT, SLANT_VARIANCE, WITH_CODE, MOVED, SPAN, MOVED_VARIANCE = range(OUT_COLUMNS)
+SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_COLUMNS)
 # Refusals of a satellite's carrier, by what `follow` writes.
 FOLLOWED, LOCK_LOST, CYCLE_SLIP = 0, 1, 2
 
@@ -90,7 +88,7 @@ CLIPPED = 9.0
 MULTIPATH_S = 60.0
 """For how long multipath of code lasts: minutes at rest, seconds on the move."""
 LONGEST_S = 2.0
-"""Beyond this the way between two epochs says little of the velocity at its end."""
+"""Beyond this Dopplers tell no slip any more."""
 FORGOTTEN_S = 120.0
 """After this the delay begins anew."""
 DELAY_RATE_M_S = 0.01
@@ -104,8 +102,8 @@ SLIP_RATE_M_S = 0.5
 """Between the mean of two Dopplers and the carrier's rate, or a wavelength over dt where that is
 more. A hand that swings with 3 m/s^2 twice a second leaves 0.2 m/s over 0.25 s."""
 JUMP_M_S = 3.0
-"""Common part of all satellites beyond their Dopplers: three sigma of the filter's clock of
-the carriers (fusiond.aiding.range_rows). A clock set by a millisecond within 2 s gives 150,000."""
+"""Common part of all satellites beyond their Dopplers: a clock's phase that walks by 0.1 m by the
+root of a second makes 0.45 m/s over 50 ms, one set by a millisecond within 2 s 150,000."""
 
 
 @compiled("f8(f8[:, ::1])")
@@ -208,7 +206,7 @@ def follow(
         if kept[0, j] > MOST_COUNT:
             kept[0, j] *= 0.5
             kept[0, j - 1] *= 0.5
-    residuals = np.empty(n)
+    residuals, moved = np.empty(n), np.empty(n)
     many = 0
     for i in range(n):
         state = kept[int(plan[i, SLOT])]
@@ -218,6 +216,8 @@ def follow(
         out[i, SPAN] = 0.0
         span = now - state[_T]
         l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
+        out[i, CARRIER] = l_a
+        out[i, CARRIER_VARIANCE] = phases * _phase_variance(first[i, CNO], plan[i, LENGTH_A])
         if not (0.0 < span <= LONGEST_S) or state[_SIGNAL] != plan[i, SIGNAL]:
             continue
         if math.isnan(l_a) or math.isnan(state[_L_A]):
@@ -225,11 +225,8 @@ def follow(
         if first[i, LOCK_A] < span:
             refused[i] = LOCK_LOST
             continue
-        moved = (l_a - state[_L_A]) / span
-        out[i, MOVED], out[i, SPAN] = moved, span
-        phase = phases * _phase_variance(first[i, CNO], plan[i, LENGTH_A])
-        out[i, MOVED_VARIANCE] = 2.0 * phase / (span * span)
-        d = moved - 0.5 * (first[i, RATE] + state[_RATE])
+        moved[i], out[i, SPAN] = (l_a - state[_L_A]) / span, span
+        d = moved[i] - 0.5 * (first[i, RATE] + state[_RATE])
         if not math.isnan(d):
             residuals[many] = d
             many += 1
@@ -261,11 +258,11 @@ def follow(
             kept[0, _PHASES] += w * min(change * change / noise, CLIPPED * phases)
             kept[0, _PHASE_COUNT] += w
         if out[i, SPAN] > 0.0:
-            d = out[i, MOVED] - 0.5 * (first[i, RATE] + state[_RATE]) - common
+            d = moved[i] - 0.5 * (first[i, RATE] + state[_RATE]) - common
             if slipped or abs(d) > max(SLIP_RATE_M_S, plan[i, LENGTH_A] / span):
                 refused[i] = CYCLE_SLIP
         if jumped or refused[i] != FOLLOWED:
-            out[i, MOVED], out[i, SPAN] = math.nan, 0.0
+            out[i, SPAN] = 0.0
         if pair:
             if slipped:
                 change = math.nan

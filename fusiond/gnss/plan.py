@@ -16,6 +16,7 @@ fusiond.gnss.corrections).
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import field
 from typing import NamedTuple
@@ -138,6 +139,9 @@ class Plan(NamedTuple):
     orbits: Orbits
     fixed: Array
     ionosphere: Array
+    issues: Array
+    """(n,): numbers that change where orbit, clock or ionosphere do, and with them a carrier's
+    constant."""
     refused: tuple[tuple[str, str], ...]
 
 
@@ -181,6 +185,8 @@ class Planner:
         signals = [epoch.signals[k] for k in serving]
         paired = [k for k, s in enumerate(chosen) if s.second is not None]
         seconds = [s.second for s in chosen if s.second is not None]
+        orbits = Orbits.of([s.ephemeris for s in chosen], [s.corrected for s in chosen])
+        models = zlib.crc32(repr((self.store.ionosphere, self.store.bdgim)).encode())
         return Plan(
             keys,
             self.store.version,
@@ -196,9 +202,10 @@ class Planner:
             tuple(s.signal for s in signals),
             np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
             np.array([self.options.systems.index(s.system) for s in signals], np.int64),
-            Orbits.of([s.ephemeris for s in chosen], [s.corrected for s in chosen]),
+            orbits,
             np.array(groups, float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
+            np.array([zlib.crc32(row.tobytes(), models) for row in orbits.elements], float),
             tuple(refused),
         )
 

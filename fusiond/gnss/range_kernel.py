@@ -26,11 +26,8 @@ distance grows); dt, ddt the satellite's clock offset and drift, d the signal's 
 troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
 D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
 
-A carrier's rate is the mean over dt before the epoch: that of the middle, D at the epoch less
-dt / 2 times the range's acceleration l . a + (|w|^2 - (l . w)^2) / rho (to 1e-5 m/s in 2 s),
-w = v - v_r, of which `PULL` has l . a, the satellite's; in the turning axes
-
-    a = -GM s / |s|^3 - 2 we x v - we x (we x s)
+A carrier is a range but for a constant: its length less T, more I0 (a phase is early by what a code
+is late), with the satellite's clock, without group delay.
 
 r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
 
@@ -56,12 +53,12 @@ from fusiond.gnss.atmosphere import (
     zenith_delays,
 )
 from fusiond.gnss.bdgim import bdgim
+from fusiond.gnss.carriers import CARRIER as LENGTH
+from fusiond.gnss.carriers import CARRIER_VARIANCE as LENGTH_VARIANCE
 from fusiond.gnss.carriers import (
     CNO as CNO_A,
 )
 from fusiond.gnss.carriers import (
-    MOVED,
-    MOVED_VARIANCE,
     P_A,
     SD_A,
     SLANT,
@@ -85,10 +82,9 @@ EARTH_RATE_RAD_S = 7.2921151467e-5
 LOWEST_RADIUS_M = 6.3e6
 """A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
 
-GM_M3_S2 = 3.986004418e14
-"""For a satellite's acceleration, to 1e-3 of it: over half of two seconds 1e-3 m/s."""
-ATMOSPHERE_RATE_M_S = 0.002
-"""Rate of a range at the zenith by ionosphere and troposphere beside their models."""
+WALK_M_SQRT_S = 0.002
+"""Walk of a carrier at the zenith beside the models: satellites' clocks, 1e-12 to 3e-12 over 10 s,
+are 3 to 9 mm, ionosphere and troposphere 1 mm/s at most."""
 BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
 """One sigma of what a receiver delays BeiDou-2 more than BeiDou-3: of B1I (a Septentrio's has
 0.5 m), and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13
@@ -103,14 +99,15 @@ GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(S
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # Columns of `first` as the receiver says them; NaN where it does not.
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
-# Results; the first seventeen are what a measurement takes (fusiond.aiding.pseudorange).
-ROW_COLUMNS = 29
-RANGE_VALUES = 17
+# Results; the first nineteen are what a measurement takes (fusiond.aiding.pseudorange).
+ROW_COLUMNS = 30
+RANGE_VALUES = 19
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, VARIANCE, RATE_VARIANCE,
-    COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER_RATE, CARRIER_VARIANCE, PULL,
+    COMMON, TROPOSPHERE_SIGMA, BEIDOU_2_SIGMA, CARRIER_SPAN, CARRIER, CARRIER_VARIANCE, WALK,
+    SLOT, ISSUE,
     LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, TROPOSPHERE, IONOSPHERE, TOTAL_VARIANCE,
-    LASTING, SLOT,
+    LASTING,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -187,11 +184,11 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (29, n) values of satellites as a receiver has them.
+    """Write (30, n) values of satellites as a receiver has them.
 
-    `SLOT` is the plan's and stays. `receiver` (3,) ECEF m, at GPS time `week`, `tow` of its clock;
-    returns how many satellites are lower than `least_elevation` (rad) or weaker than `least_cno`
-    (dB Hz).
+    `SLOT` and `ISSUE` are the plan's and stay. `receiver` (3,) ECEF m, at GPS time `week`, `tow` of
+    its clock; returns how many satellites are lower than `least_elevation` (rad) or weaker than
+    `least_cno` (dB Hz).
 
     `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
@@ -279,21 +276,10 @@ def range_rows(
         out[RATE_VARIANCE, k] = (
             noise[RATE_ZENITH] * noise[RATE_ZENITH] * thin * thin + stated * stated
         )
-        span = carriers[k, SPAN]
-        out[CARRIER_SPAN, k] = span
-        out[CARRIER_RATE, k], out[CARRIER_VARIANCE, k], out[PULL, k] = math.nan, math.nan, 0.0
-        if span > 0.0:
-            out[CARRIER_RATE, k] = carriers[k, MOVED] * (1.0 + inertial) + drift
-            change = ATMOSPHERE_RATE_M_S * thin
-            out[CARRIER_VARIANCE, k] = carriers[k, MOVED_VARIANCE] * thin * thin + change * change
-            radius2 = x * x + y * y + z * z
-            fall = GM_M3_S2 / (radius2 * math.sqrt(radius2))
-            turn = EARTH_RATE_RAD_S * EARTH_RATE_RAD_S - fall
-            out[PULL, k] = (
-                lx * (turn * x + 2.0 * EARTH_RATE_RAD_S * vy)
-                + ly * (turn * y - 2.0 * EARTH_RATE_RAD_S * vx)
-                - lz * fall * z
-            )
+        out[CARRIER_SPAN, k] = carriers[k, SPAN]
+        out[CARRIER, k] = carriers[k, LENGTH] + SPEED_OF_LIGHT_M_S * states[k, 6] - tropo + iono
+        out[CARRIER_VARIANCE, k] = carriers[k, LENGTH_VARIANCE] * thin * thin
+        out[WALK, k] = WALK_M_SQRT_S * thin
         code = noise[CODE_ZENITH] * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno

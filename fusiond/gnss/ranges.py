@@ -2,7 +2,7 @@ r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how g
 
     sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2 + s_sis^2 + s_d^2
                      + what carriers leave of the ionosphere + (0.3 s_I)^2
-    sigma^2(rate)  = (r m)^2 + s_rx^2,  or of the carrier from epoch to epoch
+    sigma^2(rate)  = (r m)^2 + s_rx^2
     common to all ranges: s_I n_1 + 0.12 m n_2 + s_2 n_3,   n ~ N(0, 1)
 
 m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zenith and b thermal
@@ -22,7 +22,7 @@ this receiver's are (`fusiond.gnss.carriers`).
 Which signals of a satellite serve: `fusiond.gnss.plan`.
 
 Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`; of carriers, which
-then give no rate for the epoch, `lock_lost`, `cycle_slip`, and of all at once `clock_jump`.
+then wait for a new anchor, `lock_lost`, `cycle_slip`, and of all at once `clock_jump`.
 """
 
 from __future__ import annotations
@@ -88,11 +88,11 @@ class Rows:
     that was assumed; `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use;
     `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
     independent, `common` (n, 3) what a common error of one sigma adds (ionosphere, troposphere,
-    BeiDou-2), `total_variance` (n,) of both; `carrier_rate_m_s` (n,) the mean rate over the last
-    `span_s` (n,) by the carrier, NaN and 0 where there is none; `troposphere_m` and
+    BeiDou-2), `total_variance` (n,) of both; `carrier_m` (n,) the carrier as a range but for a
+    constant, NaN where there is none, followed for `span_s` (n,); `troposphere_m` and
     `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
     `lasting` (n,) m^2 what of `variance` lasts for many minutes.
-    `values` (29, n) has all of them, as `range_kernel.range_rows` writes it.
+    `values` (30, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -117,7 +117,7 @@ class Rows:
     ionosphere_sigma_m = _Of(rk.COMMON)
     common = _Of(slice(rk.COMMON, rk.BEIDOU_2_SIGMA + 1))
     span_s = _Of(rk.CARRIER_SPAN)
-    carrier_rate_m_s = _Of(rk.CARRIER_RATE)
+    carrier_m = _Of(rk.CARRIER)
     total_variance = _Of(rk.TOTAL_VARIANCE)
     lasting = _Of(rk.LASTING)
 
@@ -257,7 +257,7 @@ class RangeModel:
             options.cno_mask_db_hz,
             out,
         )
-        out[rk.SLOT] = plan.followed[:, ca.SLOT]
+        out[rk.SLOT], out[rk.ISSUE] = plan.followed[:, ca.SLOT], plan.issues
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
         if not lost:

@@ -18,6 +18,12 @@ from drivers.immutable import immutable
 from fusiond.navigation.error_model import FORCE_ERROR, FORCE_SCALE, RATE_ERROR, RATE_SCALE
 
 CLOCK_OFFSET, CLOCK_DRIFT = "clock_offset", "clock_drift"
+CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
+"""Place of an antenna (ECEF, m) at the epoch from which carriers are counted, and how much their
+clock has gone since (m): fusiond.aiding.carrier_anchor."""
+CARRIER_WALK = 0.002**2
+"""Walk of all carriers beside their models (m^2/s), as fusiond.gnss.range_kernel has of each; a sky
+makes about as much a displacement of it as a satellite has at the zenith."""
 SAR_MISALIGNMENT = "sar_misalignment"
 # One sigma (rad) of how a SAR antenna is mounted where nothing else says it: 0.1 deg, about what
 # paper 002's accuracy needs and a mechanical alignment keeps.
@@ -158,6 +164,20 @@ def clock_blocks(
             white=n.drift_white,
             tau_s=n.drift_tau_s,
             steady=n.drift_steady,
+        ),
+    ]
+
+
+def carrier_blocks(noise: ClockNoise) -> list[Block]:
+    """Anchor of carriers, and their clock, which goes as those of the codes do."""
+    columns = (-1, -1, -1)
+    return [
+        Block(CARRIER_ANCHOR, "m", ("x", "y", "z"), columns, initial=1.0, white=CARRIER_WALK),
+        Block(
+            *(CARRIER_CLOCK, "m", ("carriers",), (-1,)),
+            initial=1.0,
+            white=noise.offset_white,
+            rate=CLOCK_DRIFT,
         ),
     ]
 

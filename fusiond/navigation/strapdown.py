@@ -39,10 +39,7 @@ NAV_SIZE = 10
 # noise that the latter has left, and for how long (s) the vehicle is known to rest.
 STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM, STEP_SMOOTH_N = 0, 3, 6, 9, 18
 STEP_SMOOTH_RATE_B, STEP_NOISE_B, STEP_RESTS_S = 21, 24, 27
-# Since the start, as the IMU alone has it and no feedback changes: the seconds, how much the
-# velocity has changed (NED, m/s), and the integral of that (m).
-STEP_SECONDS, STEP_CHANGED_N, STEP_MOVED_N = 28, 29, 32
-STEP_SIZE = 35
+STEP_SIZE = 28
 # Time constant (s) of both: a car's acceleration changes in a second, an engine shakes in 50 ms.
 SMOOTH_S = 0.25
 # Seconds that the variance looks back, as fusiond.navigation.vibration does. Samples that differ
@@ -65,7 +62,7 @@ def strapdown_step(
     hold_height: bool,
     step: Array,
 ) -> None:
-    """Advance `nav` (10,) in place by `h` seconds; write `step` (35,) for the error model.
+    """Advance `nav` (10,) in place by `h` seconds; write `step` (28,) for the error model.
 
     `rate` (rad/s) and `force` (m/s^2) are the interval's means in body axes after compensation,
     the slopes their time derivatives. `hold_height` keeps height and v_D = 0 (planar models).
@@ -144,13 +141,6 @@ def strapdown_step(
         -h * (earth_d - mid_ve * tan_lat / radius_n),
         True,
     )
-
-    step[STEP_SECONDS] += h
-    change, moved = STEP_CHANGED_N, STEP_MOVED_N
-    for j in range(3):
-        gained = nav[VN + j] - (vn, ve, vd)[j]
-        step[moved + j] += h * (step[change + j] + 0.5 * gained)
-        step[change + j] += gained
 
     inverse = 1.0 / h
     step[0], step[1], step[2] = d0 * inverse, d1 * inverse, d2 * inverse

@@ -19,7 +19,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.integrity.verdicts import Verdicts
-from fusiond.models.blocks import Block
+from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
@@ -44,7 +44,7 @@ def model_of(config: Config, *extra: Block) -> Model:
     try:
         return make_model(name, noise, *extra)
     except TooManyStatesError as error:
-        for unasked in (_skews, _wanders, _unasked):
+        for unasked in (_skews, _wanders, _unasked, _carriers):
             asked = [block for block in extra if not unasked(config, block)]
             if len(asked) < len(extra):
                 return model_of(config, *asked)
@@ -63,6 +63,11 @@ def _skews(_: Config, block: Block) -> bool:
 def _wanders(_: Config, block: Block) -> bool:
     """True if a block is that of an error which fixes share for seconds."""
     return block.name.startswith(FIX_MARKOV)
+
+
+def _carriers(_: Config, block: Block) -> bool:
+    """True if a block is of the carriers' anchor: without it Dopplers serve."""
+    return block.name in (CARRIER_ANCHOR, CARRIER_CLOCK)
 
 
 def _unasked(config: Config, block: Block) -> bool:

@@ -25,7 +25,6 @@ from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeMeasurement, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
-from fusiond.gnss.climbing import take_off_climb
 from fusiond.gnss.displacement import Displacement
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.levels import Levels, take_off
@@ -47,7 +46,6 @@ from fusiond.gnss.ranges import (
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
 from fusiond.gnss.store import EphemerisStore
-from fusiond.navigation.strapdown import VD
 
 Array = NDArray[np.float64]
 
@@ -144,8 +142,6 @@ class RawEpochMeasurement(AidingMeasurement):
         if found is None or found.place != key or found.followed is not followed:
             guess = np.array(to_ecef(lat, lon, height))
             found = _Corrected(key, followed, guess, *self.receiver.correct(self, followed, guess))
-            if nav.size > VD:  # a place alone has no velocity
-                take_off_climb(found.measurement.values, lat, height, -nav.item(VD))
             self.memory.corrected = found
         return found.measurement
 

@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.turn_rate import gyro_slots
+from fusiond.models.blocks import CARRIER_ANCHOR
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, PHI
+from fusiond.navigation.error_model import CORE_SIZE, DR, FORCE_ERROR, PHI
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
 
 Array = NDArray[np.float64]
@@ -56,15 +57,16 @@ class Nodes(NamedTuple):
 
 def links(model: Model) -> Indices:
     """(2, k): rows and columns of what Phi has beside the navigation errors' rows and its diagonal:
-    offsets by their rates, and where the axes of a tilt were turned (fusiond.estimators.tilt_axes)
-    a vertical accelerometer's bias by those of the others, and each gyro's by the tilt and by
-    those of the others (fusiond.estimators.turn_rate)."""
+    offsets by their rates, a clone by what it is of, and where the axes of a tilt were turned
+    (fusiond.estimators.tilt_axes) a vertical accelerometer's bias by those of the others, and each
+    gyro's by the tilt and by those of the others (fusiond.estimators.turn_rate)."""
     down, *others = [model.parameters(FORCE_ERROR + axis) for axis in (2, 0, 1)]
-    if not down:
-        return np.ascontiguousarray(model.rate_terms)
-    pairs = [(down[0], slot) for slot in (*down[1:], *itertools.chain(*others))]
-    gyros = gyro_slots(model).tolist()
-    pairs += [(to, of) for to in gyros for of in (PHI, PHI + 1, *gyros) if of != to]
+    cloned = (*range(PHI, PHI + 3), *range(DR, DR + 3))
+    pairs = [(to, of) for to in model.slots_of(CARRIER_ANCHOR) for of in cloned]
+    if down:
+        pairs += [(down[0], slot) for slot in (*down[1:], *itertools.chain(*others))]
+        gyros = gyro_slots(model).tolist()
+        pairs += [(to, of) for to in gyros for of in (PHI, PHI + 1, *gyros) if of != to]
     told = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     return np.ascontiguousarray(np.hstack([model.rate_terms, told.T]))
 

@@ -4,8 +4,8 @@ Measurements: the transform is taken over the states that the measurement depend
 its H that are not zero), each point through the measurement's own innovation at the true state that
 its error would mean. What comes of it is linear in the error state again
 (fusiond.estimators.unscented.sigma_points), so gate, update and feedback are those of the extended
-filter. All other states follow through their correlation, as in a full transform. A sigma point has
-no past: a measurement that `remembers` goes by its Jacobian.
+filter. All other states follow through their correlation, as in a full transform. A measurement
+that `remembers` goes by its Jacobian.
 
 Propagation: the extended filter's covariance, or with `propagation` sigma points through the
 strapdown equations and a covariance that turns with a large correction of the attitude

@@ -8,7 +8,7 @@ from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.settings import clock_noise
-from fusiond.models.blocks import Block, clock_blocks, position_bias, shared_error
+from fusiond.models.blocks import Block, carrier_blocks, clock_blocks, position_bias, shared_error
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
@@ -33,14 +33,14 @@ height. An epoch alone says little of them beyond their sigma. What lasts is in 
 
 
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
-    """A clock offset a system, drift, and errors that ranges share."""
+    """A clock offset a system, drift, errors that ranges share, and the carriers' anchor."""
     from fusiond.aiding.pseudorange import (  # noqa: PLC0415 - as fusiond.navigator.raw_gnss
-        CARRIER_CLOCK,
         RANGE_BIAS,
         RANGE_SHARED,
     )
 
-    found = clock_blocks(section.systems, clock_noise(section))
+    clock = clock_noise(section)
+    found = clock_blocks(section.systems, clock)
     if section.bias_sd_m > 0.0:
         tau_s = section.bias_correlation_s
         level, down = RANGE_BIAS
@@ -49,8 +49,7 @@ def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     lasting = (EPOCH_S, EPOCH_S, math.inf)
     for name, lasts_s in zip(RANGE_SHARED, lasting, strict=True):
         found.append(shared_error(name, "", 1.0, lasts_s))
-    found.append(shared_error(CARRIER_CLOCK, "", 1.0, EPOCH_S))
-    return found
+    return found + carrier_blocks(clock)
 
 
 KIND = Kind(RawGnssEpoch, measurements_of, {RawAiding: blocks})
