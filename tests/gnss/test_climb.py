@@ -7,20 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusiond.configuration.schema import Config
-from fusiond.demo.papers import PAPERS, settings
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
+from fusiond.simulation.papers import configured
 
 
 def test_an_aircraft_that_climbs_knows_its_vertical_velocity(tmp_path: Path) -> None:
     """Paper 002 by ranges: 15 mm/s off, at a sigma of 6, where the delay's rate is left in
     the carriers."""
-    paper = PAPERS["002"]
-    found = settings("002") | {"alignment": paper.start["alignment"]}
-    config = Config.model_validate(found)
-    scenario = paper.scenario().fitted(config)
+    config, scenario = configured("002")
     files = simulate(scenario, tmp_path, seed=1, duration_s=110.0, gnss_raw="ubx").files
     measurements = [
         ("raw", files["raw"]),
