@@ -74,6 +74,7 @@ class AttitudeMeasurement(AidingMeasurement):
 
     @property
     def orientation(self) -> Oriented | None:
+        """All three angles; None where it measures fewer, or the pitch is steep."""
         known = all(math.isfinite(x) for x in (*self.rpy, *self.sd))
         if not known or abs(self.rpy[1]) > STEEPEST_PITCH_RAD:
             return None

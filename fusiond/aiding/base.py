@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.candidates import Candidate
-from fusiond.aiding.heading_history import HeadingHistory, Oriented
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -192,11 +192,6 @@ class AidingMeasurement:
     def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
         """Clone of `state` for the next one, when the filter has looked at it and made `codes` of
         its rows."""
-        return None
-
-    @property
-    def orientation(self) -> Oriented | None:
-        """Attitude that it measures, all three angles; None where it measures none."""
         return None
 
     @property

@@ -242,9 +242,12 @@ class Diagnosis:
         return correction
 
     def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
-        """False of a position's fault before the position of that instant has come."""
+        """False of a position's fault before the position of that instant has come, where it may
+        be the error that positions share (fusiond.integrity.shared_error)."""
         kind = self._kinds[int(found.item(BEST)) // RESTARTS]
-        return kind.of != PLACE or measurement.locates
+        if kind.of != PLACE or measurement.locates:
+            return True
+        return not any(s.shares and s.device == kind.device for s in self._series.values())
 
     def _decide(
         self, measurement: AidingMeasurement, estimator: Estimator, bank: Hypotheses, found: Array

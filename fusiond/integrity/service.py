@@ -101,6 +101,8 @@ class Series:
     noise: Array = field(default_factory=unlearned)
     repeating: float = 1.0
     """Probability that a value repeats the one before it, as shown so far in motion."""
+    shares: bool = False
+    """True of positions that share an error, which the filter estimates."""
 
     @staticmethod
     def of(measurement: AidingMeasurement) -> Series:
@@ -111,6 +113,7 @@ class Series:
             measurement.locates,
             measurement.moves,
             since_ns=measurement.t_ns,
+            shares=any(getattr(each, "bias", ()) for each in measurement.candidates()),
         )
 
     def copied(self) -> Series:

@@ -22,15 +22,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.hypotheses import Estimated
 from fusiond.integrity.catalogue import POSITION_SD_M
-
-Array = NDArray[np.float64]
 
 PLACE = slice(6, 9)
 """Of the position in the error state."""

@@ -90,6 +90,7 @@ class Navigator:
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding, config.plausibility, self._event)
+        self._manoeuvre = config.plausibility.manoeuvre
         self.raw = self._intake.receivers
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         shared_blocks = self._intake.extra_blocks()
@@ -418,8 +419,9 @@ class Navigator:
             return Solution(t_ns, mode, reason, bound=self._protection.unknown())
         gap_ns = round(self.config.imu.gap_s * 1e9)
         bound = self._protection.bound() if self._protection.watches else NO_BOUND
-        drives = self.config.plausibility.manoeuvre
-        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound, drives)
+        return solution_of(
+            self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound, self._manoeuvre
+        )
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """Mode at `t_ns`, and why."""

@@ -28,6 +28,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.attitude import AttitudeMeasurement
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.candidates import HeadingCandidate, PositionCandidate
 from fusiond.aiding.heading_history import HeadingHistory, KnownHeading
@@ -132,8 +133,8 @@ class WithoutImu:
         if self._first_ns is None and measurements:
             self._first_ns = seen_ns or measurements[0].t_ns
         for one in measurements:
-            if (attitude := one.orientation) is not None:
-                self._way.orient(attitude)
+            if isinstance(one, AttitudeMeasurement) and one.orientation is not None:
+                self._way.orient(one.orientation)
             for candidate in one.candidates() if self._way.known and not one.locates else ():
                 if isinstance(candidate, HeadingCandidate):
                     own = candidate.t_ns, candidate.yaw_rad, candidate.sd_rad

@@ -94,12 +94,12 @@ async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -
         if number == "003":
             await until(lambda: bool(run.used))
             assert {name[0] for name in run.used} == {"C"}
+        if number == "000":  # fed back at the instants of arrival: the fifth may be under way
+            await until(lambda: run.health["rdss_feedback"].rejected.get("fed_back", 0) >= 5)
         health = run.health
     assert set(PAPERS[number].devices) <= set(health)
     for name in MEASUREMENTS[number]:
         assert health[name].rejected.get("isolated", 0) == 0, (name, health[name])
-    if number == "000":  # fed back at the instants of arrival
-        assert health["rdss_feedback"].rejected["fed_back"] >= 5
     if number == "003":
         (drift,) = run.daemon.navigator.model.slots_of("clock_drift")
         assert run.daemon.navigator.model.noise[0, drift] == pytest.approx(1.0 / 300.0)
