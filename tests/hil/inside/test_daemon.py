@@ -101,7 +101,7 @@ async def _step_the_system_clock(heard: Heard, vehicle: VehicleProcess) -> None:
 
 def _inertial(status: dict[str, Any]) -> bool:
     """Whether it navigates by the inertial unit."""
-    return bool(status["mode"] == "navigating" and not status["why"].startswith("No inertial"))
+    return bool(status["mode"] == "navigating" and "no inertial unit" not in status["why"].lower())
 
 
 async def _lose_imu(heard: Heard, vehicle: VehicleProcess) -> None:
