@@ -2,8 +2,10 @@
 
 python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
 descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descriptor (`socketcan`,
-`udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn. A bus
-without one (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
+`udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn, or
+when its owner calls `poll`: an IMU sends its frames one by one, and a daemon that wakes for each
+spends five times their cost on waking. A bus without one (`virtual`) is read by a thread into a
+ring of `RING_FRAMES`.
 
 Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
 """
@@ -17,6 +19,7 @@ import os
 import socket
 import struct
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -56,8 +59,9 @@ class CanFilter(TypedDict):
 class CanFrame(NamedTuple):
     """A frame as received; for an error frame `can_id` holds the error classes.
 
-    `t_seen_ns` is monotonic, at reading; `realtime_ns` is the stamp of the bus (CLOCK_REALTIME),
-    None where it gives none.
+    `t_seen_ns` is monotonic, of its arrival: by the stamp of the bus where that lies between the
+    last reading and this one, else the instant of reading. `realtime_ns` is that stamp
+    (CLOCK_REALTIME), None where it gives none.
     """
 
     can_id: int
@@ -78,6 +82,8 @@ Read = Callable[[], CanFrame | None]
 
 class CanBus:
     """One CAN bus, reopened for ever. It listens; it sends what it is told to, and nothing else.
+
+    With `polled`, set before `run`, a bus that has a descriptor is read by `poll` alone.
 
     `counters`: `bus_opened`, `bus_closed`, `bus_open_failed`, `frames`, `remote_frames`,
     `error_frames`, `error_<class>`, `error_overflow` (controller lost frames), `socket_overflow`
@@ -104,6 +110,10 @@ class CanBus:
         self._on_controller: Callable[[ControllerState], None] = lambda state: None
         self._drops_seen = 0
         self._bus: can.BusABC | None = None
+        self.polled = False
+        self._drain: Callable[[], None] | None = None
+        self._read_ns = 0
+        """Instant at which nothing was left to read."""
 
     async def run(
         self,
@@ -145,6 +155,11 @@ class CanBus:
                 self.counters["bus_closed"] += 1
             on_link(False, reported)
             await asyncio.sleep(self._backoff.next())
+
+    def poll(self) -> None:
+        """Read what has come: `FRAMES_PER_WAKEUP` frames, the rest in the next turn of the loop."""
+        if self.polled and self._drain is not None:
+            self._drain()
 
     def send(self, frame: CanFrame) -> bool:
         """Put a frame on the bus; False where it is down or its queue full. Never waits."""
@@ -207,7 +222,10 @@ class CanBus:
             return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
         read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
-        loop.add_reader(fd, self._readable, fd, read, gone)
+        self._drain = partial(self._readable, fd, read, gone)
+        self._read_ns = self._now_ns()
+        if not self.polled:
+            loop.add_reader(fd, self._drain)
         try:
             while not gone.done():
                 await asyncio.wait([gone], timeout=CHECK_S)
@@ -215,10 +233,13 @@ class CanBus:
                     self._count_drops(sock)
             return gone.result()
         finally:
+            self._drain = None
             loop.remove_reader(fd)
 
     def _readable(self, fd: int, read: Read, gone: asyncio.Future[str]) -> None:
-        """Callback of the loop: drain the socket, bounded; a fault ends the watch at once."""
+        """Drain the socket, bounded; a fault ends the watch at once."""
+        if gone.done():
+            return
         try:
             for _ in range(FRAMES_PER_WAKEUP):
                 frame = read()
@@ -231,6 +252,18 @@ class CanBus:
         except Exception as defect:
             asyncio.get_running_loop().remove_reader(fd)
             gone.set_exception(defect)
+        else:
+            if self.polled:
+                asyncio.get_running_loop().call_soon(self._readable, fd, read, gone)
+
+    def _arrived_ns(self, realtime_ns: int | None) -> int:
+        """Monotonic instant of the arrival of a frame that is read now."""
+        now_ns = self._now_ns()
+        if realtime_ns is None:
+            return now_ns
+        arrived_ns = now_ns - (time.time_ns() - realtime_ns)
+        # A stamp from before the system clock was set, or by another clock, lies outside.
+        return arrived_ns if self._read_ns <= arrived_ns <= now_ns else now_ns
 
     def _read_socket(self, sock: socket.socket) -> CanFrame | None:
         """One frame off a raw CAN socket with its kernel stamp, None when there is none.
@@ -240,6 +273,7 @@ class CanBus:
         try:
             raw, control, _, _ = sock.recvmsg(_CANFD_MTU, 64, socket.MSG_DONTWAIT)
         except (BlockingIOError, InterruptedError):
+            self._read_ns = self._now_ns()
             return None
         except OSError as error:
             raise _BusFaultError(self._explain(error)) from error
@@ -254,7 +288,7 @@ class CanBus:
             can_id & (0x1FFF_FFFF if extended or can_id & ERROR_FLAG else 0x7FF),
             extended,
             raw[_FRAME.size : _FRAME.size + length],
-            self._now_ns(),
+            self._arrived_ns(realtime_ns),
             realtime_ns,
             bool(can_id & REMOTE_FLAG),
             bool(can_id & ERROR_FLAG),
@@ -276,13 +310,15 @@ class CanBus:
             self.counters["bad_datagrams"] += 1
             return None
         if message is None:
+            self._read_ns = self._now_ns()
             return None
+        realtime_ns = round(message.timestamp * 1e9) if message.timestamp > 0.0 else None
         return CanFrame(
             message.arbitration_id,
             message.is_extended_id,
             bytes(message.data),
-            self._now_ns(),
-            round(message.timestamp * 1e9) if message.timestamp > 0.0 else None,
+            self._arrived_ns(realtime_ns),
+            realtime_ns,
             message.is_remote_frame,
             message.is_error_frame,
         )

@@ -147,6 +147,11 @@ class CanDriver(Generic[O]):
         finally:
             watch.cancel()
 
+    def poll_from_now_on(self) -> Callable[[], None]:
+        """Leave it to the caller when the bus is read; what to call for it. Before `run`."""
+        self._bus.polled = True
+        return self._bus.poll
+
     def feed(self, frame: CanFrame) -> None:
         """Take one data frame, off the bus or out of a log: what it completes is handed over."""
         measurements = self._decoder.feed(frame)

@@ -25,7 +25,11 @@ from fusiond.live.chain import Chain
 from fusiond.live.front import Front
 from fusiond.live.journal import handler
 from fusiond.live.message_keeper import MessageKeeper
-from fusiond.live.process_usage import release_start_memory, share_one_heap
+from fusiond.live.process_usage import (
+    release_start_memory,
+    share_one_heap,
+    widen_descriptor_table,
+)
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
@@ -215,6 +219,7 @@ class Daemon:
 
     def _tick(self, t_ns: int) -> None:
         delay_ns = self.clock.now_ns() - t_ns
+        self.sources.poll()
         self.recorder.tick_begins(t_ns)
         solution = self._chain.tick(t_ns)
         if self.recorder.active:
@@ -290,6 +295,7 @@ def run_daemon(
     log.info("configuration %s", config_path)
     sys.setswitchinterval(SWITCH_S)
     share_one_heap()
+    widen_descriptor_table()
 
     async def main(compiling: Forked | None) -> None:
         if isinstance(written, StandardErrorHandler):

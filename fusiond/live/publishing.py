@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 
 from fusiond.configuration.load import config_digest
@@ -39,6 +39,10 @@ STATUS_EVERY_S = 1
 CALIBRATION_EVERY_S = 30
 
 
+Make = Callable[[int, int | None], tuple[Topic, Message] | None]
+"""A message of the instant (monotonic ns, UTC ns), where there is anything to say."""
+
+
 class Publishing:
     """Makes a vehicle's messages in the tick and hands them to every output, which keeps them."""
 
@@ -65,7 +69,8 @@ class Publishing:
         self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
-        self._waiting: deque[tuple[Topic, Message]] = deque()
+        self._waiting: deque[Make] = deque()
+        self._spare_ns = round(0.5 * SECOND_NS / config.scheduler.rate_hz)
         self.serve(config, outputs)
 
     def serve(self, config: Config, outputs: Mapping[str, Output]) -> None:
@@ -79,20 +84,26 @@ class Publishing:
     def tick(self, t_ns: int, solution: Solution) -> None:
         """Publish what is due at the tick of `t_ns`, the status at every change of mode too.
 
-        The large messages of a second are of one instant and go out a tick each: a broker hands one
-        to all its clients before the next, and the next solution would wait for all of them."""
+        The large messages of a second are made and go out a tick each, in ticks that have half of
+        their period left: the filter may have gone back for a late fix, and a broker hands a
+        message to all its clients before the next, so that the next solution would wait."""
         changed = solution.mode is not self._mode
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
         utc_ns = self._clock.utc_ns(t_ns)
         self._publish_nav(t_ns, utc_ns, solution)
         self._publish_messages()
-        if self._health.due(t_ns):
-            self._publish_waiting(most=len(self._waiting))
-            self._waiting.extend(self._of_health(t_ns, utc_ns))
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
-        self._publish_waiting(most=1)
+        due = self._health.due(t_ns)
+        while self._waiting and (due or self._clock.now_ns() - t_ns < self._spare_ns):
+            message = self._waiting.popleft()(t_ns, utc_ns)
+            if message is not None:
+                self._publish(*message)
+                if not due:
+                    break
+        if due:
+            self._waiting.extend((self._health_of, self._consistency_of, self._innovations_of))
         self._publish_calibration(t_ns, utc_ns)
 
     def _publish(self, topic: Topic, message: Message) -> None:
@@ -153,30 +164,26 @@ class Publishing:
             ),
         )
 
-    def _publish_waiting(self, most: int) -> None:
-        for _ in range(min(most, len(self._waiting))):
-            self._publish(*self._waiting.popleft())
-
-    def _of_health(self, t_ns: int, utc_ns: int | None) -> Iterator[tuple[Topic, Message]]:
+    def _health_of(self, t_ns: int, utc_ns: int | None) -> tuple[Topic, Message]:
         cpu_percent, memory_mb = self._usage.sample()
-        yield (
-            HEALTH,
-            health_message(
-                utc_ns,
-                sources=self._sources.health(t_ns),
-                outputs={name: _health(output) for name, output in self._outputs.items()},
-                scheduler=self._scheduler(),
-                clock=self._clock.status(),
-                cpu_percent=cpu_percent,
-                memory_mb=memory_mb,
-            ),
+        message = health_message(
+            utc_ns,
+            sources=self._sources.health(t_ns),
+            outputs={name: _health(output) for name, output in self._outputs.items()},
+            scheduler=self._scheduler(),
+            clock=self._clock.status(),
+            cpu_percent=cpu_percent,
+            memory_mb=memory_mb,
         )
+        return HEALTH, message
+
+    def _consistency_of(self, _: int, utc_ns: int | None) -> tuple[Topic, Message] | None:
         reports = self._navigator.verdicts.reports()
-        if reports:
-            yield CONSISTENCY, consistency_message(utc_ns, reports)
+        return (CONSISTENCY, consistency_message(utc_ns, reports)) if reports else None
+
+    def _innovations_of(self, _: int, utc_ns: int | None) -> tuple[Topic, Message] | None:
         innovations = self._innovations.since()
-        if innovations:
-            yield INNOVATIONS, innovations_message(utc_ns, innovations)
+        return (INNOVATIONS, innovations_message(utc_ns, innovations)) if innovations else None
 
 
 def _health(output: Output) -> OutputHealth:

@@ -36,6 +36,10 @@ from fusiond.navigator.source_status import worst
 from fusiond.outputs.messages.fault import FaultReport, fault_report
 from fusiond.outputs.messages.health import BeamHealth, SatelliteHealth, SkyHealth, SourceHealth
 
+POLLED_HZ = 50.0
+"""Least tick rate by which the buses are read: of a full 500 kbit/s bus 80 frames wait for such a
+tick, and a socket of Linux's default size holds 277."""
+
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
 
@@ -75,11 +79,15 @@ class Sources:
         self.on_mail: Callable[[Mail], None] = lambda mail: None
         """Hears of short messages."""
         self.all: dict[str, Source] = {}
+        self._polls: list[Callable[[], None]] = []
         points = driver_entry_points()
         for name, section in config.sources.items():
             make = points[section.driver].load()
             driver = make(name, make.Options(**section.options), self._emit, clock.now_ns)
             self.all[name] = Source(name, driver)
+            begin = getattr(driver, "poll_from_now_on", None)
+            if begin is not None and config.scheduler.rate_hz >= POLLED_HZ:
+                self._polls.append(begin())
 
     async def run(self) -> None:
         """Serve every device until cancelled."""
@@ -101,6 +109,11 @@ class Sources:
             return
         for left in self._injection.pass_on(item):
             self._receive(left)
+
+    def poll(self) -> None:
+        """Read the buses: before a tick, which is then the only wake for their frames."""
+        for poll in self._polls:
+            poll()
 
     def release(self, t_ns: int) -> None:
         """Take in what an injected delay has held back until the tick at `t_ns`."""

@@ -54,3 +54,18 @@ assert numba.njit(lambda x: x * 2.0 + 1.0)(3.0) == 7.0
 assert numba.njit(lambda: turned(0.0, 0.0, 0.0)[0] + 1.0)() == 2.0
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
+
+
+def test_the_table_of_descriptors_never_grows_while_threads_wait() -> None:
+    """`FDSize` of proc(5) is the size of the table; a process has 64 or 256 at its start."""
+    script = """
+import resource
+from pathlib import Path
+from fusiond.live.process_usage import widen_descriptor_table
+resource.setrlimit(resource.RLIMIT_NOFILE, (1000, 1000))
+widen_descriptor_table()
+fields = dict(l.split(":", 1) for l in Path("/proc/self/status").read_text().splitlines())
+assert int(fields["FDSize"]) >= 1000, fields["FDSize"]
+assert len(list(Path("/proc/self/fd").iterdir())) < 20
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=300)

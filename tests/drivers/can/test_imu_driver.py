@@ -70,6 +70,10 @@ class Running:
             lambda: self.now_ns,
         )
 
+    def follow_the_host(self) -> None:
+        """Take the host's clock for the driver's."""
+        self.driver._bus._now_ns = time.monotonic_ns
+
     @property
     def samples(self) -> list[ImuSample]:
         return [e for e in self.emitted if isinstance(e, ImuSample)]
@@ -139,6 +143,47 @@ async def test_samples_silence_and_recovery(interface: str, channel: str) -> Non
             send(sender, 100)
             await until(lambda: imu.driver.status.state == "running")
     assert imu.codes == []
+
+
+async def test_a_polled_bus_is_read_when_its_owner_asks() -> None:
+    """Each frame has the instant of its arrival, not that of the poll."""
+    imu = Running(**{**SIM_IMU.model_dump(), "interface": "udp_multicast", "channel": GROUP})
+    imu.follow_the_host()
+    poll = imu.driver.poll_from_now_on()
+    encoder = CanImu()
+    async with imu.run():
+        with can.Bus(interface="udp_multicast", channel=GROUP, ignore_config=True) as sender:
+            sent_ns = []
+            for k in range(3):
+                sent_ns.append(time.monotonic_ns())
+                for message in encoder.frames(k, 5_000_000 * k, (0.0, 0.0, 0.3), (0.0, 0.0, -9.8)):
+                    sender.send(message)
+                await asyncio.sleep(0.02)
+            assert imu.samples == []
+            polled_ns = time.monotonic_ns()
+            poll()
+            assert len(imu.samples) == 3
+            ends_ns = [*sent_ns[1:], polled_ns]
+            for sample, after_ns, before_ns in zip(imu.samples, sent_ns, ends_ns, strict=True):
+                # CLOCK_REALTIME and CLOCK_MONOTONIC are read one after the other.
+                assert after_ns - 1_000_000 < sample.t_seen_ns < before_ns
+            poll()
+            assert len(imu.samples) == 3
+
+
+async def test_a_polled_bus_that_breaks_down_is_left_and_opened_again() -> None:
+    imu = Running(**{**SIM_IMU.model_dump(), "interface": "udp_multicast", "channel": GROUP})
+    poll = imu.driver.poll_from_now_on()
+    async with imu.run():
+        bus = imu.driver._bus._bus
+        assert bus is not None
+        reader, writer = os.pipe()
+        os.dup2(reader, bus.fileno())
+        os.close(reader)
+        os.close(writer)  # it can be read now, but is no socket
+        poll()
+        await until(lambda: imu.driver.counters["bus_opened"] == 2)
+        assert "interface_up" in imu.codes
 
 
 async def test_bus_stamps_are_reported() -> None:
