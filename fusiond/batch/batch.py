@@ -29,7 +29,7 @@ def run_batch(
     runner: Runner,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
-    """Number of rows that were there, and of new rows by how they ended.
+    """Write a row for each log; the counts of rows by outcome.
 
     Raises `ConfigError`, `MissingPackageError`, `TableError` for an `out` that is no file of rows,
     OSError; of what happens to a log nothing.

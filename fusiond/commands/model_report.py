@@ -52,7 +52,7 @@ def model_report(name: str, config: Config | None) -> dict[str, Any]:
 
 
 def print_model(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print a model in the units of data sheets, to standard output or the given console."""
+    """Print a model in the units of data sheets, to `console` or standard output."""
     console = console or Console()
     held = ", height held" if report["hold_height"] else ""
     console.print(f"{report['model']}: {report['size']} states{held}", highlight=False)

@@ -108,7 +108,7 @@ def process(
 
 @contextmanager
 def _missing_packages() -> Iterator[None]:
-    """Exit with the reason where a package for a file's format is not installed."""
+    """Exit with the reason where the package of a file format is missing."""
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     try:
@@ -141,8 +141,8 @@ def calibrate(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML: of files, or
-    of the daemon's own recording."""
+    """Estimate mounting, lever arms, offsets and scales from one recorded drive, as TOML; input:
+    files or a recording of the daemon."""
     aids = [_aid_argument(text) for text in aid or []]
     if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
@@ -240,7 +240,7 @@ def compare(
     ] = 0.0,
     json_path: JsonPath = None,
 ) -> None:
-    """Errors of a solution, and how they sit with its stated sigma."""
+    """Compare a solution with a truth: errors, and their ratio to the stated sigma."""
     from fusiond.commands.compare_report import print_report  # noqa: PLC0415
     from fusiond.files.csv_tables import file_report  # noqa: PLC0415
     from fusiond.files.tables import read_solution, read_truth  # noqa: PLC0415
@@ -263,7 +263,7 @@ def compare(
 
 
 def _aid_argument(text: str) -> tuple[str, Path]:
-    """KIND=FILE."""
+    """Parse KIND=FILE."""
     kind, equals, path = text.partition("=")
     if not equals or not path or kind not in AID_KINDS:
         raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
@@ -271,7 +271,7 @@ def _aid_argument(text: str) -> tuple[str, Path]:
 
 
 def _outage_argument(text: str) -> Outage:
-    """START:LENGTH[:SOURCE,...]."""
+    """Parse START:LENGTH[:SOURCE,...]."""
     start, _, rest = text.partition(":")
     length, colon, sources = rest.partition(":")
     try:
@@ -287,7 +287,7 @@ def _outage_argument(text: str) -> Outage:
 
 
 def _systems_argument(text: str | None) -> tuple[System, ...] | None:
-    """C,G,E."""
+    """Parse satellite systems such as C,G,E."""
     if text is None:
         return None
     from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
@@ -299,7 +299,7 @@ def _systems_argument(text: str | None) -> tuple[System, ...] | None:
 
 
 def _print_summary(result: dict[str, Any], err: bool) -> None:
-    """`files`: what was read; `sources`: each aid's measurements by outcome; the solution."""
+    """Print what `files` were read, each source's measurements by outcome, and the solution."""
     for name, report in result["files"].items():
         _print_file(name, report, err)
     for name, outcomes in result["sources"].items():
@@ -327,7 +327,7 @@ def _print_summary(result: dict[str, Any], err: bool) -> None:
 
 
 def _print_file(name: str, report: dict[str, Any], err: bool) -> None:
-    """One file as `csv_tables.file_report` describes it."""
+    """Print the report of one file, made by `csv_tables.file_report`."""
     rejected = sum(report["rejected"].values())
     typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
     for row in report["first_rejected"]:

@@ -35,7 +35,7 @@ log = typer.Typer(help="Recordings: look into, cut, join, mend, hand on.", no_ar
 
 @contextmanager
 def log_errors() -> Iterator[None]:
-    """Exit 65 for what is no log, 74 for what cannot be read."""
+    """Exit 65 for a file that is not a log, 74 for one that cannot be read."""
     from fusiond.recording.reader import LogError  # noqa: PLC0415
 
     try:
@@ -159,7 +159,7 @@ def merge(logs: LogPaths, out: OutPath) -> None:
 def recover(
     damaged: Annotated[Path, typer.Argument(metavar="LOG", help="One file.")], out: OutPath
 ) -> None:
-    """Write what can be read of a file that was cut off or damaged."""
+    """Copy all readable messages of a damaged or truncated log."""
     from fusiond.recording.edit import recover as mend  # noqa: PLC0415
 
     with log_errors(), spinner("reading"):

@@ -34,7 +34,7 @@ def report(
         typer.Option(metavar="F.html", help="The page; here, by the first file's name, if none."),
     ] = None,
 ) -> None:
-    """Write what happened on a drive, or on many, as one HTML file, which needs no network."""
+    """Write a report of one drive, or of many, as one HTML file that needs no network."""
     if (batch is None) == (not run) or (batch is not None and (truth or beside)):
         raise typer.BadParameter("a log or a solution, or --batch with rows and nothing else")
     if out is None:

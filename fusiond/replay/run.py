@@ -113,7 +113,7 @@ class _Files:
 
 
 class _Run:
-    """A replay and what is counted of it."""
+    """Replay with its counters."""
 
     def __init__(self, recording: Log, config: Config, same: bool, out: _Files | None) -> None:
         self._recording = recording
@@ -185,7 +185,7 @@ class _Run:
 
 
 async def _publish(run: _Run, config: Config, speed: float) -> None:
-    """At `speed` times real time, what the daemon would publish."""
+    """Publish the daemon's messages at `speed` times real time."""
     mqtt = MqttPublisher(config.mqtt, config.vehicle, on_event=lambda code, text: None)
     run.listeners.append(partial(mqtt.publish, EVENT))
     sending = asyncio.create_task(mqtt.run())
