@@ -35,7 +35,7 @@ EPOCHS = 100
 
 
 def raw_epoch(_: int) -> Callable[[], int]:
-    """Work of `EPOCHS` epochs, each with all that the daemon does with one."""
+    """Work of `EPOCHS` epochs, each processed as in the daemon."""
     truth = SCENARIOS["drive"].truth(10.0)
     receiver = GnssRaw(truth, GnssRawOptions(signals=SIGNALS), np.random.default_rng(1))
     section = RawAiding(systems=("G", "C"))

@@ -94,7 +94,7 @@ class Imu(Section):
     gyro_range_deg_s: PositiveFloat | None = None
     """Full scale of the data sheet: a rate that reaches it is rejected as `saturated`."""
     accel_range_g: PositiveFloat | None = None
-    """The same for specific force."""
+    """Full scale of specific force."""
     gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
     """Angle random walk."""
     accel_noise_m_s_sqrt_h: PositiveFloat = 0.1

@@ -70,8 +70,7 @@ class Biases:
 
 
 def _bias_slots(config: bytes | None) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]] | None:
-    """For each axis (gyro x, y, z, accel x, y, z) its slots; None where the configuration does not
-    say which model ran."""
+    """Slots of the biases of each axis (gyro x, y, z, accel x, y, z); None for an unknown model."""
     try:
         data = json.loads(config or b"")
         estimator = Estimator.model_validate(data["estimator"])

@@ -110,7 +110,7 @@ def _sections(run: Run, truth: TrajectoryTable | None) -> list[Section]:
 
 
 def _joined(runs: Sequence[Sequence[Section]], zeros: Sequence[float]) -> list[dict[str, Any]]:
-    """Sections by title and items by key, those of two runs in one row."""
+    """Merge sections by title and items by key, so that two runs share a row."""
     titles = dict.fromkeys(section.title for sections in runs for section in sections)
     # A run without a section does not move it to the end.
     order = max(runs, key=len)
