@@ -40,7 +40,7 @@ CALIBRATION_EVERY_S = 30
 
 
 class Publishing:
-    """Makes a vehicle's messages in the tick and hands them to every output, which keeps them."""
+    """Builder of a vehicle's messages in the tick, which hands them to every output."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Publishing:
         self.serve(config, outputs)
 
     def serve(self, config: Config, outputs: Mapping[str, Output]) -> None:
-        """From now on by this configuration, to these outputs."""
+        """Switch to this configuration and these outputs."""
         self._outputs = outputs
         self._digest = config_digest(config)
         self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
@@ -77,7 +77,7 @@ class Publishing:
         self._calibrated: tuple[CalibrationState, ...] = ()
 
     def tick(self, t_ns: int, solution: Solution) -> None:
-        """Publish what is due at the tick of `t_ns`, the status at every change of mode too.
+        """Publish the messages due at the tick of `t_ns`, and the status at every change of mode.
 
         The large messages of a second are of one instant and go out a tick each: a broker hands one
         to all its clients before the next, and the next solution would wait for all of them."""

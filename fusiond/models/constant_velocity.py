@@ -22,8 +22,8 @@ NAME = "constant_velocity"
 
 
 def constant_velocity(manoeuvre: tuple[float, float, float], extra: Sequence[Block] = ()) -> Model:
-    """The model with acceleration sigmas (m/s^2), horizontal and vertical, that last for a time (s)
-    and the further blocks of its measurements."""
+    """Model with acceleration sigmas (m/s^2), horizontal and vertical, of a correlation time (s),
+    and further blocks of its measurements."""
     level, vertical, lasts_s = manoeuvre
     return Model(
         NAME,

@@ -43,7 +43,7 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
 
 
 class ConstraintMaker:
-    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
+    """Maker of the constraints of `[constraints]` from samples in chunks of any size.
 
     `noise` is the IMU's; `rest_evidence` hears of what is measured; `drifts` say how much of the
     typed side drift counts.

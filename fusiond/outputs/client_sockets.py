@@ -112,7 +112,7 @@ class Guests:
                 self._end()
 
     def due(self) -> None:
-        """True if work is due that no descriptor signals."""
+        """Schedule a turn for work that no descriptor signals."""
         if self._paused is None and self._due is None:
             self._due = asyncio.get_running_loop().call_soon(self._turn)
 

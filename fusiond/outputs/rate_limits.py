@@ -28,7 +28,7 @@ MESSAGES = Rate(25.0, 50.0)
 """Requests. gpsd's clients poll once a report, and receivers report at 20 Hz at most; a Foxglove
 viewer sends one for each panel of a layout."""
 MICROSECONDS = Rate(20_000.0, 20_000.0)
-"""Processor time for a client's requests: 2 % of a core, a fifth of that for all clients."""
+"""Processor time for a client's requests: 2 % of a core, a fifth of the time of all clients."""
 
 
 class Bucket:

@@ -63,7 +63,7 @@ class Incoming:
         return self._quiet.next()
 
     def over(self) -> None:
-        """True if the pause is over."""
+        """End the pause."""
         self._flooded.clear()
         self._restart()
 

@@ -44,7 +44,7 @@ class AlignmentOptions:
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
-    """From `[alignment]` and `[constraints.zero_velocity]`."""
+    """Options of alignment from `[alignment]` and `[constraints.zero_velocity]`."""
     a, rest = config.alignment, config.constraints.zero_velocity
     no_slip = config.constraints.non_holonomic
     position = a.position_deg_m

@@ -1,4 +1,4 @@
-"""Attitude, also of a star tracker, which may be mounted askew."""
+"""Attitude, also of a star tracker, which may be misaligned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bearings of known points, as a radar sees them."""
+"""Bearings of known points, as from a radar."""
 
 from __future__ import annotations
 
