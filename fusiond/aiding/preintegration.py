@@ -37,12 +37,12 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 CLEAR = 3.0
-"""Sigmas of its noise beyond which a smoothed rate is a turn."""
+"""Sigmas of noise beyond which a smoothed rate is a turn."""
 
 
 @compiled("f8(f8[::1], i8)", forceinline=True)
 def turning(step: Array, axis: int) -> float:
-    """Rate (rad/s) about an axis of the body, smoothed, that is no noise, of a `step` (28,)."""
+    """Smoothed rate (rad/s) about a body axis of a `step` (28,); zero within its noise."""
     rate: float = step[STEP_SMOOTH_RATE_B + axis]
     left = rate * rate - CLEAR * CLEAR * step[STEP_NOISE_B + axis]
     return left / rate if left > 0.0 else 0.0

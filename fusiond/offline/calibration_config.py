@@ -92,8 +92,8 @@ def calibrated(config: Config, found: Mapping[str, Parameter]) -> Config:
 
 
 def configured(config: Config, before: Config, p: Parameter) -> tuple[str, float]:
-    """Key and value of a parameter in a configuration that `calibrated` made of `before`; an empty
-    key and the parameter's own value where there is no key for it."""
+    """Key and value of a parameter in the configuration that `calibrated` made of `before`; an
+    empty key and the parameter's own value without a key."""
     imu = config.imu
     if p.kind == MOUNTING:
         axis = (ROLL, PITCH, YAW).index(p.name)
@@ -154,12 +154,12 @@ def fragment(
 
 
 def _axis(p: Parameter) -> str:
-    """Of a lever arm's parameter, whose name ends in `x_m`."""
+    """Axis of a lever arm's parameter, whose name ends in `x_m`."""
     return p.name.removesuffix("_m")[-1]
 
 
 def _first_receiver(config: Config) -> str:
-    """The receiver whose fixes say the time: the first that has an offset."""
+    """Reference receiver of the time: the first with an offset."""
     for name, section in config.aiding.items():
         if isinstance(section, GnssAiding) and section.time_offset_sd_s:
             return name
