@@ -78,7 +78,7 @@ def any_likely(bank: Array, lanes: Array) -> bool:
 def judge_what_waits(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, found: Array
 ) -> None:
-    """Odds of an epoch that nobody has read until now."""
+    """Compute the odds of a deferred epoch."""
     if bank[UNWEIGHED] < np.inf:
         epoch_s = bank[UNWEIGHED]
         bank[UNWEIGHED] = np.inf

@@ -38,7 +38,7 @@ BENT_RAD = 0.01
 
 @compiled("void(f8[::1], f8[::1], f8[::1])", allocates=True)
 def moved(guess: Array, step: Array, there: Array) -> None:
-    """Write a guess `there` (19,) that is by a step (13,) from another."""
+    """Write the guess `there` (19,) that differs from another by a step (13,)."""
     turn = np.empty((3, 3))
     turn_to_dcm(step[0], step[1], step[2], turn)
     for i in range(3):
