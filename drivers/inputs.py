@@ -59,6 +59,6 @@ class Inputs:
             self._held_ns = None
 
     def sent(self, data: bytes) -> None:
-        """Tell who listens what the driver has sent to its device."""
+        """Report data sent to the device to the listener."""
         if self.on_input is not None:
             self.on_input("sent", self.now_ns(), data)

@@ -42,19 +42,19 @@ Carriage = Literal["binary", "ascii", "bcd"]
 
 
 class CutError(FieldError):
-    """An envelope that is shorter or longer than it says."""
+    """Error: an envelope shorter or longer than it states."""
 
 
 class DamagedError(FieldError):
-    """An envelope whose check or content cannot be."""
+    """Error: an envelope with a wrong check or contents."""
 
 
 class VersionError(FieldError):
-    """An envelope of a version or a kind that is not known here."""
+    """Error: an envelope of an unknown version or kind."""
 
 
 class Envelope(NamedTuple):
-    """`crc` is that of the envelope, by which its receipt names it."""
+    """Envelope; its `crc` identifies it in receipts."""
 
     kind: int
     body: bytes
@@ -104,7 +104,7 @@ def read_receipt(body: bytes) -> Receipted:
 
 
 def carried(envelope: bytes, carriage: Carriage) -> Wording:
-    """An envelope as a terminal carries it."""
+    """Encode an envelope as a terminal's text."""
     match carriage:
         case "binary":
             return mixed(envelope)
@@ -115,7 +115,7 @@ def carried(envelope: bytes, carriage: Carriage) -> Wording:
 
 
 def opened(wording: Wording) -> Envelope | None:
-    """The envelope that a message holds, None where it is somebody else's kind of message.
+    """Envelope in a message, None for other messages.
 
     CutError, DamagedError, VersionError for one that is ours by its mark and cannot be read.
     """

@@ -40,8 +40,8 @@ def _follow(
     mean: Array,
     out: Array,
 ) -> None:
-    """Add to `out` (m, 6) the density after each of `samples` (m, 6); `mean` (13,) goes on from
-    call to call: smoothed rates and forces, their means, and of how many samples they are."""
+    """Add to `out` (m, 6) the density after each of `samples` (m, 6). `mean` (13,) persists from
+    call to call: smoothed rates and forces, their means, and the number of samples."""
     for i in range(samples.shape[0]):
         mean[12] += 1.0
         fast, slow = max(gain, 1.0 / mean[12]), max(slow_gain, 1.0 / mean[12])

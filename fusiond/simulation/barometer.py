@@ -69,5 +69,5 @@ class Barometer:
 
 
 def barometer_stream(seed: int) -> np.random.Generator:
-    """A generator independent of the other devices'."""
+    """Generator independent of the other devices'."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(102,)))

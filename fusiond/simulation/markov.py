@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @compiled("void(f8[:, ::1], f8)")
 def _decaying(process: Array, decay: float) -> None:
-    """Row by row add to what drives the processes (n, columns) what is left of the row before.
+    """Add to each row of the processes' input (n, columns) the decayed row before.
 
     As scipy's `lfilter`, to the bit; its package takes a second to load."""
     for k in range(1, process.shape[0]):

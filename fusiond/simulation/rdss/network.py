@@ -44,7 +44,7 @@ class MessageNetwork:
     _terminals: dict[int, RdssTerminal] = field(default_factory=dict)
 
     def join(self, terminal: RdssTerminal) -> None:
-        """Carry this terminal's messages, and others' to it."""
+        """Connect a terminal, whose messages are carried to and from others."""
         self._terminals[terminal.options.user] = terminal
         terminal.carry = self.carry
 
@@ -87,7 +87,7 @@ class ConvoyVehicle:
         ahead.carry = self._receive
 
     def tick(self, t_s: float) -> None:
-        """Say what is due."""
+        """Deliver due messages."""
         if t_s >= self._next_report_s:
             self._next_report_s = t_s + self.REPORT_S
             self._say(carried(sealed(REPORT, encode_report(self._report(t_s))), "binary"), t_s)
