@@ -72,8 +72,7 @@ def _later(shared: Mapping[str, Read], name: str) -> Read:
 
 
 def _message(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
-    """Reader of an object. It requires at least one field of its topic, since each may be absent.
-    """
+    """Reader of an object. It requires at least one field of its topic, since each may be absent."""
     read = reader(schema, shared)
 
     def message(said: Any) -> Any:

@@ -135,8 +135,7 @@ def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """True if a kind concerns these rows: of its device, or of any and this one locates or moves.
-    """
+    """True if a kind concerns these rows: of its device, or of any and this one locates or moves."""
     if ints[kind, SIGNATURE] <= FOLLOWED:
         return False
     if measures == PLACES and not ints[kind, LOCATES]:

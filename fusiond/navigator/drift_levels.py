@@ -111,8 +111,7 @@ class DriftLevels:
         return 1.0 if drift is None else drift.at(t_ns)
 
     def look(self, e: Estimator) -> None:
-        """Evaluate the filter's state at an instant of the grid, once nothing earlier can arrive.
-        """
+        """Evaluate the filter's state at an instant of the grid, once nothing earlier can arrive."""
         if speed_of(e.nav) < MOVES_M_S:
             return
         for drift in self._drifts.values():

@@ -43,7 +43,7 @@ class Fault:
     q: float = 1.0
     r: float = 1.0
     correlation: float = 0.0
-    """Of successive measurement errors, a first-order Gauss-Markov sequence."""
+    """Correlation of successive measurement errors, a first-order Gauss-Markov sequence."""
     delay_s: float = 0.0
 
 

@@ -1,4 +1,4 @@
-"""Faults beyond those of the matrix, for recorded drives: other sizes, and several at once."""
+"""Further faults for recorded drives: other sizes, and several at once."""
 
 from __future__ import annotations
 
@@ -115,4 +115,4 @@ MORE: dict[str, Fault] = {
 }
 
 EVERY = {**FAULTS, **MORE}
-"""Those of the matrix and these."""
+"""Faults of the matrix and of this module."""
