@@ -1,4 +1,4 @@
-"""Budget of bytes parsed of a line: as many as a receiver sends, whoever sends them.
+"""Limit on the bytes parsed of a line, set by the fastest rate of a real receiver.
 
     a bucket of BURST bytes, filled at the line's rate; each byte read takes one out of it
 

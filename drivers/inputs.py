@@ -1,4 +1,4 @@
-"""The door of a driver: what moves it from outside comes in here, one thing after the other.
+"""Single entry point of a driver: all external input arrives here, in sequence.
 
 A driver is a function of its inputs. While one of them is handled the driver's time stands at the
 instant at which it came, so that the same inputs, taken again from a recording, give the same

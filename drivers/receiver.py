@@ -1,4 +1,4 @@
-"""Common part of receiver and compass drivers: one on one line, read and judged.
+"""Common base of receiver and compass drivers: one device on one line.
 
 A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
 silent, and says in `status` whether the device is there and intelligible.

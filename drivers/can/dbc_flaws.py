@@ -1,4 +1,4 @@
-"""Readable part of a damaged DBC file: messages one by one, the others by name.
+"""Recovery of the readable messages of a damaged DBC file; the others are named.
 
 Of public files one in six has a flaw somewhere: an identifier of 29 bits without the mark of one
 (bit 31), a name that begins with a digit, a comma for a decimal point, a comment without its

@@ -1,4 +1,4 @@
-"""A device's own time out of a counter that wraps: unwrapped, and known to begin anew. No I/O.
+"""Device time from a wrapping counter: unwrapped, with restarts detected. No I/O.
 
     lateness l(k) = l(k-1) + (arrival(k) - arrival(k-1)) - (device(k) - device(k-1)) >= 0
 

@@ -1,5 +1,5 @@
-"""Result of an NMEA epoch's sentences: a fix, a heading, a report of UTC, or the name of
-why there is none. No I/O, no clock.
+"""Fix, heading or UTC report from an NMEA epoch's sentences, or the name of the refusal. No I/O, no
+clock.
 
 The receivers' own protocols have theirs in `drivers.solution`; these say their quality, their date
 and their height in more ways than one.

@@ -102,7 +102,8 @@ def note(names: Counter[str], name: str) -> None:
 
 
 def own_name(address: str, fields: Sequence[str]) -> str:
-    """Name of a maker's own sentence by its address, and by its kind if the first field states it."""
+    """Name of a maker's own sentence by its address, and by its kind if the first field states
+    it."""
     kind = fields[0] if fields else ""
     is_kind = kind.isalnum() and len(kind) in KIND_LETTERS
     return f"{address},{kind}" if is_kind else address

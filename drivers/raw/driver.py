@@ -216,7 +216,8 @@ class GnssDecoder:
         self.undelayed = 0 if served else len({s.prn for s in beidou})
 
     def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
-        """Report UTC of RXM-RAWX, if the receiver knows the leap seconds and sends no RMC or ZDA."""
+        """Report UTC of RXM-RAWX, if the receiver knows the leap seconds and sends no RMC or
+        ZDA."""
         if self._raw is None or self._raw.leap_seconds is None:
             return
         if not isinstance(epoch.stamp, UtcStamp):

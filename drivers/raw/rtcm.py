@@ -197,8 +197,8 @@ class RtcmDecoder:
         return [RawGnssEpoch(self._source, self._t_seen_ns, stamp, week, tow_s, signals)]
 
     def _parameters(self, bits: Bits) -> None:
-        """Note the system parameters of 1013: day (DF051, modified Julian), second of UTC's day (DF052),
-        leap seconds (DF054); implausible ones are None."""
+        """Note the system parameters of 1013: day (DF051, modified Julian), second of UTC's day
+        (DF052), leap seconds (DF054); implausible ones are None."""
         self._counters["rtcm_system_parameters"] += 1
         day, second, leap = bits.unsigned(24, 16), bits.unsigned(40, 17), bits.unsigned(62, 8)
         if not within(leap, PLAUSIBLE_LEAP_SECONDS):

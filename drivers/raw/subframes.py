@@ -120,7 +120,8 @@ def check_orbit(found: Ephemeris) -> None:
 
 
 def week_of_toe(week: int, tow_s: float, toe_s: float) -> int:
-    """Week of `toe_s`, given `week` and `tow_s` of the transmission: toe is never half a week away."""
+    """Week of `toe_s`, given `week` and `tow_s` of the transmission: toe is never half a week
+    away."""
     if toe_s - tow_s > HALF_WEEK_S:
         return week - 1
     if toe_s - tow_s < -HALF_WEEK_S:

@@ -1,5 +1,4 @@
-"""Envelope of short messages between vehicles with fusiond: an envelope with kind, version and
-check.
+"""Envelope of short messages between vehicles with fusiond: kind, version and check.
 
     0    1  0xF8 + kind
     1    n  body

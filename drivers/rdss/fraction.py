@@ -1,4 +1,4 @@
-"""The last byte of T in a 4.0 position reply: tenths or hundredths of a second, by vendor."""
+"""Last byte of the time T in a 4.0 position reply: tenths or hundredths of a second, by vendor."""
 
 from __future__ import annotations
 

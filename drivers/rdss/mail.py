@@ -1,4 +1,4 @@
-"""Mail of an RDSS driver: those that came, and how those sent fare.
+"""Short messages of an RDSS driver: those received, and the state of those sent.
 
 It stands by itself: a daemon without a terminal loads no more than this.
 """

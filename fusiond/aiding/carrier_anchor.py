@@ -1,4 +1,4 @@
-r"""Anchor of carriers: the epoch from which they are counted, with a clone of the antenna's place.
+r"""Reference epoch of carrier phases, with a clone of the antenna's position.
 
 A carrier L, with the satellite's clock and the atmosphere taken off, is a range but for a constant
 as long as it is followed. Against an anchor epoch a, with s the satellite (ECEF, m), p the antenna,

@@ -1,4 +1,4 @@
-r"""Shares of a receiver's error: each fix's own, lasting for seconds, and longer.
+r"""Division of a receiver's error into a white part, one of seconds, and a longer one.
 
 A receiver states one sigma, s, of all that is wrong with a fix. One that errs anew with each fix is
 averaged out; one that fixes share for half a minute (multipath, satellites that come and go) or

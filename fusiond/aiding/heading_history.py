@@ -89,7 +89,8 @@ class HeadingHistory:
         del kept[: bisect_left(kept, kept[-1].t_ns - KEPT_NS, key=_instant)]
 
     def oriented_at(self, t_ns: int) -> Oriented | None:
-        """Attitude at `t_ns`, interpolated, or from the last heading; None where neither is valid."""
+        """Attitude at `t_ns`, interpolated, or from the last heading; None where neither is
+        valid."""
         kept = self._attitudes
         at = bisect_right(kept, t_ns, key=_instant)
         near = [one for one in kept[max(0, at - 1) : at + 1] if abs(one.t_ns - t_ns) <= HOLDS_NS]

@@ -1,5 +1,4 @@
-r"""Preintegrated IMU data of a measurement: an acceleration, with the force's own errors, and a
- turn.
+r"""Preintegrated IMU data of a measurement: acceleration, with accelerometer errors, and rotation.
 
     a = C f + g,   d a = [f x] phi + C e,   e = db + ds f       (computed minus true, body axes)
 

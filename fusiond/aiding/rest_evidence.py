@@ -1,4 +1,4 @@
-r"""Evidence for or against rest beside a quiet sensor: measured speeds, and quiet at speed.
+r"""Evidence for or against rest beside a quiet IMU: measured speeds, and quiet while driving.
 
     m = sum(v_k) / n,   s = max(sd / sqrt(n), s_0),   contradicts rest if m^2 / s^2 > chi2(0.999)
 

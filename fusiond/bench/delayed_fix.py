@@ -1,4 +1,4 @@
-"""The worst tick: a fix that is 10 s late, on a vehicle with much to do again.
+"""Worst tick: a fix that is 10 s late, with much to process again after the rewind.
 
 IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at
 100 Hz. The tick in which the late fix comes takes it in, runs the last 10 s again with 2000 samples

@@ -62,7 +62,8 @@ class Step(NamedTuple):
 
 
 class Slew(NamedTuple):
-    """Slew: the clock, without its steps, gains `rate` s/s from `begin_ns` to `end_ns` of its time."""
+    """Slew: the clock, without its steps, gains `rate` s/s from `begin_ns` to `end_ns` of its
+    time."""
 
     begin_ns: int
     end_ns: int

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from fusiond.studies.stored_runs import KeptRuns
 
 FEWEST_RUNS = 8
-"""Fewest runs for workers: loading a worker's kernels takes two seconds, as long as several runs."""
+"""Fewest runs for workers: loading a worker's kernels takes two seconds, as long as several
+runs."""
 
 
 def schema(

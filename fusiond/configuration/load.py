@@ -1,4 +1,4 @@
-"""Read a vehicle's configuration; a mistake names file, key, value and what would do.
+"""Reader of a vehicle's configuration; errors name file, key, value and remedy.
 
 Every mistake in the file is listed, not the first alone; `fusiond.configuration.mistakes` words
 them.

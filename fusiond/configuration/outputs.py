@@ -1,4 +1,4 @@
-"""Sections `[outputs.NAME]`: what leaves besides MQTT. A section that stands there is served."""
+"""Sections `[outputs.NAME]`: outputs beside MQTT. A section that is present is enabled."""
 
 from __future__ import annotations
 

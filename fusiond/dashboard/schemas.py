@@ -1,4 +1,4 @@
-"""Messages by the published schemas: what is shown is what `fusiond schema` says a topic carries.
+"""Parser of messages by the published schemas of `fusiond schema`.
 
 `topics.json` holds the schemas of the topics that are shown, made of the daemon's own models by
 `python -m tools.topic_schemas`: the models themselves bring 250 MB of numerics along. A message is
@@ -72,7 +72,8 @@ def _later(shared: Mapping[str, Read], name: str) -> Read:
 
 
 def _message(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
-    """Reader of an object. It requires at least one field of its topic, since each may be absent."""
+    """Reader of an object. It requires at least one field of its topic, since each may be
+    absent."""
     read = reader(schema, shared)
 
     def message(said: Any) -> Any:

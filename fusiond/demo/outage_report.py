@@ -1,4 +1,4 @@
-"""Story of the demo's drive: what was lost without GNSS, and its share in sigma."""
+"""Summary of the demo's GNSS outages: error growth, and its ratio to sigma."""
 
 from __future__ import annotations
 

@@ -87,7 +87,8 @@ class Outcome(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """State for a later restore, `kept` and `held` as in `Memory`; `extra` is the estimator's own."""
+    """State for a later restore, `kept` and `held` as in `Memory`; `extra` is the estimator's
+    own."""
 
     t_ns: int
     sample: int
@@ -316,7 +317,8 @@ class Estimator:
             self.xi[self.model.slots_of_all(renewal.blocks)] = renewal.estimate
 
     def _leave(self, measurement: Linearised, codes: tuple[int, ...]) -> None:
-        """Clone the state for the next measurement; `codes` are the outcomes of the screened rows."""
+        """Clone the state for the next measurement; `codes` are the outcomes of the screened
+        rows."""
         if measurement.screened:
             renewal = measurement.leaves(self._view, codes)
             if renewal is not None:

@@ -1,4 +1,4 @@
-r"""Compiled kernel: covariances over several samples at once, to which a filter has added up.
+r"""Compiled kernel: propagation of covariances over several accumulated samples at once.
 
 A sample's transition is that of a step of strapdown navigation: C_nb, the force in navigation axes,
 rate and force in body axes (fusiond.navigation.error_model). All of it enters linearly, so that the

@@ -1,4 +1,4 @@
-r"""Compiled kernels: sigmas of the samples that a covariance crosses at once.
+r"""Compiled kernels: sigmas at the samples inside a block of the covariance's propagation.
 
 Where a solution is recorded at each sample, its sigmas are wanted at each, of a covariance that is
 brought from one crossing to the next (fusiond.estimators.block_covariance). What they are made of

@@ -28,7 +28,8 @@ def sensor_estimates(
 
 @compiled("void(f8[::1], i8, f8[::1], f8[::1], f8[::1])")
 def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Array) -> None:
-    """Write `rate` and `force` (3,) of sample i of `samples` (6 m,), corrected by `estimate` (12,)."""
+    """Write `rate` and `force` (3,) of sample i of `samples` (6 m,), corrected by `estimate`
+    (12,)."""
     at = 6 * i
     for j in range(3):
         rate[j] = (samples[at + j] - estimate[j]) / (1.0 + estimate[6 + j])

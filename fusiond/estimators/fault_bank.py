@@ -254,7 +254,8 @@ def awake(bank: Array, three: bool) -> tuple[int, int]:
 
 @compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)
 def explained_by_three(bank: Array, lanes: Array, j: np.uint64, c: np.uint64) -> float:
-    """Explained chi-square e^T L^-1 e of the group of three numbers at `j`, with constants at `c`."""
+    """Explained chi-square e^T L^-1 e of the group of three numbers at `j`, with constants at
+    `c`."""
     unsigned = np.uint64
     d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
     a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]

@@ -143,7 +143,8 @@ def settle(bank: Array, n: int) -> None:
 
 @compiled("void(f8[::1], i8, i8[::1], f8[:, ::1])", allocates=True)
 def mix(bank: Array, n: int, slots: Indices, t: Array) -> None:
-    """Multiply V <- T V, where T is the identity but for rows and columns `slots` (k,): t (k, k)."""
+    """Multiply V <- T V, where T is the identity but for rows and columns `slots` (k,): t (k,
+    k)."""
     settle(bank, n)
     width, phi = int(bank[WIDTH]), bank[int(bank[PHI]) :]
     for a in range(slots.shape[0]):

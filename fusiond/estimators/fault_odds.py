@@ -106,9 +106,11 @@ BEST, BEST_ODDS, AHEAD, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 
 @compiled("f8(f8[::1], i8, i8, f8[::1], f8, f8[::1])", allocates=True)
 def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
-    """Write M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,), with the
-    mean of its kind's `numbers` (7,) where `share` is 1, by Gauss-Jordan elimination of a positive
-    definite matrix. Returns e^T b: without a mean the explained chi-square l."""
+    """Write M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,).
+
+    With the mean of its kind's `numbers` (7,) where `share` is 1; by Gauss-Jordan elimination of a
+    positive definite matrix. Returns e^T b: without a mean the explained chi-square l.
+    """
     a = np.empty((3, 6))
     mean = numbers[MEAN] if share == 1.0 else 0.0
     for i in range(size):

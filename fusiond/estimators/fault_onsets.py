@@ -1,4 +1,4 @@
-r"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
+r"""Compiled kernels: onset of each hypothesis of a bank, and its initial step of states.
 
 As fusiond.estimators.fault_bank says. One of them is that a source's fault is over, which the
 filter has followed: its error is then what those faults f have done to it, as they are weighed,

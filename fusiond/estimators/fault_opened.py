@@ -1,4 +1,4 @@
-r"""Sizes of a bank's hypotheses, and their share of the published covariance.
+r"""Sizes of a bank's hypotheses, and the covariance that they add to the published one.
 
 Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
 the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,

@@ -1,5 +1,4 @@
-"""Compiled kernels: what the hypotheses of a bank say of a measurement's rows, and what these say
-of them.
+"""Compiled kernels: measurement rows under each hypothesis of a bank, and the update by them.
 
 As fusiond.estimators.fault_bank says, with the path by dead reckoning that a delay needs.
 """
@@ -135,7 +134,8 @@ def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """True if a kind concerns these rows: of its device, or of any and this one locates or moves."""
+    """True if a kind concerns these rows: of its device, or of any and this one locates or
+    moves."""
     if ints[kind, SIGNATURE] <= FOLLOWED:
         return False
     if measures == PLACES and not ints[kind, LOCATES]:

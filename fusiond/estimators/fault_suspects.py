@@ -1,4 +1,4 @@
-"""Compiled kernel: whether a hypothesis may be likely, at a fraction of what odds of all cost.
+"""Compiled kernel: cheap test for a likely hypothesis, before all odds are computed.
 
 With the prior's density taken for its largest, log odds are at most
 

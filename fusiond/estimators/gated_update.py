@@ -1,4 +1,4 @@
-"""A compiled kernel: gate, update, feedback, and what the bank of hypotheses makes of the rows."""
+"""Compiled kernel: gate, update, feedback, and the update of the fault bank."""
 
 from __future__ import annotations
 

@@ -116,9 +116,11 @@ class Hypotheses:
         return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
-        """Restart all hypotheses at `t_ns` with the filter's state (10,) and last step, at a start
-        or after removal of a fault's `mean` (n,) from the error state. A change of the mounting is
-        a turn."""
+        """Restart all hypotheses at `t_ns` with the filter's state (10,) and last step.
+
+        At a start, or after removal of a fault's `mean` (n,) from the error state; a change of the
+        mounting in it is a turn.
+        """
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned

@@ -1,4 +1,4 @@
-r"""The error-state filter in coordinates that a wrong heading does not spoil.
+r"""Error-state filter in invariant coordinates, consistent under a large heading error.
 
 A heading error turns all that was felt since the heading was last of no matter: a vehicle that has
 driven off in an unknown direction is somewhere on an arc. In dx that is a bent distribution; here

@@ -1,4 +1,4 @@
-r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock or by its own.
+r"""Compiled kernels: the published state, by the receiver's clock or the filter's own.
 
 A receiver defines the time that others label a solution with. Where a filter estimates by how much
 tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it

@@ -149,7 +149,8 @@ def conclude(
 
 @compiled("b1(i8[:, ::1], i8, i8)")
 def _said_later(ints: Indices, first: int, until_ns: int) -> bool:
-    """True if a row from `first` on is measured, applies in any state, and comes before `until_ns`."""
+    """True if a row from `first` on is measured, applies in any state, and comes before
+    `until_ns`."""
     for i in range(first, ints.shape[0]):
         if ints[i, T_NS] >= until_ns:
             return False

@@ -103,7 +103,8 @@ def _residuals(
     residual: Array,
     variance: Array,
 ) -> None:
-    """Write z - h dx and r + h P h^T, or r - h P h^T with a `sign` of -1, of every row (m,)."""
+    """Write residual and variance of every row (m,): z - h dx and r + h P h^T; r - h P h^T with a
+    `sign` of -1."""
     for k in range(groups):
         own, first, last = columns[k], begin[k], begin[k + 1]
         v, s, t = residual[first:last], variance[first:last], work[first:last]

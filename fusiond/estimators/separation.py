@@ -134,7 +134,8 @@ class SeparatedEstimator(KalmanEstimator):
         return self._device_of[measurement.source]
 
     def _fold_into_subsets(self, measurement: Linearised, i: Innovation) -> None:
-        """Fold a measurement into each subset but its own device's, if the subset's gate passes it."""
+        """Fold a measurement into each subset but its own device's, if the subset's gate passes
+        it."""
         own = self._device(measurement)
         for k in range(1, 1 + len(self.devices)):
             if k - 1 == own:

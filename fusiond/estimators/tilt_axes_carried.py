@@ -1,4 +1,4 @@
-"""Compiled kernels: P and sensitivities after an update that turned the axes of a tilt.
+"""Compiled kernels: rotation of P and sensitivities after an update that rotated the tilt axes.
 
 As fusiond.estimators.tilt_axes says, with what turn_rate and antenna_place add.
 """
@@ -119,8 +119,10 @@ def keep_rows(
     lever: Indices,
     late: Indices,
 ) -> None:
-    """Apply M (n, k) <- T M after an update of an estimate `before` that has rotated the axes by
-    `turned` (rad), preserving gyro errors and antenna position."""
+    """Apply M (n, k) <- T M after an update of an estimate `before`.
+
+    The update has rotated the axes by `turned` (rad); gyro errors and antenna position are kept.
+    """
     if gyros.size:
         told = before[_TOLD:_ARM_AFTER]
         for j in range(3):

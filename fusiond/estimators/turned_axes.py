@@ -1,4 +1,4 @@
-"""Effect of an interval on the tilt axes of a covariance: compiled kernels.
+"""Compiled kernels: effect of an interval on the tilt axes of a covariance.
 
 The equations are in fusiond.estimators.tilt_axes. Covariances (width, width) are flat, and nothing
 of P21 comes into what else they hold: it is made of P12 (fusiond.estimators.covariance). What

@@ -117,7 +117,8 @@ def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], f8[::1])")
 def feed_back(nav: Array, xi: Array, d: Array) -> None:
-    """Subtract the estimated errors `d` (n,) from `nav` (10,) and add its parameters to `xi` (n,)."""
+    """Subtract the estimated errors `d` (n,) from `nav` (10,) and add its parameters to `xi`
+    (n,)."""
     for i in range(CORE_SIZE, d.shape[0]):
         xi[i] += d[i]
     rotate_quaternion(nav[Q0:], d[0], d[1], d[2], True)

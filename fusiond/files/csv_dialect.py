@@ -72,7 +72,8 @@ def _unzipped(data: bytes) -> bytes:
 
 
 def _without_quotes(data: Text) -> Text:
-    """Remove quotes around cells, as R and spreadsheets write; numbers and column names need none."""
+    """Remove quotes around cells, as R and spreadsheets write; numbers and column names need
+    none."""
     if b'"' in first_line(data) or b'"' in first_line(data[len(first_line(data)) + 1 :]):
         return np.where(data == ord('"'), np.uint8(ord(" ")), data)
     return data

@@ -1,4 +1,4 @@
-"""Numeric CSV tables with a header row: read fast, and name every row that cannot be true.
+"""Fast reader of numeric CSV tables with a header row; it names every implausible row.
 
 `fusiond.files.csv_dialect` makes one dialect of several. Plain decimals are read by a compiled
 reader, other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank

@@ -1,5 +1,5 @@
-"""Installation of an extra into the running Python: no index has fusiond
-itself, so the packages are named."""
+"""Installation of an extra into the running Python. fusiond is on no package index, so its packages
+are named."""
 
 from __future__ import annotations
 

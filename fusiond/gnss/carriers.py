@@ -1,4 +1,4 @@
-r"""Carrier phases from epoch to epoch: slant delay of a satellite, and its displacement.
+r"""Carrier phase changes between epochs: slant delay and displacement of a satellite.
 
 Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
 gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
@@ -69,7 +69,7 @@ SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_CO
 FOLLOWED, LOCK_LOST, CYCLE_SLIP = 0, 1, 2
 
 CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
-"""Constants of `fusiond.gnss.ranges.RangeNoise`, the first as a mean over a uniform sky above 10
+"""Constants of `fusiond.gnss.ranges.RangeNoise`. The first is a mean over a uniform sky above 10
 deg, where the mean of 1 / sin^2 E is 1 / sin 10 deg."""
 PRIOR_COUNT, MOST_COUNT = 20.0, 400.0
 """Weight of that as a number of independent codes, a sky; older than so many are forgotten by
@@ -146,8 +146,8 @@ def _delay(
     scale: float,
     seen: Array,
 ) -> None:
-    """Write the slant delay from this epoch's codes and the carriers' `change`; NaN: none. Adds to the sums
-    of `seen` codes."""
+    """Write the slant delay from this epoch's codes and the carriers' `change`; NaN: none. Adds to
+    the sums of `seen` codes."""
     more = plan[GAMMA] - 1.0
     code = (second[P_B] - first[P_A] - plan[DELAY]) / more
     noise = _code_variance(first[CNO], first[SD_A], scale)

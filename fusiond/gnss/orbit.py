@@ -80,7 +80,8 @@ def is_beidou_geo(system: System, prn: int) -> bool:
 
 
 def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
-    """GPS week and second of week of a system's own week and second; seconds may exceed the week."""
+    """GPS week and second of week of a system's own week and second; seconds may exceed the
+    week."""
     if system == "C":
         return week + BDT_WEEK_0_IN_GPS_WEEKS, seconds + BDT_BEHIND_GPS_S
     return week, seconds

@@ -1,4 +1,4 @@
-"""Plan of an epoch: the signals that serve, as long as the same ones come and no ephemeris changes.
+"""Cached choice of an epoch's signals, valid until signals or ephemerides change.
 
 One signal of each satellite serves as range and carrier, a second one for its slant delay
 (`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range

@@ -145,7 +145,8 @@ class Rows:
 
 
 class Picked(NamedTuple):
-    """Chosen signals of an epoch, (n, 7) as measured, and the second ones (n, 5), NaN where absent."""
+    """Chosen signals of an epoch, (n, 7) as measured, and the second ones (n, 5), NaN where
+    absent."""
 
     plan: Plan
     week: int

@@ -140,7 +140,8 @@ class Series:
         self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
 
     def gated(self, t_ns: int, explained: bool) -> None:
-        """Note a gate failure of a series in service; `explained`: by a fault of the inertial unit."""
+        """Note a gate failure of a series in service; `explained`: by a fault of the inertial
+        unit."""
         self.failed += 1
         again = self.state is Service.PROBATION
         if again or (self.failed >= REFUSED_IN_A_ROW and not explained):

@@ -94,7 +94,8 @@ class Operator:
 
 
 def distance_m(lat_a: float, lon_a: float, lat_b: float, lon_b: float) -> float:
-    """Distance (m) between two positions (rad) on a sphere, to half a percent: haversine formula."""
+    """Distance (m) between two positions (rad) on a sphere, to half a percent: haversine
+    formula."""
     across = math.cos(lat_a) * math.cos(lat_b) * math.sin(0.5 * (lon_b - lon_a)) ** 2
     chord = math.sin(0.5 * (lat_b - lat_a)) ** 2 + across
     return 2.0 * EARTH_RADIUS_M * math.asin(math.sqrt(min(1.0, chord)))

@@ -1,4 +1,4 @@
-r"""The model of a vehicle without an inertial unit: it goes on as it goes, but for white noise.
+r"""Constant-velocity model with white acceleration noise, for a vehicle without an inertial unit.
 
     dr' = dv,   dv' = w,   w white with the density q = 2 s^2 tau
 

@@ -99,7 +99,8 @@ def f_tail(d: float, n: float, x: float) -> float:
 
 
 def f_quantile(d: float, n: float, upper: float) -> float:
-    """Quantile of the F law of `d` and `n` degrees of freedom, exceeded with probability `upper`."""
+    """Quantile of the F law of `d` and `n` degrees of freedom, exceeded with probability
+    `upper`."""
     return _quantile(lambda x: _f_tails(d, n, x), upper, True, 1.0)
 
 

@@ -1,5 +1,5 @@
-"""Gauss-Newton of an attitude on the move, as compiled kernels; what is sought, and why, has
-fusiond.navigator.alignment.motion_fit.
+"""Gauss-Newton kernels for the attitude fit of fusiond.navigator.alignment.motion_fit, which
+defines the problem.
 
 A guess (19,) holds the attitude C_nb at the last fix by rows, biases of force and rate, the
 velocities' offset in time in its sigmas, the velocity at the first fix; a step (13,) moves it by a

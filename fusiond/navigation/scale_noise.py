@@ -1,4 +1,4 @@
-r"""Scale factors that a model has no states for: what of them is noise, while the vehicle turns.
+r"""Noise equivalent of unmodelled scale factors while the vehicle turns.
 
     e_i = s_i w_i,   d_i = k_i f_i,   s_i ~ N(0, s^2), k_i ~ N(0, k^2)
 

@@ -1,4 +1,4 @@
-r"""Levels of typed drifts: side drift, wheel drift, disturbance of a compass.
+r"""Magnitudes of configured drifts: side slip, wheel drift, compass disturbance.
 
 No device states them, and a configuration has what fits any vehicle. Each is a Markov state x of
 typed sigma s, of which c x counts in its measurement. By x^ and P as the filter has them the
@@ -111,7 +111,8 @@ class DriftLevels:
         return 1.0 if drift is None else drift.at(t_ns)
 
     def look(self, e: Estimator) -> None:
-        """Evaluate the filter's state at an instant of the grid, once nothing earlier can arrive."""
+        """Evaluate the filter's state at an instant of the grid, once nothing earlier can
+        arrive."""
         if speed_of(e.nav) < MOVES_M_S:
             return
         for drift in self._drifts.values():

@@ -1,4 +1,4 @@
-r"""Protection levels by raw epochs: advanced RAIM of each, and the way to it.
+r"""Protection levels from raw epochs, each by advanced RAIM.
 
 The position x_e of an epoch's ranges alone has levels PL_e that hold whatever one satellite or
 constellation does (fusiond.integrity.araim). With x_0 the published solution after the epoch

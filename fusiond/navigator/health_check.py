@@ -1,4 +1,4 @@
-"""Unexpected failures: a measurement that raises, a filter of no numbers.
+"""Unexpected failures: a measurement that raises, a filter with values that are not finite.
 
 An exception costs the measurement that raised it, never the tick. A filter that has lost its
 numbers never gets them back: it is started anew.

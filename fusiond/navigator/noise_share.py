@@ -1,4 +1,4 @@
-r"""Share of the noise in IMU samples that attitude and velocity integrate: predictions, judged.
+r"""Share of the IMU noise that integrates into attitude and velocity, estimated from predictions.
 
 What engine and road shake into the samples bounds the noise of a sensor (fusiond.navigation.
 vibration). A part of it is motion that the sensors measure, and vibration that averages out later

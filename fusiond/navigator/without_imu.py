@@ -306,7 +306,8 @@ def counted_together(
 
 
 def _sensed(nav: Array) -> Array:
-    """Rate and force (1, 6) of a level vehicle in the state (10,) that faces north at its velocity."""
+    """Rate and force (1, 6) of a level vehicle in the state (10,) that faces north at its
+    velocity."""
     lat, height = float(nav[LAT]), float(nav[HEIGHT])
     north, east = float(nav[VN]), float(nav[VE])
     earth = np.array([math.cos(lat), 0.0, -math.sin(lat)]) * EARTH_RATE_RAD_S

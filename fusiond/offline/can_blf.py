@@ -1,4 +1,4 @@
-"""Containers of a Vector BLF file, made whole for python-can's reader: damage costs what it hit.
+"""Repair of a damaged Vector BLF file's containers, so that python-can reads the intact part.
 
 A BLF file is a header and containers of some 128 kB, mostly zipped, with objects in them that may
 go on in the next one. Here containers are taken apart into objects, a piece that cannot be read is

@@ -1,4 +1,4 @@
-"""Frames of a recorded CAN bus, by python-can's readers: what cannot be read costs itself.
+"""Frames of a recorded CAN bus, by python-can's readers; unreadable ones are skipped.
 
     .log   candump -L, -l, and its terminal form with stamps     .blf   Vector, binary
     .asc   Vector, text                                          .mf4   ASAM MDF 4 (asammdf)

@@ -1,4 +1,4 @@
-"""`fusiond process --smooth`: at each sample the solution of all that was measured, later too.
+"""`fusiond process --smooth`: the solution at each sample from all measurements, later ones too.
 
 The filter runs as ever and leaves a tape (fusiond.estimators.smoothing). What the daemon would have
 said at each sample, in the last pass over it, is kept until the navigation has ended; then the

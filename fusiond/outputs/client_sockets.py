@@ -1,4 +1,4 @@
-"""The door for guests: sockets of all servers, served in turns that cost a tick little.
+"""Client sockets of all servers, served in turns at little cost to a tick.
 
 All listeners and connections are in one epoll set, of which the event loop sees a single
 descriptor. When something is there the loop gives a turn: pieces of work, of each server one to

@@ -1,5 +1,5 @@
-"""End of a connection to a broker where aiomqtt has no answer: a cancellation that is swallowed,
-a broker that is frozen, an attempt that is given up."""
+"""End of a broker's connection where aiomqtt fails: a swallowed cancellation, a frozen broker, an
+abandoned attempt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Schedule of `tracker`: every 10 s, and sooner after 20 m, but for one a second."""
+"""Schedule of `tracker`: every 10 s or after 20 m, at most once a second."""
 
 from __future__ import annotations
 

@@ -100,7 +100,8 @@ def _kml(file: TextIO, vehicle: str, points: list[Point]) -> None:
 
 
 def _geojson(file: TextIO, vehicle: str, points: list[Point]) -> None:
-    """Write one LineString for each stretch of one mode, so that a map can colour them, with times."""
+    """Write one LineString for each stretch of one mode, so that a map can colour them, with
+    times."""
     features: list[dict[str, object]] = []
     stretch: list[Point] = []
     for p in points:

@@ -53,7 +53,8 @@ _CHANNEL = struct.Struct("<HHI")
 
 
 class LogError(Exception):
-    """Error: a file that is not a log of fusiond, or has a later format; the text names the reason."""
+    """Error: a file that is not a log of fusiond, or has a later format; the text names the
+    reason."""
 
 
 class LogMessage(NamedTuple):
@@ -257,7 +258,8 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 class _Bounded:
-    """File whose reads are limited to a record's size, since mcap trusts lengths inside a record."""
+    """File whose reads are limited to a record's size, since mcap trusts lengths inside a
+    record."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -1,4 +1,4 @@
-"""The daemon's side of a recording: what moves it is written down in the order it is handled.
+"""Daemon side of a recording: every input is written in the order of handling.
 
 A record begins when its input is about to be handled, and is complete when the next begins: the
 readings of the host's clocks in between are its own. A tick closes a message, so that the log grows

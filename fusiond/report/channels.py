@@ -146,7 +146,8 @@ class Calibrations:
 
 
 class Healths:
-    """Rows of `/health`: last outcomes and counters; satellites, delays, CPU and memory over time."""
+    """Rows of `/health`: last outcomes and counters; satellites, delays, CPU and memory over
+    time."""
 
     def __init__(self) -> None:
         self.outcomes: dict[str, dict[str, int]] = {}

@@ -1,4 +1,4 @@
-"""Innovations, verdicts, delays and satellites: whether what came in goes with the filter."""
+"""Plots of innovations, verdicts, delays and satellites: agreement of inputs and filter."""
 
 from __future__ import annotations
 

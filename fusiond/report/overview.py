@@ -1,4 +1,4 @@
-"""The first sections: what the run was, what became of each source's measurements, the way."""
+"""First sections: summary of the run, outcomes of each source's measurements, track."""
 
 from __future__ import annotations
 

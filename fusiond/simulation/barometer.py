@@ -1,4 +1,4 @@
-r"""Barometer of a simulated vehicle: the pressure at which the standard atmosphere says
+r"""Barometer of a simulated vehicle: the pressure of this height in the standard atmosphere:
 
     H = (1 + k) h + b + c v^2 / (2 g) + n
 

@@ -210,7 +210,8 @@ _transverse_radii = np.vectorize(transverse_radius, otypes=[np.float64])
 
 
 def metres_to_geodetic(lat: Array, height: Array, ned_m: Array) -> Array:
-    """Convert displacements (n, 3) in m, NED, to changes of latitude, longitude (rad), height (m)."""
+    """Convert displacements (n, 3) in m, NED, to changes of latitude, longitude (rad), height
+    (m)."""
     return np.stack(
         (
             ned_m[:, 0] / (_meridian_radii(lat) + height),

@@ -1,4 +1,4 @@
-r"""First-order Gauss-Markov processes: what of the errors of sensors and measurements lasts.
+r"""First-order Gauss-Markov processes: time-correlated errors of sensors and measurements.
 
     x' = -x / T + w,   x_k = x_(k-1) exp(-dt / T) + w_k,   var(w_k) = sigma^2 (1 - exp(-2 dt / T))
 

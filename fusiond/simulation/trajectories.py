@@ -184,7 +184,8 @@ def body_rate(rpy: Array, rate: Array, acceleration: Array) -> tuple[Array, Arra
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Leg: time in which speed and climb reach a new value (None: unchanged) and the course turns."""
+    """Leg: time in which speed and climb reach a new value (None: unchanged) and the course
+    turns."""
 
     duration_s: float
     speed_m_s: float | None = None

@@ -190,8 +190,10 @@ def _quiet(
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Run the study with `runs` windows for each false-alarm rate and a fortieth (at least 50) of
-    them as runs of 1,800 epochs for each power. The same arguments give the same result.
+    """Run the study with `runs` windows for each false-alarm rate.
+
+    A fortieth of that number (at least 50) are runs of 1,800 epochs for each power. The same
+    arguments give the same result.
     """
     windows = runs or DEFAULT_RUNS
     drives = max(50, windows // 40)

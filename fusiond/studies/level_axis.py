@@ -1,4 +1,4 @@
-r"""INS errors of a level axis aided by positions: the smallest filter that drifts as an INS does.
+r"""Level-axis INS errors aided by positions: the smallest filter with INS drift.
 
     p' = v,   v' = a + w_v,   a' = w_a,   z = p + e,   var e = R
 

@@ -1,4 +1,4 @@
-"""Monte Carlo runs: on processes, with their progress, and what NEES may be on average.
+"""Parallel Monte Carlo runs with progress, and the bounds of their mean NEES.
 
 A run draws from a generator of its own, made of the study's seed and the run's number, so that no
 result depends on who ran what, in which order, and on how many processes. `of_run` makes it by a

@@ -136,7 +136,8 @@ class Observability:
 
     @property
     def sigma_end(self) -> tuple[Array, Array]:
-        """One sigma (n,) at the end with and without the measurements, both without process noise."""
+        """One sigma (n,) at the end with and without the measurements, both without process
+        noise."""
         with_them = self.theta @ self.start @ self.theta.T
         without = self.theta * self.scale
         return np.sqrt(np.diag(with_them)), np.sqrt(np.square(without).sum(axis=1))

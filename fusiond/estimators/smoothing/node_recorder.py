@@ -1,6 +1,5 @@
-"""The Kalman filter with a tape: it does what it does and leaves nodes behind. It crosses each
-sample alone (fusiond.estimators.block_covariance): its sigmas are those of that filter within 1e-4
-of them.
+"""Kalman filter that records nodes for the smoother. It propagates each sample alone
+(fusiond.estimators.block_covariance): its sigmas equal the other filter's within 1e-4 of them.
 
 Nodes hang on each other, the newest in front. A snapshot holds the newest of its instant, so a
 rewind takes the tape back with the state, and what was written since is forgotten with it: the tape

@@ -1,4 +1,4 @@
-"""Data of an alignment: rest seen by the IMU, and what the measurements offered."""
+"""Data for alignment: rest detected by the IMU, and initial values from measurements."""
 
 from __future__ import annotations
 

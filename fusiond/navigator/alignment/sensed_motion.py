@@ -1,4 +1,4 @@
-r"""Preintegrated motion and measurements, since the first of some fixes.
+r"""Preintegrated motion with measurements, since the first of several fixes.
 
 Integrals of the gyros and accelerometers in the axes of the first fix, with their slopes by the
 sensors' biases, for fusiond.navigator.alignment.motion_fit.

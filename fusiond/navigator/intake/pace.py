@@ -1,4 +1,4 @@
-r"""Rate limits of sources: what comes faster than its kind can is not believed.
+r"""Rate limits of sources: measurements faster than their kind allows are refused.
 
 A bucket of tokens for a source and kind of measurement:
 

@@ -1,4 +1,4 @@
-"""Short messages between simulated cards: a delay, losses, damage, and a vehicle of a convoy.
+"""Simulated short messages between cards: delay, loss, damage, and another vehicle of a convoy.
 
 A terminal that joins has its messages carried to the card that they name; what is for a card that
 nobody has is counted and lost, as it is in the real network.

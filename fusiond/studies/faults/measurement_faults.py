@@ -143,7 +143,8 @@ def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: floa
 
 
 def velocity_old(r: Recording, begin_s: float, length_s: float, age_s: float = 1.0) -> Recording:
-    """Replace velocities by those of an epoch `age_s` before, or of the first; positions unchanged."""
+    """Replace velocities by those of an epoch `age_s` before, or of the first; positions
+    unchanged."""
     said: dict[str, deque[tuple[float, Velocity]]] = {}
 
     def older(fix: PositionFix, since_s: float) -> PositionFix:

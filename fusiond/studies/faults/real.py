@@ -206,7 +206,8 @@ class _Own:
 def _read(
     folder: Path, wheels: bool, truth: str | None
 ) -> tuple[Recording, TrajectoryTable, float]:
-    """Read the recording, its clock starting at the first sample, with the reference and the start."""
+    """Read the recording, its clock starting at the first sample, with the reference and the
+    start."""
     path = next(p for p in (folder / "imu.csv", folder / "imu.csv.gz") if p.exists())
     imu = read_imu(path)
     stamps = np.rint(imu.t_s * 1e9).astype(np.int64)

@@ -75,7 +75,8 @@ class Recording:
         )
 
     def withheld(self, begin_s: float, end_s: float) -> Recording:
-        """Recording without measurements valid from `begin_s` to before `end_s`; wheels continue."""
+        """Recording without measurements valid from `begin_s` to before `end_s`; wheels
+        continue."""
         begin, end = round(begin_s * 1e9), round(end_s * 1e9)
         return replace(
             self,

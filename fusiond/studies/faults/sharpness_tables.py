@@ -1,5 +1,4 @@
-"""Tables of `sharpness`, as Markdown: how many cells are right, sums by what they share, and a line
-a cell and phase; and what `real` did, a line a drive."""
+"""Markdown tables of `sharpness` (totals, cells and phases) and of `real` (drives)."""
 
 from __future__ import annotations
 

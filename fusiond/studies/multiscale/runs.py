@@ -145,7 +145,8 @@ def epochs() -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Errors of one run: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch, start."""
+    """Errors of one run: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch,
+    start."""
 
     buffer: ImuBuffer
     drift: Array

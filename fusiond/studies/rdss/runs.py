@@ -331,7 +331,8 @@ def simulate(case: Case, seed: int, number: int) -> dict[str, Trace]:
 
 
 def _events(grid_s: Array, arrival_s: Array) -> Iterator[tuple[int | None, int]]:
-    """Events in order of time: (None, k) fix k arrives, (i, 0) grid point i, which comes after it."""
+    """Events in order of time: (None, k) fix k arrives, (i, 0) grid point i, which comes after
+    it."""
     k = 0
     for i, t_s in enumerate(grid_s):
         while k < len(arrival_s) and arrival_s[k] <= t_s + 1e-9:

@@ -48,7 +48,8 @@ def combinations(of: Model) -> Array:
 
 @dataclass(slots=True)
 class Flown:
-    """Result of one filter in one run: error (k, 20) and its covariance in the filter (k, 20, 20)."""
+    """Result of one filter in one run: error (k, 20) and its covariance in the filter (k, 20,
+    20)."""
 
     error: Array
     believed: Array
