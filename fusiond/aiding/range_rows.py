@@ -1,4 +1,4 @@
-"""Compiled kernels of `fusiond.aiding.pseudorange`: Jacobian, measured values, sums by clock.
+"""Compiled kernels of `fusiond.aiding.pseudorange`: Jacobian, measured values, clock sums."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from fusiond.batch.drives import drive_row
+from fusiond.batch.log_row import drive_row
 from fusiond.configuration.load import config_digest, load_config
 from fusiond.files.parquet_rows import Row, RowFile
 from fusiond.workers.outcome import Outcome, Runner

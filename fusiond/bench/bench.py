@@ -60,7 +60,7 @@ from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.raw_epoch import raw_epoch
 from fusiond.bench.start import start
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator

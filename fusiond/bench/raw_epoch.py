@@ -18,7 +18,7 @@ import numpy as np
 from drivers.raw.messages import RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
 from fusiond.gnss.orbit import is_beidou_geo

@@ -32,7 +32,7 @@ AHEAD_NS = SECOND_NS
 arrival, and two controllers' clocks agree better."""
 LEAP_NS = 200 * MILLISECOND_NS
 """Least step that reports of UTC can show: the largest delay of a receiver on a healthy line
-(fusiond.clock.utc_envelope). The envelope follows a smaller step."""
+(fusiond.clock.utc_from_arrivals). The envelope follows a smaller step."""
 ASKED_AGAIN_NS = 20 * SECOND_NS
 """Interval between checks for a set clock on a bus whose controllers disagree."""
 ORDINARY = 3

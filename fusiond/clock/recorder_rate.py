@@ -11,8 +11,8 @@ reports: as long as one line passes all reports of a stretch within their own sc
 changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
 
 A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
-explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else. That of the first and
-of the last reports is held before and behind them, for as long as it was seen.
+explains: the envelope of UTC (fusiond.clock.utc_from_arrivals) follows all else. That of the first
+and of the last reports is held before and behind them, for as long as it was seen.
 """
 
 from __future__ import annotations

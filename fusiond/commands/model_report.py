@@ -9,7 +9,7 @@ from rich.console import Console
 
 from fusiond.commands.tables import print_table
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, DEG_PER_HOUR, MILLI_G
+from fusiond.configuration.si_units import DEG, DEG_PER_HOUR, MILLI_G
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -121,7 +121,7 @@ def _missing_packages() -> Iterator[None]:
 def _recording(logs: list[Path]) -> Pass:
     """A pass through the daemon's recording."""
     from fusiond.recording.reader import Log  # noqa: PLC0415
-    from fusiond.replay.watched import watched  # noqa: PLC0415
+    from fusiond.replay.calibration_replay import watched  # noqa: PLC0415
 
     # Its events are those of the drive, which has been: the report shows them.
     logging.getLogger("fusiond").addHandler(logging.NullHandler())

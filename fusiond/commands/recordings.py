@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -182,8 +182,8 @@ def export(
     ] = 0.0,
 ) -> None:
     """Hand a log on: the track, the measurements as CSV tables, or a bag for ROS."""
-    from fusiond.recording.export import export as write_track  # noqa: PLC0415
     from fusiond.recording.reader import Log  # noqa: PLC0415
+    from fusiond.recording.track_export import export as write_track  # noqa: PLC0415
 
     with log_errors(), config_errors(), spinner("writing"), TemporaryDirectory() as folder:
         recording = Log(logs)
@@ -199,9 +199,9 @@ def export(
 
 def _export_measurements(recording: Log, folder: Path, out: Path, to: str) -> dict[str, int]:
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+    from fusiond.replay.csv_export import write_tables  # noqa: PLC0415
     from fusiond.replay.replay_config import config_of  # noqa: PLC0415
-    from fusiond.replay.rosbag import write_rosbag  # noqa: PLC0415
-    from fusiond.replay.tables import write_tables  # noqa: PLC0415
+    from fusiond.replay.rosbag_export import write_rosbag  # noqa: PLC0415
 
     config = config_of(recording.about, folder)
     if to == "csv":

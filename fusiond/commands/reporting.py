@@ -43,7 +43,7 @@ def report(
     if batch is None:
         _of_drive(run or [], out, truth, beside or [])
     else:
-        from fusiond.report.drives import report_drives  # noqa: PLC0415
+        from fusiond.report.drives_page import report_drives  # noqa: PLC0415
 
         with row_errors(), spinner("writing the report"):
             drives = report_drives(batch, out)

@@ -19,7 +19,7 @@ from fusiond.commands.batch import (
     row_errors,
     runner_of,
 )
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,

@@ -122,7 +122,7 @@ async def ask(
 
     import aiomqtt  # noqa: PLC0415
 
-    from fusiond.outputs import packet_limit  # noqa: PLC0415
+    from fusiond.outputs import oversized_packets  # noqa: PLC0415
 
     vehicles: dict[str, VehicleMessages] = {}
     loop = asyncio.get_running_loop()
@@ -151,7 +151,7 @@ async def ask(
         }
     try:
         asking = aiomqtt.Client(host, port, timeout=_CONNECT_S, **credentials)
-        packet_limit.limit(asking, _MOST_BYTES)
+        oversized_packets.limit(asking, _MOST_BYTES)
         async with asking as client:
             listening = asyncio.create_task(listen(client))
             await asyncio.wait({listening}, timeout=min(_SETTLE_S, wait_s))

@@ -22,7 +22,7 @@ import math
 from collections.abc import Iterator
 
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, MILLI_G, imu_noise
+from fusiond.configuration.si_units import DEG, MILLI_G, imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR

@@ -1,7 +1,7 @@
 """The configuration of a vehicle: one TOML file, in the units that data sheets print.
 
 Every section is a frozen pydantic model that refuses unknown keys. Units stand in the names;
-nothing else in the project converts them: `fusiond.configuration.settings` turns this into SI once.
+nothing else in the project converts them: `fusiond.configuration.si_units` turns this into SI once.
 """
 
 from __future__ import annotations

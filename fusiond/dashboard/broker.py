@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import aiomqtt
 
-from fusiond.dashboard.hub import LARGEST_BYTES, Hub
 from fusiond.dashboard.schemas import topics
-from fusiond.outputs.packet_limit import SOCKET_OPTIONS, limit
+from fusiond.dashboard.vehicles import LARGEST_BYTES, Hub
+from fusiond.outputs.oversized_packets import SOCKET_OPTIONS, limit
 
 BASE = "fusiond"
 RETRY_S = 1.0

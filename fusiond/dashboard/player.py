@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.recording.reader import Log
 
 TOPICS = (

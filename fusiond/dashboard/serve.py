@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.dashboard.broker import Access, Broker
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.files.extras import install
 
 PMTILES = b"PMTiles\x03"
@@ -136,7 +136,7 @@ async def serve(
     """Serve `source` at `listener` until `stop` or until the source fails."""
     import uvicorn  # noqa: PLC0415 - an extra
 
-    from fusiond.dashboard.connections import BoundedConnection  # noqa: PLC0415 - the same
+    from fusiond.dashboard.connection_limits import BoundedConnection  # noqa: PLC0415 - the same
     from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
 
     config = uvicorn.Config(

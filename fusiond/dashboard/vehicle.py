@@ -14,8 +14,8 @@ from statistics import median
 from typing import Any
 
 from fusiond.dashboard.advice import advice
+from fusiond.dashboard.counter_window import Recent
 from fusiond.dashboard.history import Keyed, Ring
-from fusiond.dashboard.recent import Recent
 
 Said = Mapping[str, Any]
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 
 FRAME_S = 0.1

@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.dashboard.viewer import MOST_VIEWERS, Viewer
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")

@@ -29,11 +29,11 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
+from fusiond.demo.dashboard_process import DemoPage
 from fusiond.demo.outage_report import outage_report
-from fusiond.demo.page import DemoPage
 from fusiond.demo.papers import paper_setup
-from fusiond.demo.setup import DemoSetup, Unplugged
-from fusiond.demo.view import HeadlessView, Live, LiveView
+from fusiond.demo.scenario import DemoSetup, Unplugged
+from fusiond.demo.terminal_view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution

@@ -29,7 +29,7 @@ from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_senten
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.sbf.framing import BlockSplitter
 from drivers.serial_line import SerialLine
-from fusiond.doctor.known_devices import KNOWN_DEVICES
+from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
 BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_800)

@@ -21,10 +21,10 @@ from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import NavigationMessage
 from drivers.rdss.mail import Mail
 from drivers.rdss.messages import BeamPower
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise, quiet_limits, sensor_to_body
+from fusiond.configuration.si_units import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.findings import finding
 from fusiond.doctor.measurement_statistics import KEPT, Values

@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
@@ -50,8 +50,8 @@ from fusiond.outputs.commands import (
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
-from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
+from fusiond.recording.state_digest import state_digest
 from fusiond.workers.forked import Forked
 
 log = logging.getLogger("fusiond")

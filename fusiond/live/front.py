@@ -8,7 +8,7 @@ import logging
 from collections.abc import Awaitable, Callable, Mapping
 from importlib.metadata import version
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events

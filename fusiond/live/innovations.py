@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.navigator.timeline import Entry, Key
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.innovations import Innovation

@@ -20,7 +20,7 @@ from drivers.rdss.mail import (
     MessageStage,
 )
 from drivers.rdss.report import DAY_S, PositionReport
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Solution

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.live.injection import Injection
 from fusiond.live.messaging import Messaging
 from fusiond.live.sources import Sources

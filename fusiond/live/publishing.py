@@ -32,7 +32,7 @@ from fusiond.outputs.topics import (
     TRACKER,
     Topic,
 )
-from fusiond.outputs.tracking import Tracking
+from fusiond.outputs.tracker_schedule import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.

@@ -22,8 +22,8 @@ from drivers.measurements import DeviceEvent, Height, ImuSample, Measurement, Ti
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from drivers.rdss.mail import Mail
 from drivers.standard_atmosphere import standard_pressure_pa
-from fusiond.clock.clock import Clock
 from fusiond.clock.results import Instant
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config

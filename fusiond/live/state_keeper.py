@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution

@@ -17,8 +17,8 @@ from pathlib import Path
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from fusiond.clock.clock import Clock
-from fusiond.clock.utc_envelope import UtcKnown
+from fusiond.clock.stamp_mapping import Clock
+from fusiond.clock.utc_from_arrivals import UtcKnown
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every

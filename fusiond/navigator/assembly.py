@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.si_units import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import ImuSample
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 
 Array = NDArray[np.float64]
 Row = tuple[int, tuple[float, ...]]

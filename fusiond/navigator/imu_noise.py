@@ -14,7 +14,7 @@ import numpy as np
 
 from fusiond.aiding.fix_errors import SETTLES_NS
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_range
+from fusiond.configuration.si_units import imu_range
 from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.measurements import Measurement
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.finite_check import first_not_finite
 from fusiond.estimators.invariant import InvariantFilter

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import DEG, PER_ROOT_HOUR, imu_noise
+from fusiond.configuration.si_units import DEG, PER_ROOT_HOUR, imu_noise
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,

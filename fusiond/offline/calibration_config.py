@@ -3,7 +3,7 @@
 With C_vb the matrix of `imu.mounting_deg`, m the rest of the mounting that was found, rho the roll,
 and tau by how much fixes are later valid than their stamps say:
 
-    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.settings.sensor_to_body)
+    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.si_units.sensor_to_body)
     lever arm of an antenna <- C(rho) exp[m x] (l + dl), where dl was observed
     imu.time_offset_s <- time_offset_s - tau,   and all other sources against it:
     velocity_delay_s <- velocity_delay_s - tau_v + tau,   latency_s <- latency_s + tau_w + tau
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.aiding import Aiding, GnssAiding, WheelAiding, lever_sd_m
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,

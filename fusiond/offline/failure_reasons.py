@@ -11,7 +11,7 @@ import numpy as np
 from drivers.immutable import immutable
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import Rejection, counts
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.distributions import median

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from drivers.base import DriverStatus
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.mqtt import MqttPublisher

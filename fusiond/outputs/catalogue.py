@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, packet_limit, subscriptions
+from fusiond.outputs import broker_access, oversized_packets, subscriptions
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
@@ -101,7 +101,7 @@ class MqttPublisher:
         self.on_confirmed: Callable[[BaseModel], None] = lambda message: None
         """Callback with each queued message that the broker has confirmed."""
         self._reconnecting = Reconnecting()
-        self._version = MqttVersion(MAX_PAYLOAD_BYTES + packet_limit.LONGEST_TOPIC)
+        self._version = MqttVersion(MAX_PAYLOAD_BYTES + oversized_packets.LONGEST_TOPIC)
         self._quiet = subscriptions.quiet()
         self.status = DriverStatus()
 
@@ -213,9 +213,9 @@ class MqttPublisher:
             max_queued_incoming_messages=_INCOMING,
             logger=_LOG,
             tls_context=self._tls,
-            socket_options=packet_limit.SOCKET_OPTIONS,
+            socket_options=oversized_packets.SOCKET_OPTIONS,
         )
-        packet_limit.limit(client, MAX_PAYLOAD_BYTES)
+        oversized_packets.limit(client, MAX_PAYLOAD_BYTES)
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fusiond.clock.host import SECOND_NS
 from fusiond.recording.channels import CHANNELS, INPUT, STATE
-from fusiond.recording.log_file import About, Attachment, LogFile
+from fusiond.recording.mcap_writer import About, Attachment, LogFile
 from fusiond.recording.reader import About as Described
 from fusiond.recording.reader import Log, LogError, LogMessage
 from fusiond.recording.records import NO_SOURCE, Kind, Record, pack, unpack

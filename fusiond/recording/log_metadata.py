@@ -13,7 +13,7 @@ from drivers.base import PermanentDriverError
 from drivers.can.dbc import find_dbc
 from fusiond.configuration.load import config_digest, dumped
 from fusiond.configuration.schema import Config
-from fusiond.recording.log_file import FORMAT, About, Attachment
+from fusiond.recording.mcap_writer import FORMAT, About, Attachment
 
 CONFIG = "config.json"
 """Configuration of the daemon with every default and path filled in."""

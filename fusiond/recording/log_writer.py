@@ -25,7 +25,7 @@ from fusiond.clock.host import SECOND_NS
 from fusiond.configuration.recording import Recording
 from fusiond.outputs.messages.base import Message
 from fusiond.recording.channels import CHANNELS, OF_FOXGLOVE, InnovationMessage
-from fusiond.recording.log_file import SUFFIX, About, LogFile
+from fusiond.recording.mcap_writer import SUFFIX, About, LogFile
 
 log = logging.getLogger("fusiond")
 

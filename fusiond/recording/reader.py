@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
 from fusiond.recording.channels import INPUT
-from fusiond.recording.log_file import FORMAT, METADATA
+from fusiond.recording.mcap_writer import FORMAT, METADATA
 from fusiond.recording.records import DamagedRecordError, Record, check, unpack
 
 RECORD_LIMIT = 1 << 26

@@ -21,8 +21,8 @@ from pydantic import BaseModel
 from drivers.base import DriverStatus
 from drivers.can.bus import CanFrame
 from drivers.inputs import Inputs
-from fusiond.clock.clock import Clock
 from fusiond.clock.host import SECOND_NS, ReadClock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config
 from fusiond.navigator.timeline import Entry

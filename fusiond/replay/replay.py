@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.clock.clock import Clock
 from fusiond.clock.results import Instant
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
@@ -32,9 +32,9 @@ from fusiond.navigator.timeline import Entry
 from fusiond.outputs.commands import CARRIED_OUT, CommandRefusedError
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.recording.channels import STATE
-from fusiond.recording.digest import state_digest
 from fusiond.recording.reader import Log
 from fusiond.recording.records import Kind, Record, Tick, input_of, tick_of
+from fusiond.recording.state_digest import state_digest
 from fusiond.replay.recorded_time import RecordedReadings, RecordedTime
 
 log = logging.getLogger("fusiond")

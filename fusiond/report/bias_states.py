@@ -11,10 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.error_model import RATE_ERROR
-from fusiond.report.channels import number
+from fusiond.report.channel_arrays import number
 from fusiond.report.run import Estimated
 
 _AXES = tuple(f"{what} {axis}" for what in ("gyro", "accel") for axis in "xyz")

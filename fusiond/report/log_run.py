@@ -19,7 +19,7 @@ from fusiond.recording.log_metadata import CONFIG
 from fusiond.recording.reader import Log, LogMessage
 from fusiond.recording.records import Record
 from fusiond.report.bias_states import Biases
-from fusiond.report.channels import (
+from fusiond.report.channel_arrays import (
     Calibrations,
     FaultLists,
     Healths,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.files.tables import TrajectoryTable, read_truth
-from fusiond.report import devices, filter_plots, overview, states
+from fusiond.report import filter_plots, imu_and_host, overview, states
 from fusiond.report.log_run import run_from_log
 from fusiond.report.page import page
 from fusiond.report.page_items import Item, Section
@@ -103,8 +103,8 @@ def _sections(run: Run, truth: TrajectoryTable | None) -> list[Section]:
         filter_plots.verdicts(run),
         filter_plots.delays(run),
         filter_plots.satellites(run),
-        devices.inertial(run),
-        devices.computer(run),
+        imu_and_host.inertial(run),
+        imu_and_host.computer(run),
     )
     return [section for section in made if section is not None]
 

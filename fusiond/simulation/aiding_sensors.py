@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.si_units import DEG, imu_noise, sensor_to_body
 from fusiond.simulation.markov import gauss_markov
 
 Array = NDArray[np.float64]

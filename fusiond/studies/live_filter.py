@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.timeline import Entry, Timeline

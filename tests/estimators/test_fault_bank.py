@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.fault_bank import (
     E_AT,
     E_ROWS,

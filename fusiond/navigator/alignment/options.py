@@ -6,7 +6,7 @@ import math
 
 from drivers.immutable import immutable
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 
 # Faster (m/s) than a road vehicle reverses: a reverse gear ends at 10 to 25 km/h in a car.
 # A train drives either way.

@@ -8,7 +8,7 @@ from drivers.measurements import Attitude
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import Aiding, AttitudeAiding, StarTrackerAiding
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
 

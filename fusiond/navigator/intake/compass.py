@@ -23,7 +23,7 @@ from fusiond.aiding.compass import (
     disturbance,
 )
 from fusiond.configuration.aiding import CompassAiding
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.blocks import Block
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 

@@ -8,7 +8,7 @@ from drivers.measurements import Heading
 from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import HeadingAiding
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from fusiond.configuration.aiding import Misaligned
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.models.blocks import Block, misalignment
 from fusiond.navigator.intake.kind import Sections
 

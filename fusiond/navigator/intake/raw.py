@@ -7,7 +7,7 @@ import math
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
-from fusiond.configuration.settings import clock_noise
+from fusiond.configuration.si_units import clock_noise
 from fusiond.models.blocks import Block, carrier_blocks, clock_blocks, position_bias, shared_error
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic

@@ -40,7 +40,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.constellation import slots

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.studies.faults.recording import Recording
 

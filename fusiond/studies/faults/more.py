@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from drivers.measurements import DelayedFix, PositionFix, WheelSpeed
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.library import FAULTS, UNDER_WAY, Fault, sideways

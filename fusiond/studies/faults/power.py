@@ -16,7 +16,7 @@ from functools import partial
 from itertools import product
 from typing import Any
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S

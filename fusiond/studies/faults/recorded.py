@@ -31,7 +31,7 @@ from drivers.measurements import DelayedFix, Height, MonotonicStamp, PositionFix
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.tables import TrajectoryTable, read_imu, read_solution
 from fusiond.navigation.solution import Solution
 from fusiond.offline.can_log import read_can_log

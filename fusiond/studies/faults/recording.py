@@ -16,7 +16,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre

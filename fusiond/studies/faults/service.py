@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from drivers.measurements import PositionFix
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S

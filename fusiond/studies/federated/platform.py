@@ -19,7 +19,7 @@ from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, Positi
 from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
 from fusiond.configuration.aiding import AnyAiding, GnssAiding, RdssAiding
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator

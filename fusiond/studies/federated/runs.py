@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator

@@ -34,7 +34,7 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions

@@ -29,7 +29,7 @@ from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

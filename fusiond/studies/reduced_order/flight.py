@@ -22,7 +22,7 @@ from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.bearing import BearingMeasurement
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.studies.covariance_analysis import Result, System, analyse

@@ -31,7 +31,7 @@ from fusiond.aiding.height import HeightMeasurement
 from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeMeasurement, epoch_values
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT

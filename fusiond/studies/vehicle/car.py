@@ -30,7 +30,7 @@ from drivers.standard_atmosphere import pressure_height_m
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

@@ -18,12 +18,12 @@ from drivers.measurements import ImuSample, Measurement
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError
 from fusiond.files.extras import install
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
-from fusiond.replay.tables import arrivals
+from fusiond.replay.csv_export import arrivals
 
 _TO_ROS = np.array([1.0, -1.0, -1.0])
 
