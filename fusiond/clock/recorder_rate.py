@@ -70,10 +70,10 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
     before, after = (float(s[line.last] - s[line.first]) for line in (lines[0], lines[-1]))
     inner = (_edge(*pair, s) for pair in pairwise(lines))
     edges = [s[lines[0].first] - before, *inner, s[lines[-1].last] + after]
-    late = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
+    delayed = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
     found, gained_s = [], 0.0
     for line, begin, end in zip(lines, edges, edges[1:], strict=False):
-        if line in late:
+        if line in delayed:
             continue
         first, last = float(s[line.first]), float(s[line.last])
         rate = line.slope / (1.0 - line.slope)  # a second of UTC for one of the recorder's

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fusiond.offline.calibrate import Pass
     from fusiond.offline.outages import Outage
 
-AID_KINDS = (
+MEASUREMENT_KINDS = (
     *("gnss", "rdss", "attitude", "bearing", "wheel", "barometer"),
     *("nmea", "ubx", "bestpos", "sbf", "raw"),
 )
@@ -49,9 +49,9 @@ CanLog = Annotated[
     Path | None,
     typer.Option("--can", metavar="LOG", help="Recorded CAN bus: .log, .asc, .blf, .trc, .mf4."),
 ]
-AidFiles = Annotated[
+MeasurementFiles = Annotated[
     list[str] | None,
-    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
+    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(MEASUREMENT_KINDS)}."),
 ]
 
 
@@ -59,7 +59,7 @@ def process(
     config: ConfigPath,
     imu: ImuFile = None,
     can: CanLog = None,
-    aid: AidFiles = None,
+    aid: MeasurementFiles = None,
     outage: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,7 +81,7 @@ def process(
     json_path: JsonPath = None,
 ) -> None:
     """Navigate through recorded files with the daemon's own navigator."""
-    aids = [_aid_argument(text) for text in aid or []]
+    measurements = [_measurement_argument(text) for text in aid or []]
     outages = [_outage_argument(text) for text in outage or []]
     if out is not None and str(out) == "-" == json_path:
         raise typer.BadParameter("--out and --json cannot both be standard output")
@@ -96,7 +96,7 @@ def process(
 
         raw_receivers(settings.aiding)  # what they compile comes with the rest
     wanted = _systems_argument(systems)
-    given = (settings, imu, aids, outages, out, wanted, can)
+    given = (settings, imu, measurements, outages, out, wanted, can)
     with _missing_packages(), config_errors(), data_errors(), progress_bar("processing") as bar:
         result = run_process(*given, smooth=smooth, progress=bar or (lambda done, total: None))
     _print_summary(result, err="-" in (json_path, str(out)))
@@ -135,7 +135,7 @@ def calibrate(
     ] = None,
     imu: ImuFile = None,
     can: CanLog = None,
-    aid: AidFiles = None,
+    aid: MeasurementFiles = None,
     out: Annotated[
         Path | None, typer.Option(metavar="F.toml", help="Write the lines of TOML there too.")
     ] = None,
@@ -143,8 +143,8 @@ def calibrate(
 ) -> None:
     """Estimate mounting, lever arms, offsets and scales from one recorded drive, as TOML; input:
     files or a recording of the daemon."""
-    aids = [_aid_argument(text) for text in aid or []]
-    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
+    measurements = [_measurement_argument(text) for text in aid or []]
+    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and measurements):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
     settings = load(config)
     from fusiond.commands.recordings import log_errors  # noqa: PLC0415
@@ -154,7 +154,7 @@ def calibrate(
         from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
         from fusiond.offline.calibrate import files  # noqa: PLC0415
 
-        navigate = _recording(logs) if logs else files(imu, aids, can)
+        navigate = _recording(logs) if logs else files(imu, measurements, can)
         raw_receivers(settings.aiding)  # what they compile comes with the rest
     with (
         _missing_packages(),
@@ -262,11 +262,11 @@ def compare(
     write_json(report, json_path)
 
 
-def _aid_argument(text: str) -> tuple[str, Path]:
+def _measurement_argument(text: str) -> tuple[str, Path]:
     """Parse KIND=FILE."""
     kind, equals, path = text.partition("=")
-    if not equals or not path or kind not in AID_KINDS:
-        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
+    if not equals or not path or kind not in MEASUREMENT_KINDS:
+        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(MEASUREMENT_KINDS)}")
     return kind, Path(path)
 
 

@@ -12,7 +12,7 @@ Records stand in the order in which the daemon handled them: a log is played by 
 
     kind        payload
     start       JSON: what the daemon had loaded when the recording began
-    tick        inputs u64, overruns u64, late_ns i64, digest 8 bytes; t_ns is the tick's deadline
+    tick        inputs u64, overruns u64, latency_ns i64, digest 8 bytes; t_ns is the tick's deadline
     read        bytes of one read
     frame       CAN id u32, flags u8 (1 extended, 2 remote, 4 error, 8 stamped), realtime_ns i64,
                 data
@@ -87,7 +87,7 @@ class Tick(NamedTuple):
 
     inputs: int
     overruns: int
-    late_ns: int
+    latency_ns: int
     digest: bytes
 
 

@@ -60,7 +60,7 @@ class InputStatistics:
             self._first_ns = record.t_ns
         if record.kind is Kind.TICK:
             with suppress(DamagedRecordError):
-                self._tick_delays.append((record.t_ns, tick_of(record).late_ns))
+                self._tick_delays.append((record.t_ns, tick_of(record).latency_ns))
         elif record.source != NO_SOURCE:
             since_s = (record.t_ns - self._first_ns) / SECOND_NS
             if since_s < WHOLE_S:

@@ -190,10 +190,9 @@ def _quiet(
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Run the study with `runs` windows for each false-alarm rate.
+    """Run the study with `runs` windows a false-alarm rate, 1/40 of them (>= 50) runs a power.
 
-    A fortieth of that number (at least 50) are runs of 1,800 epochs for each power. The same
-    arguments give the same result.
+    A run has 1,800 epochs. The same arguments give the same result.
     """
     windows = runs or DEFAULT_RUNS
     drives = max(50, windows // 40)
