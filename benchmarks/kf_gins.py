@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.load import load_config
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.tables import (
     GnssTable,
     TrajectoryTable,

@@ -18,7 +18,7 @@ from typing import Any
 
 from playwright.async_api import Browser, async_playwright
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from tests.dashboard.serving import at_work, payload, said
 from tests.dashboard.tiles import MVT, PNG, all_water, png, tile_of, write_map
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import PositionFix, TimeReport, UtcStamp
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator

@@ -1,4 +1,4 @@
-"""A call that may block for seconds, in a thread that nobody waits for.
+"""Call that may block for seconds, in a detached thread.
 
 A thread of the loop's own pool is joined before the process may end: a name server that does not
 answer would hold up the end of the daemon by more than its service manager allows.

@@ -21,8 +21,8 @@ from drivers.raw.messages import RawEvent
 from drivers.rdss.mail import Mail
 
 Emitted = Measurement | RawEvent | DeviceEvent | Mail
-"""All that a driver may hand over. A `NavigationMessage` has no stamp: it says itself what it is
-valid for."""
+"""Types that a driver may emit. A `NavigationMessage` has no stamp: it contains its own validity.
+"""
 Emit = Callable[[Emitted], None]
 Now = Callable[[], int]
 
@@ -30,7 +30,7 @@ State = Literal["starting", "absent", "silent", "running", "failed"]
 
 
 class DriverError(Exception):
-    """A fault of a device or of its line that may pass: the driver retries."""
+    """Transient fault of a device or line, after which the driver retries."""
 
 
 class PermanentDriverError(DriverError):

@@ -1,4 +1,4 @@
-"""Budget of bytes parsed of a line: as many as a receiver sends, whoever sends them.
+"""Limit on the bytes parsed of a line, set by the fastest rate of a real receiver.
 
     a bucket of BURST bytes, filled at the line's rate; each byte read takes one out of it
 
@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 
 LINE_BYTES_S = 92_160.0
-"""921600 baud, the highest rate that receivers have on a UART, of ten bits a byte; 60 satellites of
+"""Byte rate of 921600 baud, a receiver's highest UART rate, at ten bits a byte; 60 satellites of
 two signals at 10 Hz (RXM-RAWX and RXM-SFRBX) take half of it."""
 BURST = 65_536.0
 """The largest datagram; seven of the longest epochs (8 kB)."""

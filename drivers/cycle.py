@@ -12,13 +12,13 @@ from collections.abc import Hashable
 MAX_UNLEARNED = 8
 """Cycles remembered as too short; a receiver mixes at most a few output rates."""
 MAX_CYCLE = 24
-"""Messages that one epoch may hold; a receiver sends a dozen kinds."""
+"""Most messages in an epoch; a receiver sends a dozen kinds."""
 
 Name = int | str
 
 
 class Cycle:
-    """The names of the epoch that is open, and what earlier ones have shown.
+    """Names in the open epoch, and the pattern of earlier ones.
 
     Counts `late_message`: more of an epoch that was closed because its last one had come.
     """
@@ -34,18 +34,18 @@ class Cycle:
 
     @property
     def open(self) -> bool:
-        """True if an epoch has begun."""
+        """True if an epoch is open."""
         return bool(self._names)
 
     def restarts(self, key: Hashable, name: Name) -> bool:
-        """True if a message belongs to another epoch than the one that is open."""
+        """True if a message starts another epoch."""
         if not self._names:
             return False
         return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
 
     def delayed(self, key: Hashable, name: Name) -> bool:
-        """True if a message is of the epoch that was closed just now: what was learned is too
-        short. One that this epoch had is none: the receiver repeats itself."""
+        """True for a message of the epoch just closed, whose learned pattern was too short. A name
+        already in that epoch is a repetition instead."""
         if self._names or not self._at_once or key != self._key or name in self._last:
             return False
         self._counters["late_message"] += 1

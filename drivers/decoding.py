@@ -7,7 +7,7 @@ from datetime import date
 from drivers.base import DriverOptions
 
 BUILD_DATE = date(2026, 11, 20)
-"""No receiver can truly report a date before this software was written."""
+"""Build date of this software, before which no receiver's date is plausible."""
 
 
 class SolutionDecoding(DriverOptions):
@@ -16,7 +16,6 @@ class SolutionDecoding(DriverOptions):
     heading_offset_deg: float = 0.0
     """Added to headings: from the antenna baseline to the vehicle's forward axis, clockwise."""
     earliest_date: date = BUILD_DATE
-    """Dates before it are refused; set it back to read old logs."""
+    """Earliest accepted date; set it back to read old logs."""
     allow_simulator: bool = False
-    """Accept positions that the receiver calls simulated or put in by hand (of NMEA quality 7 and
-    8)."""
+    """Accept simulated or manually entered positions (NMEA quality 7 and 8)."""

@@ -32,7 +32,7 @@ def geodetic(x: float, y: float, z: float) -> Vector3:
 
 
 def north_east_down(v: Vector3, lat: float, lon: float) -> Vector3:
-    """A vector of ECEF axes in those of a place (rad)."""
+    """Rotate a vector from ECEF axes to NED axes at a position (rad)."""
     x, y, z = v
     sin_lat, cos_lat, sin_lon, cos_lon = (
         math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon),

@@ -1,4 +1,4 @@
-"""The door of a driver: what moves it from outside comes in here, one thing after the other.
+"""Single entry point of a driver: all external input arrives here, in sequence.
 
 A driver is a function of its inputs. While one of them is handled the driver's time stands at the
 instant at which it came, so that the same inputs, taken again from a recording, give the same
@@ -59,6 +59,6 @@ class Inputs:
             self._held_ns = None
 
     def sent(self, data: bytes) -> None:
-        """Tell who listens what the driver has sent to its device."""
+        """Report data sent to the device to the listener."""
         if self.on_input is not None:
             self.on_input("sent", self.now_ns(), data)

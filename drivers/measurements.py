@@ -53,14 +53,14 @@ class DeviceStamp:
 
 @immutable()
 class UtcStamp:
-    """A full UTC instant as POSIX nanoseconds (a leap second repeats the last second's count)."""
+    """Full UTC instant as POSIX nanoseconds (a leap second repeats the last second's count)."""
 
     utc_ns: int
 
 
 @immutable()
 class TimeOfDayStamp:
-    """A time of day without a date, in one of several possible zones.
+    """Time of day without a date, in one of several possible zones.
 
     `time_of_day_s` may reach 86401 (leap second). `zones_h` lists the possible offsets of the
     printed time from UTC. `requested_ns` is the monotonic instant at which the device was asked,
@@ -81,7 +81,7 @@ Stamp = ArrivalStamp | MonotonicStamp | KernelStamp | DeviceStamp | UtcStamp | T
 
 @immutable()
 class ImuSample:
-    """Mean angular rate (rad/s) and specific force (m/s^2) since the sample before, sensor axes."""
+    """Mean angular rate (rad/s) and specific force (m/s^2) since the last sample, sensor axes."""
 
     source: str
     t_seen_ns: int
@@ -92,7 +92,7 @@ class ImuSample:
 
 @immutable()
 class PositionFix:
-    """A GNSS receiver's fix of its antenna, with velocity where the receiver gives one.
+    """Fix of a GNSS receiver's antenna, with velocity if stated.
 
     `sd_ned_m` and `sd_v_ned_m_s` are one sigma; None where the device did not say (the aiding then
     uses what the configuration holds). A velocity whose down part is None is horizontal only.
@@ -239,7 +239,7 @@ class WheelSpeed:
 
 @immutable()
 class TimeReport:
-    """UTC as a device states it (NMEA RMC/ZDA, RDSS SJXX/BDZDA), to discipline the clock.
+    """UTC from a device (NMEA RMC/ZDA, RDSS SJXX/BDZDA), for the clock.
 
     `trusted` is False while the device itself says its time is not yet valid.
     """

@@ -1,4 +1,4 @@
-"""A receiver behind a network, read as if it hung on a serial line; see `docs/network.md`.
+"""Receiver behind a network, read like a serial line; see `docs/network.md`.
 
     tcp://HOST:PORT            a serial server, or a receiver's own socket: this side connects
     udp://:PORT                datagrams to this port; udp://ADDRESS:PORT of one interface alone
@@ -22,18 +22,18 @@ from pydantic import AfterValidator
 from drivers.port import READ_BYTES, Port, SerialPort
 
 CONNECT_S = 5.0
-"""For name and connection together a few round trips of a mobile network; the first packet is sent
-again after 1 s and 3 s (RFC 6298, section 2)."""
+"""Timeout of name resolution and connection: a few round trips of a mobile network; the first
+packet is repeated after 1 s and 3 s (RFC 6298, section 2)."""
 KEEPALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte.
+"""Keepalive options: a lost host is noticed after 5 + 3 * 2 = 11 s without a byte.
 
 A receiver that works leaves no such pause; three probes, since mobile links lose one now and
 then."""
 UNANSWERED_MS = 11_000
-"""The same for bytes of ours that are not acknowledged (RFC 5482)."""
+"""Timeout for unacknowledged sent bytes (RFC 5482)."""
 SENDER_HELD_S = 5.0
-"""A port hears the sender that spoke first until it was silent for this long: the sentences of two
-receivers would be mixed. Five epochs at 1 Hz, the time-out of the drivers."""
+"""Time of silence after which a port accepts another sender; sentences of two receivers must not
+mix. Five epochs at 1 Hz, the drivers' timeout."""
 DATAGRAM_BYTES = 65_535
 
 _DEFAULT_PORTS = {"tcp": None, "udp": None, "gpsd": 2947}
@@ -46,7 +46,7 @@ def on_network(port: str) -> bool:
 
 
 def _split(port: str) -> tuple[SplitResult, int]:
-    """The address and its port number; ValueError where it is none of `_EXAMPLES`."""
+    """Address and port number; ValueError with `_EXAMPLES` otherwise."""
     parts = urlsplit(port)
     if parts.scheme not in _DEFAULT_PORTS:
         raise ValueError(f"no such kind of address: {_EXAMPLES}")
@@ -93,7 +93,7 @@ def open_port(name: str, baud: int, counters: Counter[str]) -> Port:
 
 
 def connect(host: str, number: int) -> socket.socket:
-    """A TCP connection that notices when its far end is gone. Blocks; OSError."""
+    """Open a TCP connection with keepalive. Blocks; OSError."""
     connection = socket.create_connection((host, number), CONNECT_S)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in KEEPALIVE.items():
@@ -152,7 +152,7 @@ class UdpPort(_SocketPort):
     """Datagrams of one sender; what is written goes back to it."""
 
     at_end = ""
-    """There is none."""
+    """False: a network port has no end."""
 
     def __init__(self, address: str | None, number: int, counters: Counter[str]) -> None:
         found = socket.getaddrinfo(address, number, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)

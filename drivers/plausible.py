@@ -7,14 +7,15 @@ that was edited, a decoder of somebody else's. What lies outside is refused by t
 from __future__ import annotations
 
 HEIGHT_M = (-1_000.0, 100_000.0)
-"""Ellipsoidal. The lowest dry land, the shore of the Dead Sea, is at -430 m, and the geoid down to
-106 m below the ellipsoid (EGM96); above 100 km (FAI's limit of space) nothing drives or flies."""
+"""Ellipsoidal height. The lowest dry land, the shore of the Dead Sea, is at -430 m, and the geoid
+down to 106 m below the ellipsoid (EGM96); above 100 km (FAI's limit of space) nothing drives or
+flies."""
 SPEED_M_S = 1_000.0
-"""A receiver without an export licence stops at 515 m/s (1,000 knots, the CoCom rule) or 600 m/s
-(Wassenaar Arrangement, 7.A.5); the rest is room for one that has it."""
+"""Speed. A receiver without an export licence stops at 515 m/s (1,000 knots, the CoCom rule) or 600
+m/s (Wassenaar Arrangement, 7.A.5); the rest is a margin for licensed ones."""
 SIGMA_M = (1e-3, 1e5)
-"""One sigma of a position. Below a millimetre no phase is measured (GST prints millimetres, and a
-0 where it has none); one beyond a degree of latitude says that there is no position."""
+"""One sigma of a position. No phase is measured below a millimetre (GST prints millimetres, and 0
+where it has none); a sigma beyond a degree of latitude means no position."""
 LEAP_SECONDS = (10, 30)
 """GPS time minus UTC: 18 since 2017, changed by one in years, and not at all from 2035 on (CGPM
 2022, resolution 4)."""

@@ -1,4 +1,4 @@
-"""Ports: an open port that never blocks, and the serial one."""
+"""Ports: a non-blocking open port, and the serial one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Port(Protocol):
 
     @property
     def writable(self) -> bool:
-        """True if there is anybody to write to."""
+        """True if the far end can receive."""
 
     def fileno(self) -> int:
         """The descriptor that a loop waits for."""
@@ -43,22 +43,22 @@ class Port(Protocol):
         """Number of bytes taken."""
 
     def changed(self) -> str:
-        """Reason why this is no longer what its name stands for; empty while it is."""
+        """Reason why the port's name no longer refers to it; empty while it does."""
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate, where there is one."""
+        """Change the baud rate, if any."""
 
     def close(self) -> None:
-        """Give it back, at once."""
+        """Close at once."""
 
 
 OpenPort = Callable[[str, int, Counter[str]], Port]
-"""Opens the port of a name at a baud rate, with the counters of its line; may take seconds, raises
-`OPEN_ERRORS`."""
+"""Function that opens a port by name at a baud rate, with the counters of its line; may take
+seconds, raises `OPEN_ERRORS`."""
 
 
 def open_serial(path: str, baud: int, counters: Counter[str]) -> Port:
-    """A serial device, and nothing else. Raises `OPEN_ERRORS`."""
+    """Open a serial device only. Raises `OPEN_ERRORS`."""
     return SerialPort(path, baud)
 
 
@@ -77,7 +77,7 @@ def why_not_open(error: Exception) -> str:
 
 
 class SerialPort:
-    """8 data bits, no parity, 1 stop bit, no flow control, raw bytes.
+    """Serial port: 8 data bits, no parity, 1 stop bit, no flow control, raw bytes.
 
     pyserial opens and configures it; reading and writing go straight to its descriptor, so that
     every read is bounded and an end of file is seen as what it is.

@@ -1,4 +1,4 @@
-"""Common part of receiver and compass drivers: one on one line, read and judged.
+"""Common base of receiver and compass drivers: one device on one line.
 
 A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
 silent, and says in `status` whether the device is there and intelligible.
@@ -34,7 +34,7 @@ class ReceiverDecoder(Protocol):
 
     @property
     def gga(self) -> bytes:
-        """The last GGA with a position, without its line end; empty before one."""
+        """Last GGA with a position, without its line end; empty before one."""
 
     @property
     def epoch_open(self) -> bool:
@@ -48,13 +48,13 @@ class ReceiverDecoder(Protocol):
 
 
 class ReceiverOptions(DriverOptions):
-    """Port of the receiver, and what is written to it."""
+    """Port of the receiver, and its initial commands."""
 
     port: PortName
     """A serial device, or an address of a network: see `docs/network.md`."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
     timeout_s: PositiveFloat = 5.0
-    """Without anything verified for this long the device is `silent`; five epochs at 1 Hz."""
+    """Time without verified input after which the device is `silent`; five epochs at 1 Hz."""
     ntrip: NtripOptions | None = None
     """Corrections of a caster, written to the receiver."""
 
@@ -103,7 +103,7 @@ class ReceiverDriver:
             )
         self._silence: asyncio.TimerHandle | None = None
         self._alive_ns = now_ns()
-        """Instant when the line opened or something on it last verified."""
+        """Instant of the line's opening or of its last verified input."""
         self._window: dict[str, int] = {}
         """Counters at that instant: what came since and was not understood."""
         self._useful_ns = self._alive_ns
@@ -111,23 +111,23 @@ class ReceiverDriver:
 
     @property
     def cautions(self) -> dict[str, str]:
-        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        """Cautions by counter: limits on the quality of fixes, and the actions taken."""
         return {}
 
     def _make_decoder(self) -> ReceiverDecoder:
-        """The decoder, which counts in `self.counters`."""
+        """Make the decoder, which counts in `self.counters`."""
         raise NotImplementedError
 
     def _useless_detail(self) -> str:
-        """Reason why what arrives has brought no measurement for the time-out."""
+        """Reason why input has given no measurement for the timeout."""
         raise NotImplementedError
 
     def _unintelligible_detail(self) -> str:
-        """Reason why the bytes that arrive are not what this driver reads."""
+        """Reason why the received bytes are not this driver's input."""
         raise NotImplementedError
 
     def _where_to_look(self) -> str:
-        """Ends a sentence on bytes that nothing can be made of."""
+        """End of a sentence on unrecognised bytes: where to look next."""
         if on_network(self._port):
             return f" from {self._port}: does it serve what the receiver sends?"
         return f" at {self._baud} baud: is that the receiver's rate?"
@@ -231,7 +231,7 @@ class ReceiverDriver:
             self._emit(state_event(self.name, self._now_ns(), self._port, self.status))
 
     def _since_alive(self, name: str) -> int:
-        """Growth of a counter of bytes, sentences or frames since the device last made sense."""
+        """Growth of a counter of bytes, sentences or frames since the device's last valid input."""
         return self.counters[name] - self._window.get(name, 0)
 
     def _running_detail(self) -> str:

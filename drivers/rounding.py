@@ -18,7 +18,7 @@ Rounding = Literal["nearest", "down", "unknown"]
 NEAREST_SD = 1.0 / math.sqrt(12.0)
 """One sigma of rounding to the nearest, in steps."""
 SHARED_SD = 0.25
-"""One sigma, in steps, of what all readings share where it is not known how they are rounded."""
+"""One sigma, in steps, of an unknown rounding's common part."""
 _MEAN_SD: dict[Rounding, tuple[float, float]] = {
     "nearest": (0.0, NEAREST_SD),
     "down": (0.5, NEAREST_SD),
@@ -42,7 +42,7 @@ class RoundedSpeed(NamedTuple):
 def rounded_speed(
     value_m_s: float, step_m_s: float, rounding: Rounding = "nearest"
 ) -> RoundedSpeed:
-    """The speed behind what a device with steps of `step_m_s` says.
+    """Expected speed for a rounded value of a device with steps of `step_m_s`.
 
     A 0 is no standstill: it says that the speed is below one step, whichever way it is rounded,
     for sensors of wheels give no pulses below a least speed.

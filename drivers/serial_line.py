@@ -1,4 +1,4 @@
-"""A line under asyncio that is there when the device is, and comes back when it comes back.
+"""Serial line under asyncio that reopens itself when its device disappears and returns.
 
 Every read is bounded, stamped, and an end is seen as what it is. A piece is handed over in a turn
 of the loop, and bytes no faster than a line can be (drivers.byte_budget).
@@ -21,11 +21,12 @@ __all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
 PENDING_WRITE_BYTES = 4096
 """Most bytes that may wait for a slow line: 2 s of 19200 baud, the slowest terminal."""
 PATH_CHECK_S = 1.0
-"""Interval of comparing the path with the open device, for replugs the descriptor cannot see."""
+"""Interval of comparing the path with the open device, for replugs that the descriptor cannot see.
+"""
 
 
 class SerialLine:
-    """One port, reopened with `backoff` for ever: a serial one, but for another `open_port`.
+    """Port reopened indefinitely with `backoff`; serial, unless `open_port` is another one.
 
     `counters`: `opened`, `closed`, `open_failed`, `bytes_in`, `bytes_out`, `write_refused`,
     `baud_refused`, `paused` (more came than a line brings). `detail` is the last trouble in words;
@@ -52,7 +53,7 @@ class SerialLine:
         self._pending = bytearray()
         self._budget = ByteBudget(baud)
         self._unread: tuple[bytes, int] = b"", 0
-        """Rest of a read, and when it was found."""
+        """Rest of a read, and the instant of its arrival."""
         self._resume: asyncio.Handle | None = None
 
     @property
@@ -114,7 +115,7 @@ class SerialLine:
         return True
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate, at once when the line is open, and for every later opening."""
+        """Change the baud rate, at once when the line is open, and for every later opening."""
         self.baud = baud
         self._budget = ByteBudget(baud)
         if self._opened is None:

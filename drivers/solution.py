@@ -1,4 +1,4 @@
-"""A receiver's own solution of one epoch, as its protocol states it, and its judgement.
+"""Solution of a receiver's epoch, as in its protocol, and its validation.
 
 What NMEA spreads over sentences comes here in one piece: UBX-NAV, the BESTPOS family and SBF fill a
 `Solution`, and `SolutionJudge` makes of it what `drivers.nmea.decoder` makes of an epoch: a fix, a
@@ -44,12 +44,12 @@ REFUSALS = {
     "speed_implausible": "the receiver states a speed that no vehicle has",
     "sigma_too_large": "the receiver states that it does not know where it is",
 }
-"""In words for `status`, by counter."""
+"""Texts of refusals for `status`, by counter."""
 
 
 @dataclass(slots=True)
 class Solution:
-    """One epoch; rad, m, m/s, NED, ns of POSIX time. None where the receiver did not say.
+    """Epoch; rad, m, m/s, NED, ns of POSIX time. None where not stated.
 
     `refusal`: why the position may not be used, by counter. `utc_known`: the receiver believes its
     UTC. `hdop` and `vdop` are without unit.
@@ -89,7 +89,7 @@ class SolutionJudge:
         self.implausible_date: date | None = None
         """The last date that no receiver can truly report."""
         self.gga = b""
-        """The last fix as a GGA, for a caster that asks where the receiver is; empty before one."""
+        """Last fix as a GGA, for a caster that needs the position; empty before one."""
         self._source = source
         self._decoding = decoding
         self._calendar = Calendar(decoding.earliest_date, counters)
@@ -120,8 +120,8 @@ class SolutionJudge:
     def heading(
         self, t_seen_ns: int, utc_ns: int | None, heading_rad: float, sd_rad: float | None
     ) -> list[Measurement]:
-        """Of two antennas, the baseline's direction (rad, from north, clockwise). Without UTC it is
-        as old as it can be: true when it came."""
+        """Heading (rad, from north, clockwise) of two antennas' baseline. Without UTC it is stamped
+        with its arrival."""
         stamp: Stamp = ArrivalStamp() if utc_ns is None else self._stamp_of(utc_ns)
         good = abs(heading_rad) <= 2.0 * math.tau and (sd_rad is None or 0.0 <= sd_rad < math.pi)
         if not good:
@@ -133,7 +133,7 @@ class SolutionJudge:
         return [Heading(self._source, t_seen_ns, stamp, math.remainder(yaw, math.tau), sd)]
 
     def _stamp(self, s: Solution, found: list[Measurement]) -> Stamp | None:
-        """The solution's instant, None where it has none; reports the time when it is believed."""
+        """Instant of the solution, None without one; reports a trusted time."""
         if s.utc_ns is None:
             return None
         stamp = self._stamp_of(s.utc_ns)
@@ -184,7 +184,7 @@ class SolutionJudge:
 
 
 def _gga(fix: PositionFix, utc_ns: int) -> bytes:
-    """NMEA 0183's sentence, without its line end; the height is the ellipsoid's, separation 0."""
+    """GGA of NMEA 0183 without its line end; the height is ellipsoidal, separation 0."""
     time = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC)
     lat, lon = abs(math.degrees(fix.lat_rad)), abs(math.degrees(fix.lon_rad))
     body = (
@@ -202,7 +202,7 @@ def _minutes(degrees: float, digits: int) -> str:
 
 
 def _implausible(s: Solution) -> str | None:
-    """The counter of what no receiver can mean."""
+    """Counter of an implausible value."""
     if s.lat_rad is None or s.lon_rad is None:
         return "no_fix"
     if not (abs(s.lat_rad) <= math.pi / 2 and abs(s.lon_rad) <= math.pi):

@@ -42,7 +42,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
         self.left_out: Counter[str] = Counter()
-        """Names of messages that are not used, of a stream of nonsense the first few."""
+        """Names of unused messages, the first few of an unreadable stream."""
 
     @property
     def refusal(self) -> str:
@@ -51,7 +51,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @property
     def cautions(self) -> dict[str, str]:
-        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        """Cautions by counter: limits on the quality of fixes, and the actions taken."""
         day = self._judge.implausible_date
         if day is None:
             return {}
@@ -75,7 +75,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         return found
 
     def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        """Handle a silence longer than any receiver's pause within an epoch (50 ms)."""
         found: list[Measurement] = []
         self._end(found, learn=True)
         return found
@@ -95,7 +95,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @abstractmethod
     def _make_splitter(self) -> Splitter[Message]:
-        """Splitter; it counts in `self.counters`."""
+        """Make the splitter, which counts in `self.counters`."""
 
     @abstractmethod
     def _take(self, message: Message, found: list[Measurement]) -> None:
@@ -108,8 +108,8 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
     # ----------------------------------------------------------------- epochs
 
     def _belongs(self, key: Hashable, name: Name, found: list[Measurement]) -> bool:
-        """True if a message of instant `key` goes into the epoch that is open, or a new one; what
-        it closes is `found`."""
+        """True if a message of instant `key` belongs to the open epoch or starts a new one; a
+        closed epoch's results are added to `found`."""
         if self._cycle.restarts(key, name):
             self._close(found, learn=True)
         return not self._cycle.delayed(key, name)
@@ -124,5 +124,5 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
             found += self._judge.epoch(solution)
 
     def _end(self, found: list[Measurement], *, learn: bool) -> None:
-        """No more will come of what is open."""
+        """End the open epoch."""
         self._close(found, learn=learn)

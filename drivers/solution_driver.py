@@ -20,7 +20,7 @@ KEPT_BYTES = 4096
 
 
 class SolutionOptions(ReceiverOptions, SolutionDecoding):
-    """Options of a receiver whose own solutions are read."""
+    """Options of a receiver with its own solutions."""
 
 
 class SolutionDriver(ReceiverDriver):
@@ -31,9 +31,9 @@ class SolutionDriver(ReceiverDriver):
     kind: ClassVar[str]
     """The driver's name."""
     wanted: ClassVar[str]
-    """Name of what verifies, as in "bytes arrive, but no ... verifies"."""
+    """Name of verified input, as in "bytes arrive, but no ... verifies"."""
     switch_on: ClassVar[str]
-    """Advice where nothing that arrives has a position."""
+    """Advice where no input has a position."""
 
     def __init__(
         self, name: str, options: SolutionOptions, emit: Emit, now_ns: Now = monotonic_ns
@@ -84,7 +84,7 @@ class SolutionDriver(ReceiverDriver):
 
     @property
     def cautions(self) -> dict[str, str]:
-        """As `ReceiverDriver`."""
+        """Cautions, as in `ReceiverDriver`."""
         found: dict[str, str] = self._solutions.cautions
         return found
 

@@ -7,13 +7,13 @@ from collections import Counter
 from typing import Generic, TypeVar
 
 SLICE = 4096
-"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
+"""Bytes scanned at a time, so that the buffer stays bounded."""
 
 Message = TypeVar("Message")
 
 
 class Splitter(ABC, Generic[Message]):
-    """A buffer of what is not yet whole. Who derives from it finds messages in it (`_scan`)."""
+    """Buffer of incomplete input. Subclasses find messages in it (`_scan`)."""
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
@@ -40,4 +40,4 @@ class Splitter(ABC, Generic[Message]):
 
     @abstractmethod
     def _scan(self, found: list[Message], *, final: bool) -> None:
-        """Take what is whole out of the buffer; all of it when `final`."""
+        """Remove complete messages from the buffer; everything when `final`."""

@@ -13,11 +13,12 @@ T0_K, LAPSE_K_M, P0_PA, G0_M_S2, R_J_KG_K = 288.15, 6.5e-3, 101_325.0, 9.80665, 
 SCALE_M = T0_K / LAPSE_K_M
 EXPONENT = R_J_KG_K * LAPSE_K_M / G0_M_S2
 PRESSURE_PA = (22_632.0, 120_000.0)
-"""From the tropopause at 11 km, where the formula ends, to beyond the highest at any shore."""
+"""Range of the formula: from the tropopause at 11 km to beyond the highest pressure at any shore.
+"""
 
 
 def pressure_height_m(pressure_pa: float) -> float:
-    """Height (m) in the standard atmosphere at which this is the pressure."""
+    """Height (m) of a pressure in the standard atmosphere."""
     height: float = SCALE_M * (1.0 - (pressure_pa / P0_PA) ** EXPONENT)
     return height
 

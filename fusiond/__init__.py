@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # the same names as in _HOMES, for whoever reads types
     from fusiond.configuration.load import ConfigError as ConfigError
     from fusiond.configuration.load import load_config as load_config
     from fusiond.configuration.schema import Config as Config
-    from fusiond.configuration.settings import imu_noise as imu_noise
+    from fusiond.configuration.si_units import imu_noise as imu_noise
     from fusiond.estimators.base import Estimator as Estimator
     from fusiond.files.csv_tables import TableError as TableError
     from fusiond.files.tables import TrajectoryTable as TrajectoryTable
@@ -57,7 +57,7 @@ _HOMES = {
     ),
     "fusiond.configuration.load": ("ConfigError", "load_config"),
     "fusiond.configuration.schema": ("Config",),
-    "fusiond.configuration.settings": ("imu_noise",),
+    "fusiond.configuration.si_units": ("imu_noise",),
     "fusiond.estimators.base": ("Estimator",),
     "fusiond.files.csv_tables": ("TableError",),
     "fusiond.files.tables": (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.aiding.standstill import Rest
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

@@ -35,7 +35,7 @@ MODULES = (
 )
 COMPILE = f"""
 import sys
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 with compiling():
     import {", ".join(MODULES)}
 from fusiond.navigation.compiled import FOLDER

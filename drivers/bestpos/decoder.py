@@ -64,7 +64,7 @@ _POSITION, _BOTH, _VELOCITY_AT = 10, 28, 21
 
 
 class BadFieldError(ValueError):
-    """A log verified, but a field of it cannot be."""
+    """Error: an implausible field in a verified log."""
 
 
 @dataclass(slots=True)
@@ -91,7 +91,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
     """
 
     _leap_seconds: int | None = None
-    """As TIME told them."""
+    """Leap seconds from TIME."""
 
     def _make_splitter(self) -> LogSplitter:
         return LogSplitter(self.counters)
@@ -181,7 +181,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
         )
 
     def _velocity(self, log: Log) -> tuple[_Velocity, _VelocitySd | None] | None:
-        """None where the receiver has none, or BESTNAV is a firmware's that does not send it."""
+        """Velocity; None where the receiver has none, or its firmware lacks BESTNAV."""
         f = log.fields
         if log.name == "BESTNAV":
             if len(f) < _BOTH:

@@ -25,8 +25,7 @@ from drivers.raw.weeks import (
 from drivers.splitter import Splitter
 
 MAX_LOG = 2048
-"""Bytes from `#` to its CRC. A position has 300; RANGE and the like, which are longer, are not
-read."""
+"""Most bytes from `#` to the CRC. A position has 300; longer logs such as RANGE are not read."""
 _NOT_BODY = re.compile(rb"[^\x20-\x22\x24-\x29\x2b-\x7e]")  # anything but text, and # and *
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{2,31}\Z")
 _BODY = 9
@@ -37,11 +36,11 @@ TIMED = frozenset(
 )
 """Time statuses with a week and seconds that can be used."""
 BELIEVED = frozenset({"FINEADJUSTING", "FINE", "FINEBACKUPSTEERING", "FINESTEERING", "EXACT"})
-"""Of them, those in which the receiver is sure of its clock to a microsecond."""
+"""Time states in which the receiver knows its clock to a microsecond."""
 
 
 def log_crc(data: bytes) -> int:
-    """The CRC of what stands between `#` and `*`."""
+    """CRC of the characters between `#` and `*`."""
     return crc32(data, _ALL) ^ _ALL
 
 

@@ -27,9 +27,9 @@ class CanMeasurementOptions(CanOptions):
     """Common part of the two."""
 
     valid: str | Signals = ()
-    """Flags: a measurement with 0 in one is counted as `not_valid` and goes no further."""
+    """Flags: a measurement with 0 in one is counted as `not_valid` and dropped."""
     timeout_s: PositiveFloat = 5.0
-    """Without a measurement for so long the device is `silent`."""
+    """Time without a measurement after which the device is `silent`."""
 
 
 class CanAttitudeOptions(CanMeasurementOptions):
@@ -43,7 +43,7 @@ class CanAttitudeOptions(CanMeasurementOptions):
 
 
 class CanBearingOptions(CanMeasurementOptions):
-    """Signals of the direction to a point, and which number names the point.
+    """Signals of the direction to a point, and of the point's number.
 
     Azimuth runs from the sensor's x (nominally forward) to its y (right), elevation is positive
     upwards.

@@ -1,4 +1,4 @@
-"""A CAN bus under asyncio that is there when the interface is, and comes back when it comes back.
+"""CAN bus under asyncio that reopens itself when its interface disappears and returns.
 
 python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
 descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descriptor (`socketcan`,
@@ -34,7 +34,7 @@ FRAMES_PER_WAKEUP = 64
 RING_FRAMES = 1024
 """Most frames a thread may hold for the loop: 1.7 s of an IMU of 600 frames/s."""
 CHECK_S = 1.0
-"""Interval of reading the kernel's drop count for want of room in the socket."""
+"""Interval of reading the kernel's count of frames dropped for want of buffer space."""
 LONGEST_WAIT_S = 1.0
 """Longest wait between attempts to open: trying costs three system calls, so try often."""
 
@@ -49,7 +49,7 @@ _SO_MEMINFO, _SK_MEMINFO_DROPS = 55, 8
 
 
 class CanFilter(TypedDict):
-    """A filter as python-can takes it: a frame passes when `id & can_mask == can_id & can_mask`."""
+    """Filter in python-can's form: a frame passes when `id & can_mask == can_id & can_mask`."""
 
     can_id: int
     can_mask: int
@@ -81,7 +81,7 @@ Read = Callable[[], CanFrame | None]
 
 
 class CanBus:
-    """One CAN bus, reopened for ever. It listens; it sends what it is told to, and nothing else.
+    """CAN bus, reopened indefinitely; sends only on request.
 
     With `polled`, set before `run`, a bus that has a descriptor is read by `poll` alone.
 
@@ -177,7 +177,7 @@ class CanBus:
     # ----------------------------------------------------------------- opening
 
     def _open(self) -> can.BusABC:
-        """Open; OSError or CanError when the interface is absent or down."""
+        """Open the bus; OSError or CanError when the interface is absent or down."""
         if self.interface != "socketcan":
             return can.Bus(interface=self.interface, channel=self.channel, ignore_config=True)
         socket.if_nametoindex(self.channel)
@@ -266,7 +266,7 @@ class CanBus:
         return arrived_ns if self._read_ns <= arrived_ns <= now_ns else now_ns
 
     def _read_socket(self, sock: socket.socket) -> CanFrame | None:
-        """One frame off a raw CAN socket with its kernel stamp, None when there is none.
+        """Read one frame of a raw CAN socket with its kernel stamp; None without one.
 
         A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds.
         """
@@ -295,7 +295,7 @@ class CanBus:
         )
 
     def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
-        """One frame by python-can, None when there is none.
+        """Read one frame through python-can; None without one.
 
         A datagram on `udp_multicast` that is no CAN frame is counted and passed over.
         """
@@ -324,7 +324,7 @@ class CanBus:
         )
 
     def _count_drops(self, sock: socket.socket) -> None:
-        """Add what the kernel dropped since the last look (SK_MEMINFO_DROPS, since Linux 4.12)."""
+        """Add the kernel's newly dropped frames (SK_MEMINFO_DROPS, since Linux 4.12)."""
         with contextlib.suppress(OSError, struct.error):
             info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_SK_MEMINFO_DROPS + 1))
             (drops,) = struct.unpack_from("@I", info, 4 * _SK_MEMINFO_DROPS)
@@ -358,10 +358,10 @@ class CanBus:
 
 
 class _ThreadReader:
-    """Reads a bus without a descriptor in a daemon thread, through a bounded ring."""
+    """Reader of a bus without a descriptor, in a daemon thread, through a bounded ring."""
 
     POLL_S = 0.1
-    """Longest wait in the thread, hence the longest it outlives its bus."""
+    """Longest wait in the thread, and so its longest life after its bus."""
 
     def __init__(self, owner: CanBus, bus: can.BusABC, gone: asyncio.Future[str]) -> None:
         self._owner = owner

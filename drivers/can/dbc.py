@@ -1,4 +1,4 @@
-"""From a DBC file and a mapping of axes to a plan of decoding; no I/O once the file is loaded.
+"""Decoding plan from a DBC file and a mapping of axes; no I/O once the file is loaded.
 
 A signal is named `Message.Signal`. Physical value = raw * scale + offset (DBC), in the signal's
 unit; the plan folds sign and unit into scale and offset, so that an axis costs one multiplication
@@ -51,7 +51,8 @@ FORCE_UNITS = {
     "mg": STANDARD_GRAVITY_M_S2 * 1e-3,
 }
 MOST_RAD_S, MOST_M_S2 = 175.0, 10_000.0
-"""Beyond any inertial sensor: 10,000 deg/s and 1,000 g; only a damaged float says more."""
+"""Limits beyond any inertial sensor: 10,000 deg/s and 1,000 g; only a damaged float exceeds them.
+"""
 ANGLE_UNITS = {
     "rad": 1.0,
     "mrad": 1e-3,
@@ -105,7 +106,7 @@ class RefusedFrameError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One value out of one signal: SI value = raw * scale + offset, believed within low..high.
+    """Axis from one signal: SI value = raw * scale + offset, plausible within low..high.
 
     `step` is the distance of neighbouring values, 0 of a floating-point signal.
     """
@@ -179,7 +180,7 @@ class MessagePlan:
 
 
 def find_dbc(name: str) -> Path:
-    """The DBC file of this path, else the shipped one of this name."""
+    """DBC file of this path, else the shipped one of this name."""
     for path in (Path(name), SHIPPED / name, SHIPPED / f"{name}.dbc"):
         if path.is_file():
             return path
@@ -204,7 +205,7 @@ def load_dbc(name: str) -> Database:
 
 @lru_cache(maxsize=16)
 def _parsed(path: Path, changed_ns: int) -> Database:
-    """The file as it was then: sources of one bus share one."""
+    """Parsed file at that time of change, shared by sources of one bus."""
     content = path.read_bytes()
     # As cantools takes it; a BOM says that it is not so.
     encoding = "utf-8-sig" if content.startswith(BOM_UTF8) else "cp1252"
@@ -243,7 +244,7 @@ def find_signal(database: Database, name: str, what: str) -> tuple[Message, Sign
 
 
 def _refuse_flawed(database: Database, name: str, what: str) -> None:
-    """PermanentDriverError, where what is asked for has been left out."""
+    """Refuse a request for a damaged message. Raises PermanentDriverError."""
     left_out = database.left_out if isinstance(database, SoundPart) else {}
     if name in left_out:
         raise PermanentDriverError(
@@ -271,7 +272,7 @@ def _unit(units: Mapping[str, Any], signal: Signal, override: str | None, what: 
 def plan_axis(
     slot: int, signal: Signal, negative: bool, units: Mapping[str, float], override: str | None
 ) -> Axis:
-    """The plan of one axis of an IMU, slots 0 to 2 gyro, 3 to 5 accelerometer."""
+    """Plan of one IMU axis, slots 0 to 2 gyro, 3 to 5 accelerometer."""
     what, most = ("gyro", MOST_RAD_S) if slot < 3 else ("accel", MOST_M_S2)
     factor = _unit(units, signal, override, what)
     return plan_value(slot, signal, -factor if negative else factor, -most, most)
@@ -308,8 +309,8 @@ def plan_quantity(
     override: str | None = None,
     times: float = 1.0,
 ) -> Axis:
-    """A quantity within low..high (SI) in one of `units`, as the DBC or `override` states; its
-    value in SI is taken `times` this."""
+    """Plan of a quantity within low..high (SI) in one of `units`, by the DBC or `override`; its SI
+    value is multiplied by `times`."""
     return plan_value(slot, signal, _unit(units, signal, override, what) * times, low, high)
 
 

@@ -1,4 +1,4 @@
-"""Readable part of a damaged DBC file: messages one by one, the others by name.
+"""Recovery of the readable messages of a damaged DBC file; the others are named.
 
 Of public files one in six has a flaw somewhere: an identifier of 29 bits without the mark of one
 (bit 31), a name that begins with a digit, a comma for a decimal point, a comment without its
@@ -35,7 +35,7 @@ _STATEMENT = re.compile(
     rf"(?:{_STRING}|[^;\"\n]|\n(?!\s*[A-Z_]+_\s))*;?",
     re.MULTILINE,
 )
-"""Up to its semicolon; one that has none ends where the next statement begins."""
+"""Statement up to its semicolon; without one it ends before the next statement."""
 _MESSAGE = re.compile(r"\s*BO_\s+(?P<id>\d+)\s+(?P<name>[^\s:]+)\s*:")
 _SIGNAL = re.compile(r"\s*SG_\s+(?P<name>[^\s:]+)(?:\s+(?P<mux>[mM]\w*))?\s*:")
 _OWNER = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s+(\w+)")
@@ -44,20 +44,19 @@ _ATTRIBUTE_OWNER = re.compile(r'\s*BA_\s+"\w+"\s+(BO_|SG_)\s+(\d+)(?:\s+(\w+))?'
 UNSELECTED = "it shares its bits with other signals, and none (M) says which of them a frame holds"
 LAST_STANDARD, LAST_EXTENDED, EXTENDED = 0x7FF, 0x1FFFFFFF, 1 << 31
 _SIZES = re.compile(r"\bBO_\s+\d+\s+[^\s:]+\s*:\s*([-+]?\d+)|:\s*([-+]?\d+)\s*\|\s*([-+]?\d+)\s*@")
-"""Bytes of a message, first bit and bits of a signal, wherever they stand: a signal may be on its
-message's line, and its name of any length."""
+"""Sizes: bytes of a message, first bit and bits of a signal at any place: a signal may share its
+message's line, and have a name of any length."""
 MOST_BITS = 2048 * 8
-"""Of CAN XL, the longest frame there is. cantools makes room for as many as a file says."""
+"""Most bits: those of CAN XL, the longest frame. cantools allocates whatever a file states."""
 _AT_LINE = re.compile(r"at line \d+, column \d+: ")
 
 
 _END = '\nCM_ "";\n'
-"""The parser passes over a last statement that is cut, a signal or a type, without a word: so none
-is the last."""
+"""Appended end: the parser silently skips a truncated last statement, so none is the last."""
 
 
 class UnreadableError(Exception):
-    """Not a single message can be read; the text is the first reason."""
+    """Error: no message is readable; the text is the first reason."""
 
 
 class SoundPart(Database):
@@ -74,7 +73,7 @@ class SoundPart(Database):
 
 @dataclass(slots=True)
 class _Unit:
-    """A message with its statements."""
+    """Message with its statements."""
 
     name: str
     head: str
@@ -83,10 +82,10 @@ class _Unit:
     own: list[tuple[str | None, str]] = field(default_factory=list)
     """Statements, with the signal that each is of."""
     marked: bool = False
-    """True if the mark of an extended frame was put to its identifier."""
+    """True if the extended-frame flag was added to its identifier."""
 
     def mark(self, can_id: str) -> None:
-        """Put the mark of an extended frame to it, where no standard frame can have it."""
+        """Add the extended-frame flag to an identifier beyond those of standard frames."""
         if not can_id.isascii() or not LAST_STANDARD < int(can_id) <= LAST_EXTENDED:
             return
         found, put = re.compile(rf"\b{can_id}\b"), str(int(can_id) | EXTENDED)
@@ -107,7 +106,7 @@ class _Unit:
         return {name for name, mark in self._marks() if mark.endswith("M")}
 
     def unselected(self) -> list[str]:
-        """Signals that are to be selected, where none selects."""
+        """Signals that need a multiplexer, where none exists."""
         marks = self._marks()
         if any(mark.endswith("M") for _, mark in marks):
             return []
@@ -120,8 +119,8 @@ class _Unit:
 
 
 def read_whole(text: str) -> Database:
-    """A DBC file in which cantools finds no flaw. Raises what its parser does, and ValueError where
-    a message or signal is longer than any frame."""
+    """Parse a DBC file without flaws. Raises the parser's errors, and ValueError for a message or
+    signal longer than any frame."""
     for size in _SIZES.finditer(text):
         numbers = [int(number) for number in size.groups() if number]
         if not 0 <= min(numbers) <= max(numbers) <= MOST_BITS:
@@ -148,7 +147,7 @@ def sound_part(text: str) -> SoundPart:
 
 
 def unselected(text: str) -> bool:
-    """True if a signal of the file shares its bits with others, and none selects one of them.
+    """True if a signal of the file shares bits with others, without a multiplexer for any.
 
     cantools reads such a one as if it were there in every frame.
     """
@@ -157,7 +156,7 @@ def unselected(text: str) -> bool:
 
 
 def _readable(shared: Sequence[str], left_out: dict[str, str]) -> list[str]:
-    """Of the definitions that all messages share, those that can be read together."""
+    """Readable subset of the definitions common to all messages."""
     kept: list[str] = []
     for statement in shared:
         found = _read([*kept, statement])
@@ -212,7 +211,7 @@ class _Reader:
 
 
 def _read(parts: Iterable[str]) -> list[Message] | str:
-    """The messages of a file of these parts, or why it cannot be read."""
+    """Messages of a file with these parts, or the reason of failure."""
     try:
         database = read_whole("\n".join(('VERSION ""', *(part for part in parts if part))))
     except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error

@@ -33,7 +33,7 @@ Signals = tuple[str, ...]
 
 
 class Find(Protocol):
-    """From "Message.Signal" and what it is for to the message's plan and the signal.
+    """Function from "Message.Signal" and its purpose to the message's plan and the signal.
 
     The frames of all messages are put together, but for those of which only `held` values are
     wanted: of these the latest counts, and they may come at a rate of their own.
@@ -82,7 +82,7 @@ class CanDecoder(ABC, Generic[O]):
         self._options = options
         plans, constants = self._plan()
         self.plans = plans
-        """Of the messages that make a sample together, then of those whose values are held."""
+        """Plans of the messages that form a sample, then of those with held values."""
         paired = [plan for plan in plans if plan.paired]
         self._pairing = Pairing(paired, constants, self.counters)
         self._held: list[tuple[int, list[tuple[int, float]]] | None]
@@ -121,7 +121,7 @@ class CanDecoder(ABC, Generic[O]):
         return filters
 
     def take_missing(self) -> list[str]:
-        """Mapped messages not received since this was asked last, such as "0x121 IMU_ACCEL"."""
+        """Mapped messages not received since the last call, such as "0x121 IMU_ACCEL"."""
         seen, self._seen = self._seen, set()
         return [
             f"0x{plan.message.frame_id:X} {plan.message.name}"
@@ -130,7 +130,7 @@ class CanDecoder(ABC, Generic[O]):
         ]
 
     def reset(self) -> None:
-        """After a pause: start pairing afresh, take the first J1939 address that answers."""
+        """Restart pairing after a pause, and accept the first J1939 address that replies."""
         self._pairing.reset()
         self._held = [None] * len(self._held)
         self._address = self._options.source_address
@@ -180,13 +180,13 @@ class CanDecoder(ABC, Generic[O]):
         return self._options.stamp(group.realtime_ns)
 
     def _is_j1939(self, plan: MessagePlan) -> bool:
-        """By the DBC's VFrameFormat, or because the configuration names a source address."""
+        """True for J1939, by the DBC's VFrameFormat or a configured source address."""
         message = plan.message
         named = self._options.source_address is not None
         return message.is_extended_frame and (message.protocol == "j1939" or named)
 
     def _plan(self) -> tuple[list[MessagePlan], list[float]]:
-        """The plan of each message, and the values (by slot) of what no signal gives."""
+        """Plan of each message, and the constant values (by slot) without a signal."""
         options = self._options
         database = load_dbc(options.dbc)
         plans: dict[str, MessagePlan] = {}
@@ -219,7 +219,7 @@ class CanDecoder(ABC, Generic[O]):
 
 
 def names_of(signals: str | Signals | None) -> Signals:
-    """An option that names one signal, several or none."""
+    """Names of an option with one signal, several or none."""
     if signals is None:
         return ()
     return (signals,) if isinstance(signals, str) else signals

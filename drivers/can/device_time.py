@@ -1,4 +1,4 @@
-"""A device's own time out of a counter that wraps: unwrapped, and known to begin anew. No I/O.
+"""Device time from a wrapping counter: unwrapped, with restarts detected. No I/O.
 
     lateness l(k) = l(k-1) + (arrival(k) - arrival(k-1)) - (device(k) - device(k-1)) >= 0
 
@@ -15,21 +15,20 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 RESTART_S = 1.0
-"""Frames of one device overtake each other by less than this, and a clock of arrivals is stepped by
-less without notice; a boot takes longer."""
+"""Step from which a device may have restarted: frames of one device overtake each other by less,
+and smaller steps of the arrival clock need no action; a boot takes longer."""
 DEVICE_DRIFT = 1e-3
 """Bound of the rate error of a device's clock; crystals have 100 ppm at worst, RC oscillators ten
 times that."""
 RESTART_SAMPLES = 3
-"""Samples that must go on from a new time before it is believed: two may be one damaged frame and
-its repetition."""
+"""Consistent samples that confirm a new time: two may be one damaged frame and its repetition."""
 LEAST_PACE = 0.5
-"""Arrivals of a device that restarted take at least this part of its own time; frames of the past
-that come again come in a burst."""
+"""Least ratio of arrival time to device time after a restart; repeated old frames come in a burst.
+"""
 SETTLE_S = 2.0
 BACKLOG_PACE = 0.1
-"""A backlog that is being read shrinks, or the reader would never be in time again. A lateness
-above RESTART_S that over SETTLE_S shrank by less than this part of it is a clock that was set."""
+"""Least ratio by which a backlog shrinks while it is read. A latency above RESTART_S that shrank by
+less over SETTLE_S shows a set clock."""
 
 Arrivals = tuple[int, int]
 
@@ -63,7 +62,7 @@ class DeviceTime:
         self._delay = 0.0
         self._doubt: _Doubt | None = None
         self._lag: tuple[float, float] | None = None
-        """Delay above RESTART_S that is watched, and its duration (ticks)."""
+        """Delay above RESTART_S under observation, and its duration (ticks)."""
 
     def unwrap(self, raw: int, arrivals_ns: Arrivals) -> int | None:
         """Ticks in ns since the clock's own zero; None for a time that did not advance, or that
@@ -91,7 +90,7 @@ class DeviceTime:
         return self._ns()
 
     def _explain(self, raw: int, arrivals_ns: Arrivals) -> tuple[int, float, float]:
-        """Ticks since the last sample, the lateness they mean, and what passed meanwhile."""
+        """Ticks since the last sample, the resulting latency, and the time passed."""
         assert self._ticks is not None
         modulus, slack = self._modulus, self._slack
         step = (raw - self._ticks) % modulus

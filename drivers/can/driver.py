@@ -36,8 +36,8 @@ from drivers.measurements import (
 )
 
 EVENT_SPACING_NS = 10_000_000_000
-"""The same state of the controller is told once in 10 s: on a shorted bus it changes ten times a
-second (`restart-ms 100`); the counters keep account."""
+"""Interval of events of the same controller state: on a shorted bus it changes ten times a second
+(`restart-ms 100`); counters record each change."""
 
 CONTROLLER_EVENTS: dict[ControllerState, tuple[str, str]] = {
     "bus_off": (
@@ -57,14 +57,15 @@ class BusOptions(DriverOptions):
     interface: Interface = "socketcan"
     channel: str = "can0"
     timestamp: Literal["device", "kernel", "arrival"] | None = None
-    """Default: device if its time is given, else kernel where the bus stamps, else arrival."""
+    """Source of the stamp. Default: device if its time is given, else kernel where the bus stamps,
+    else arrival."""
     latency_s: NonNegativeFloat = 0.0
-    """From the instant of validity to the kernel's stamp or the arrival."""
+    """Delay from validity to the kernel's stamp or the arrival."""
     timeout_s: PositiveFloat = 0.5
-    """Without a sample for so long the device is `silent`."""
+    """Time without a sample after which the device is `silent`."""
 
     def stamp(self, realtime_ns: int | None) -> Stamp:
-        """Of a frame that the bus stamped so, without a time of the device."""
+        """Stamp of a frame without a time of the device, from the bus."""
         if realtime_ns is not None and self.timestamp in (None, "kernel"):
             return KernelStamp(realtime_ns, self.latency_s)
         return ArrivalStamp(self.latency_s)
@@ -87,10 +88,10 @@ class Codec(Protocol):
         """Number of restarts of the device's clock."""
 
     def take_missing(self) -> list[str]:
-        """Wanted messages not received since this was asked last, such as "0x121 IMU_ACCEL"."""
+        """Wanted messages not received since the last call, such as "0x121 IMU_ACCEL"."""
 
     def reset(self) -> None:
-        """After a pause: what comes next does not belong to what came before."""
+        """Restart after a pause: later frames do not belong to earlier ones."""
 
     def feed(self, frame: CanFrame) -> Sequence[Measurement]:
         """Take one data frame; what it completes. Never raises."""

@@ -34,7 +34,7 @@ def error_names(error_classes: int, data: bytes) -> Iterator[str]:
 
 
 def controller_state(error_classes: int, data: bytes) -> ControllerState | None:
-    """The state of the controller that an error frame tells of; None if of something else."""
+    """State of the controller by an error frame; None for other errors."""
     if error_classes & _BUS_OFF:
         return "bus_off"
     if error_classes & _RESTARTED:

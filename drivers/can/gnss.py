@@ -46,9 +46,9 @@ HALF_TURN, TURN = math.pi, 2.0 * math.pi
 SECONDS = {name: float(factor) for name, factor in TIME_UNITS.items()}
 CALENDAR = ("year", "month", "day", "hour", "minute", "second")
 TWO_DIGITS = 100
-"""A year below it counts from 2000."""
+"""Year below which a two-digit year counts from 2000."""
 EARTH_RADIUS_M = 6_378_137.0
-"""WGS 84, for the size of a step of an angle on the ground."""
+"""Earth radius of WGS 84, to convert a step of an angle to metres."""
 
 Triple = tuple[str, str, str]
 
@@ -62,7 +62,7 @@ class CanGnssOptions(CanOptions):
     horizontal_accuracy: str | None = None
     """One sigma of the position, north and east each."""
     position_valid: str | Signals = ()
-    """Flags; without one in any of them there is no fix."""
+    """Flags, all of which a valid fix needs."""
     height: str | None = None
     geoid_m: float = 0.0
     """Added to `height`: the geoid's height above the ellipsoid, where the receiver gives the
@@ -73,24 +73,24 @@ class CanGnssOptions(CanOptions):
     """North, east, down; "" for a down that it does not measure. Or `speed` and `course`."""
     speed: str | None = None
     course: str | None = None
-    """Of the motion over ground. A heading will do for a vehicle that does not reverse."""
+    """Course over ground. A heading will do for a vehicle that does not reverse."""
     speed_accuracy: str | None = None
-    """One sigma: of the speed, and of each axis of `velocity`."""
+    """One sigma of the speed, and of each axis of `velocity`."""
     course_accuracy: str | None = None
     velocity_valid: str | Signals = ()
     heading: str | None = None
-    """Of the vehicle's forward axis, as two antennas measure it."""
+    """Heading of the vehicle's forward axis, as measured by two antennas."""
     heading_accuracy: str | None = None
     heading_valid: str | Signals = ()
     utc: str | tuple[str, str, str, str, str, str] | None = None
-    """Of the fix: POSIX seconds, or year, month, day, hour, minute, second. It stamps the fix,
-    unless `timestamp` says otherwise."""
+    """UTC of the fix: POSIX seconds, or year, month, day, hour, minute, second. It stamps the fix,
+    unless `timestamp` selects another source."""
     utc_valid: str | Signals = ()
     quality: str | None = None
     """Kind of fix, as a number; `qualities` says what it means."""
     qualities: dict[int, int] = Field(default_factory=dict)
-    """By number of the receiver the quality of NMEA's GGA (1 autonomous, 2 differential, 4 RTK
-    fixed, 5 RTK float); a number that is not listed is no fix."""
+    """Quality of NMEA's GGA by the receiver's number (1 autonomous, 2 differential, 4 RTK fixed, 5
+    RTK float); any other number is not a fix."""
     satellites: str | None = None
     timeout_s: PositiveFloat = 3.0
 
@@ -180,7 +180,7 @@ class CanGnssDecoder(CanDecoder[CanGnssOptions]):
 
     @staticmethod
     def _plan_calendar(value: Callable[..., None], part: str, name: str) -> None:
-        """Parts of a date have the units of a calendar, or none; a second may have a fraction."""
+        """Plan a part of a date, in units of a calendar or none; a second may have a fraction."""
         units = {"": 1.0, "1": 1.0, part: 1.0, part[0]: 1.0, part[:3]: 1.0}
         if part == "second":
             units |= SECONDS
@@ -268,7 +268,7 @@ class CanGnssDecoder(CanDecoder[CanGnssOptions]):
         tuple[float, float, float | None] | None,
         float,
     ]:
-        """Velocity, its sigma, and one sigma of its rounding an axis."""
+        """Velocity, its sigma, and one sigma of its rounding on each axis."""
         if not self._valid("velocity_valid", values):
             return None, None, 0.0
         sd = self._value("speed_accuracy", values) or None
@@ -310,7 +310,7 @@ class CanGnssDecoder(CanDecoder[CanGnssOptions]):
     # ------------------------------------------------------------------ inside
 
     def _value(self, what: str, values: list[float]) -> float | None:
-        """None where nothing is mapped, or a held value has not been heard of."""
+        """Value of a signal; None without a mapping or a received held value."""
         slot = self._slots.get(what)
         if slot is None or math.isnan(values[slot]):
             return None

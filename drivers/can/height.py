@@ -29,13 +29,14 @@ class CanHeightOptions(CanOptions):
     height: str | None = None
     """Metres or feet. Of a barometer's own, say `barometric`."""
     pressure: str | None = None
-    """Of the air, in place of a height; an engine's intake is below it while the engine runs."""
+    """Air pressure instead of a height; an engine's intake pressure is lower while the engine runs.
+    """
     barometric: bool = False
     """`height` comes of a pressure: it is off by the weather. A `pressure` always is."""
     accuracy: str | None = None
-    """One sigma of the height, where the device says it."""
+    """One sigma of the height, if the device states it."""
     valid: str | Signals = ()
-    """Flags: a height with 0 in one is counted as `not_valid` and goes no further."""
+    """Flags: a height with 0 in one is counted as `not_valid` and dropped."""
     timeout_s: PositiveFloat = 5.0
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Layout of a message's signals in its frames, worked out once: bits of one whole number.
+"""Bit positions of a message's signals, precomputed so that a frame is read as one integer.
 
 A frame's data is one number N, little-endian for Intel's signals and big-endian for Motorola's. A
 signal of n bits is
@@ -33,7 +33,7 @@ class AbsentSignalError(Exception):
 
 
 class _Bits(NamedTuple):
-    """`sign`: the value of the sign's bit, 0 without one."""
+    """Bits of a signal; `sign`: the value of its sign bit, 0 without one."""
 
     big: bool
     shift: int
@@ -43,7 +43,7 @@ class _Bits(NamedTuple):
 
 
 class Layout:
-    """Of some signals of a message, by name."""
+    """Layout of some signals of a message, by name."""
 
     def __init__(self, message: Message, wanted: Sequence[str]) -> None:
         self._length = message.length
@@ -65,8 +65,8 @@ class Layout:
         self._struct = None if self._selectors or not self._readable else self._as_struct()
 
     def raw(self, data: bytes) -> list[Any]:
-        """The signals' raw numbers, in their order, out of a frame's data of the message's length
-        or more. Raises `AbsentSignalError`."""
+        """Raw numbers of the signals, in order, from a frame's data of at least the message's
+        length. Raises `AbsentSignalError`."""
         if self._struct is not None:
             return list(self._struct.unpack_from(data))
         if not self._readable:
@@ -104,7 +104,7 @@ class Layout:
         return struct.Struct("".join(codes))
 
     def _place(self, bits: _Bits) -> tuple[int, int]:
-        """First byte and the one after the last, of a signal of whole bytes."""
+        """Range of bytes of a signal of whole bytes."""
         begin, size = bits.shift // 8, bits.mask.bit_length() // 8
         if bits.big:
             begin = self._length - begin - size

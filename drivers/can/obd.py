@@ -30,7 +30,7 @@ from drivers.measurements import Measurement, WheelSpeed
 from drivers.rounding import Rounding, rounded_speed
 
 REQUESTS: dict[int, tuple[int, bool]] = {11: (0x7DF, False), 29: (0x18DB_33F1, True)}
-"""Identifier of a request to every unit, and whether it has 29 bits."""
+"""Identifier of a request to every unit, and True for one of 29 bits."""
 REPLY_FILTERS: dict[int, CanFilter] = {
     11: {"can_id": 0x7E8, "can_mask": 0x7F8, "extended": False},
     29: {"can_id": 0x18DA_F100, "can_mask": 0x1FFF_FF00, "extended": True},
@@ -45,16 +45,16 @@ LENGTHS = (
     | dict.fromkeys((0x02, 0x03, 0x0C, 0x10, *range(0x14, 0x1C), 0x1F), 2)
     | dict.fromkeys((0x00, 0x01), 4)
 )
-"""Bytes of the parameters up to 1F, several of which may share an answer (SAE J1979, annex B)."""
+"""Bytes of the parameters up to 1F, several of which may share a reply (SAE J1979, annex B)."""
 MOST_RATE_HZ = 20.0
-"""A unit has 50 ms for its answer (P2 of ISO 15765-4): asked faster, it may not have answered."""
+"""Highest request rate: a unit has 50 ms for its reply (P2 of ISO 15765-4)."""
 
 
 class ObdSpeedOptions(BusOptions):
-    """Bus, identifiers, and whether to ask."""
+    """Options of the OBD speed: bus, identifiers, and requests."""
 
     identifiers: Literal[11, 29] = 11
-    """Bits of the identifiers, as the vehicle uses them."""
+    """Number of bits of the vehicle's identifiers."""
     unit: Annotated[int, Field(ge=0, le=255)] | None = None
     """Identifier of the unit that counts: the last digits of its identifier, 0xE8 for 7E8 or xx of
     18DAF1xx. Without it the first that answers, until it falls silent."""
@@ -145,7 +145,7 @@ class ObdSpeedDecoder:
 
     @staticmethod
     def _speed(data: bytes) -> int | str:
-        """The speed in km/h out of an answer, or the counter of why there is none."""
+        """Speed in km/h from a reply, or the counter of the refusal."""
         if not data:
             return "undecodable"
         kind, length = data[0] >> 4, data[0] & 0x0F
@@ -178,7 +178,7 @@ class ObdSpeedDriver(CanDriver[ObdSpeedOptions]):
     Decoder: ClassVar[Callable[..., Codec]] = ObdSpeedDecoder
 
     async def run(self) -> None:
-        """Serve the device until cancelled, and ask it where that is wanted."""
+        """Serve the device until cancelled, with requests if configured."""
         if not self.options.ask_hz:
             await super().run()
             return

@@ -26,9 +26,10 @@ from drivers.can.device_time import DeviceTime
 INTERVALS = 31
 """Distances of frames the median is taken of: outlives a burst of fifteen late frames."""
 INTERVALS_NEEDED = 4
-"""Fewer say nothing about the interval; unstamped frames are not paired before (`unpaired`)."""
+"""Fewest intervals that determine the frame interval; unstamped frames are not paired before
+(`unpaired`)."""
 OPEN_GROUPS = 4
-"""Most samples whose frames are awaited at once; a device queues a sample or two, not more."""
+"""Most incomplete samples at once; a device queues one or two."""
 
 
 @dataclass(slots=True, eq=False)
@@ -42,7 +43,7 @@ class Group:
     t_seen_ns: int
     values: list[float]
     missing: int
-    """A bit for each message whose frame is awaited."""
+    """Bit for each message whose frame is missing."""
     counter: int | None = None
     ticks: int | None = None
     ticks_ns: int | None = None
@@ -149,7 +150,7 @@ class Pairing:
         return part.ticks if self._by_time else None
 
     def _is_duplicate(self, index: int, arrival_ns: int) -> bool:
-        """The same content again: with the same stamp inside, or too early to be a new sample."""
+        """True for repeated content: with the same inner stamp, or too early for a new sample."""
         if self._stamped[index]:
             return True
         interval_ns = self.interval_ns
@@ -186,7 +187,7 @@ class Pairing:
         return None
 
     def _near(self, group: Group, arrival_ns: int) -> bool:
-        """Less than half an interval after the group's last frame.
+        """True within half an interval after the group's last frame.
 
         While the interval is not known, a stamp that came ahead holds the group together.
         """
@@ -202,7 +203,7 @@ class Pairing:
     # ----------------------------------------------------------------- complete
 
     def _close(self, group: Group) -> None:
-        """It is complete; frames of those before it wait no longer."""
+        """Close a complete group and give up incomplete earlier ones."""
         position = self._open.index(group)
         for older in self._open[:position]:
             self._counters["unpaired"] += older.frames

@@ -1,4 +1,4 @@
-"""The package python-can, without asammdf, which its reader and writer of MF4 logs bring along.
+"""Import of python-can without asammdf, which only its MF4 reader and writer need.
 
 `import can` imports every format of logs that there is, and asammdf imports pandas, pyarrow and
 canmatrix: 0.75 s of processor time at the start of a daemon that reads no such log. So it is kept
@@ -23,5 +23,5 @@ __all__ = ["can", "with_mf4"]
 
 
 def with_mf4() -> None:
-    """From now on python-can reads and writes MF4 too, where asammdf is installed."""
+    """Enable MF4 in python-can, if asammdf is installed."""
     importlib.reload(importlib.import_module("can.io.mf4"))

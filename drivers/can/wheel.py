@@ -34,7 +34,7 @@ from drivers.rounding import rounded_speed
 
 MOST_WHEELS = 4
 LARGEST_STEERING_RAD = 0.5 * math.pi
-"""Of road wheels; no vehicle's turn further than across."""
+"""Largest steering angle of road wheels."""
 _STEERING, _DIRECTION, _ACCURACY, _FLAGS = 4, 5, 6, 7
 
 
@@ -51,9 +51,9 @@ class CanWheelOptions(CanOptions):
     steering_ratio: PositiveFloat = 1.0
     """Angle of `steering` over that of the wheels; 14 to 20 for a steering wheel."""
     unit: str | None = None
-    """Of the wheels, instead of the unit that the DBC states."""
+    """Unit of the wheel signals, instead of the DBC's."""
     radius_m: PositiveFloat | None = None
-    """Rolling radius, where the signals say how fast the wheels turn (rpm, rad/s, ...)."""
+    """Rolling radius, for signals of the wheels' rotation (rpm, rad/s, ...)."""
     signed: bool = False
     """The wheels themselves count backwards with a negative sign."""
     direction: str | None = None
@@ -61,11 +61,11 @@ class CanWheelOptions(CanOptions):
     forward: tuple[int, ...] = (1,)
     """Raw values of `direction` that mean forward."""
     backward: tuple[int, ...] = (2,)
-    """Those that mean backward; with any other the direction is not known."""
+    """Values that mean backward; with any other the direction is unknown."""
     accuracy: str | None = None
-    """One sigma of the speed, where the vehicle says it."""
+    """One sigma of the speed, if the vehicle states it."""
     valid: str | Signals = ()
-    """Flags: a speed with 0 in one is counted as `not_valid` and goes no further."""
+    """Flags: a speed with 0 in one is counted as `not_valid` and dropped."""
     timeout_s: PositiveFloat = 1.0
 
     @model_validator(mode="after")

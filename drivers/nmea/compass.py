@@ -65,7 +65,7 @@ class CompassDecoder:
         return [heading for heading in found if heading is not None]
 
     def silence(self) -> list[Heading | MagneticHeading]:
-        """A sentence is whole, or none."""
+        """Ignore silence: each sentence is complete."""
         return []
 
     def flush(self) -> list[Heading | MagneticHeading]:
@@ -101,7 +101,7 @@ class CompassDecoder:
 
 
 def _printed(sentence: Sentence) -> tuple[float | None, float]:
-    """Heading (deg), None where its field is empty, and the step of its last digit.
+    """Heading (deg), None for an empty field, and the step of its last digit.
 
     ValueError where a field cannot be true."""
     fields = [*sentence.fields, "", "", ""]
@@ -117,7 +117,7 @@ def _printed(sentence: Sentence) -> tuple[float | None, float]:
 
 
 def _number(text: str, most: float) -> float:
-    """Of digits and a point alone."""
+    """Number of digits and a decimal point only."""
     if not text.replace(".", "", 1).isdecimal() or not text.isascii():
         raise ValueError(text)
     value = float(text)

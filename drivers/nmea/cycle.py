@@ -26,11 +26,11 @@ class Cycle:
         self._pauses: set[Formatters] = set()
 
     def whole(self, so_far: Sequence[str]) -> bool:
-        """True if an epoch of these sentences is one to which nothing comes."""
+        """True if an epoch of these sentences is complete."""
         return tuple(so_far) == self._whole
 
     def pauses(self, so_far: Sequence[str]) -> bool:
-        """True if the receiver has paused here and then gone on with the same epoch."""
+        """True if the receiver usually pauses here within an epoch."""
         return tuple(so_far) in self._pauses
 
     def ended(self, sentences: Sequence[str], *, learn: bool) -> None:

@@ -49,7 +49,7 @@ class NmeaDecoding(SolutionDecoding):
     """Options of the decoder."""
 
     last_sentence: Formatter | None = None
-    """The sentence that ends an epoch (one that is sent once an epoch); learned by default."""
+    """Sentence that ends an epoch (one that is sent once an epoch); learned by default."""
 
 
 class NmeaDecoder:
@@ -72,7 +72,7 @@ class NmeaDecoder:
     ) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self.gga = b""
-        """The last GGA with a position, without its line end; empty before one."""
+        """Last GGA with a position, without its line end; empty before one."""
         self.received = Received()
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
@@ -96,13 +96,12 @@ class NmeaDecoder:
 
     @property
     def cautions(self) -> dict[str, str]:
-        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        """Cautions by counter: limits on the quality of fixes, and the actions taken."""
         return cautions(self.counters, self.received, self._decoding.earliest_date)
 
     @property
     def cause(self) -> str:
-        """Reason why there is no fix, as a sentence; "" where bytes say nothing of why none
-        verifies."""
+        """Reason for the absence of a fix, as a sentence; "" if unknown."""
         if not self.counters["sentences"]:
             return nothing_verified(self.counters, self._splitter.unread)
         return no_fix(self.counters, self.received, self.refusal)
@@ -121,14 +120,14 @@ class NmeaDecoder:
         return found
 
     def take(self, sentence: Sentence, t_seen_ns: int) -> list[Measurement]:
-        """As `feed`, for a sentence that somebody else has verified."""
+        """Feed a sentence that is already verified."""
         found: list[Measurement] = []
         self._t_seen_ns = t_seen_ns
         self._take(sentence, t_seen_ns, found)
         return found
 
     def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than most receivers pause inside an epoch (50 ms)."""
+        """Handle a silence longer than a receiver's pauses within an epoch (50 ms)."""
         found: list[Measurement] = []
         epoch = self._epoch
         if epoch is None or self._cycle.pauses(epoch.cycle) or _is_tail(epoch):
@@ -239,23 +238,23 @@ class NmeaDecoder:
         return self._doubling
 
     def _of_epoch(self, epoch: Epoch, time_ns: int, sentence: Sentence) -> bool:
-        """True if a sentence with a time is of an epoch, by that alone."""
+        """True if a sentence with a time belongs to an epoch by that time."""
         if epoch.time_of_day_ns is None:
             return True
         step_ns = time_step_ns(sentence)
         return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
     def _given_already(self, time_ns: int, sentence: Sentence) -> bool:
-        """True if the place at this instant came by a sentence that says more: many a burst ends
-        with GLL, behind all GSV, and the epoch would wait for it."""
+        """True if a better sentence gave the position at this instant: many bursts end with GLL,
+        behind all GSV, and the epoch would wait for it."""
         epoch = self._epoch if self._epoch is not None else self._closed
         if epoch is None or epoch.time_of_day_ns is None or FULLER.isdisjoint(epoch.cycle):
             return False
         return self._of_epoch(epoch, time_ns, sentence)
 
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
-        """True if what has no time of its own came sooner after the epoch that a silence closed
-        than before the one that begins now."""
+        """True if a sentence without time followed the epoch that a silence closed more closely
+        than it precedes the new one."""
         closed = self._closed
         if closed is None or self._closed_by != "silence" or not _is_tail(epoch):
             return False
@@ -280,5 +279,5 @@ class NmeaDecoder:
 
 
 def _is_tail(epoch: Epoch) -> bool:
-    """True if it has nothing but sentences that have no time and belong to another epoch."""
+    """True if it contains only sentences without time of another epoch."""
     return epoch.time_of_day_ns is None and _TIMELESS.issuperset(epoch.cycle)

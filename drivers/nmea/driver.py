@@ -33,12 +33,12 @@ class NmeaDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """Reason why there is no fix, as a sentence; "" where nothing that arrives tells."""
+        """Reason for the absence of a fix, as a sentence; "" if unknown."""
         return self._nmea.cause if self.counters["bytes_in"] else ""
 
     @property
     def cautions(self) -> dict[str, str]:
-        """As `ReceiverDriver`."""
+        """Cautions, as in `ReceiverDriver`."""
         return self._nmea.cautions
 
     def _useless_detail(self) -> str:

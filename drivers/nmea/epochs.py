@@ -1,4 +1,4 @@
-"""One epoch of a GNSS receiver, put together from its sentences: no I/O, no clock.
+"""Epoch of a GNSS receiver, assembled from its sentences: no I/O, no clock.
 
 `drivers.nmea.fields` makes typed fields of a sentence; an `Epoch` takes those that matter. A
 sentence with a field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as
@@ -49,24 +49,25 @@ INTEGRATED = frozenset({"II", "IN"})
 """Integrated instrumentation and navigation: a plotter or an adapter tells what it got, computed or
 smoothed, in the receiver's own sentences."""
 TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ"}) | INTEGRATED
-"""Satellites: GPS, several, BeiDou (two names), GLONASS, Galileo, NavIC, QZSS (two names)."""
+"""Talkers of satellite systems: GPS, several, BeiDou (two names), GLONASS, Galileo, NavIC, QZSS
+(two names)."""
 MAX_CYCLE = 24
-"""Sentences that one epoch may hold; a receiver sends at most nine formatters and some GSA."""
+"""Most sentences in an epoch; a receiver sends at most nine formatters and some GSA."""
 
 KNOT_M_S = 1852.0 / 3600.0
 KM_H_M_S = 1.0 / 3.6
 STANDSTILL_M_S = 0.05
-"""Below it an absent course means standing still: the Doppler velocity noise of a receiver
+"""Speed below which an absent course means standing still: the Doppler velocity noise of a receiver
 (u-blox ZED-F9P data sheet: 0.05 m/s)."""
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
 _ESTIMATED = frozenset("EMS")
 _NOT_VALID = frozenset(("V", "N", ""))
 NOVATEL_SBAS = 9
-"""GGA quality of NovAtel for a fix with the corrections of a satellite (WAAS)."""
+"""GGA quality of NovAtel for a fix with satellite corrections (WAAS)."""
 OVERDETERMINED = 5
-"""Satellites with which a fix is three-dimensional whatever GSA says, if it has an altitude and
-VDOP: four give place and clock, one more than that checks them (modules of Quectel and Telit say 2
-beside 8 to 14)."""
+"""Number of satellites that makes a fix three-dimensional whatever GSA states, if it has an
+altitude and VDOP: four give position and clock, a fifth checks them (modules of Quectel and Telit
+state 2 beside 8 to 14)."""
 
 
 @dataclass(slots=True)
@@ -76,27 +77,27 @@ class Epoch:
 
     time_of_day_ns: int | None = None
     time_step_ns: int = 0
-    """Of its last digit."""
+    """Time step of the last digit."""
     t_seen_ns: int = 0
     """Instant when the last sentence that counts came in."""
     cycle: list[str] = field(default_factory=list)
-    """Formatters in the order they came."""
+    """Formatters in order of arrival."""
     addresses: set[str] = field(default_factory=set)
-    """The same with their talkers."""
+    """Formatters with talkers, in order of arrival."""
     raws: set[bytes] = field(default_factory=set)
-    """Sentences of the epoch, which may come twice."""
+    """Raw sentences of the epoch, to detect repetitions."""
     day: date | None = None
     no_date: str = ""
-    """A date that is printed and is none."""
+    """Printed date that is invalid."""
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
     unknown_status: str = ""
-    """A status of RMC that is none: it says nothing of the others, and RMC counts for nothing."""
+    """Invalid status of RMC, which makes RMC unusable."""
     gll_valid: bool | None = None
     plain: Printed | None = None
-    """The place in RMC or GLL, which say nothing of its quality but a mode."""
+    """Position in RMC or GLL, which state only a mode."""
     by_plain: str = ""
-    """Source of place and quality where there is neither GGA nor GNS: RMC or GLL."""
+    """Sentence with position and mode where neither GGA nor GNS exists: RMC or GLL."""
     place: Printed | None = None
     altitude_m: float | None = None
     height_step_m: float = 0.0
@@ -108,13 +109,13 @@ class Epoch:
     counted: int = 0
     """Satellites that GGA and GNS say were used; of several systems GGA may count one."""
     listed: set[tuple[str, str]] = field(default_factory=set)
-    """Those that GSA lists, with the number of their system where it says it."""
+    """Satellites in GSA, with their system's number if stated."""
     hdop: float | None = None
     vdop: float | None = None
     nav_modes: set[int] = field(default_factory=set)
     """Fix mode of GSA: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
     sd_ned_m: Vector3 | None = None
-    """As printed; `implausible` judges it."""
+    """Printed sigmas; `implausible` checks them."""
     speed_m_s: float | None = None
     course_deg: float | None = None
     heading_deg: float | None = None
@@ -136,7 +137,7 @@ class Epoch:
         self.raws.add(sentence.raw)
 
     def position(self) -> tuple[float, float, int] | None:
-        """Latitude, longitude (deg) and quality, where the epoch has them."""
+        """Latitude, longitude (deg) and quality, if complete."""
         if self.place is None or self.quality is None:
             return None
         return self.place.lat_deg, self.place.lon_deg, self.quality
@@ -147,32 +148,32 @@ class Epoch:
         return self.gll_valid if self.rmc_valid is None else self.rmc_valid
 
     def take_mode(self) -> None:
-        """GGA has a place and leaves its quality empty: what RMC or GLL say of it counts."""
+        """Use the mode of RMC or GLL for a GGA with a position and an empty quality."""
         self.quality = self._quality_of_mode() if self.plain_valid else 0
 
     def take_plain(self) -> None:
-        """RMC or GLL is all that the receiver says of its place."""
+        """Use RMC or GLL, the receiver's only position."""
         if self.plain is None or not self.plain_valid:
             return
         self.place, self.quality = self.plain, self._quality_of_mode()
         self.by_plain = "RMC" if self.rmc_valid else "GLL"
 
     def _quality_of_mode(self) -> int:
-        """Of the worst mode; 1 where none is known (before NMEA 2.3)."""
+        """Quality of the worst mode; 1 without a mode (before NMEA 2.3)."""
         if "N" in self.modes:
             return 0
         return next((q for mode, q in _MODE_QUALITY.items() if mode in self.modes), 1)
 
     @property
     def two_dimensional(self) -> bool:
-        """True if the height is none that was measured: GSA says so, and may be right."""
+        """True if GSA credibly marks the height as not measured."""
         if 2 not in self.nav_modes or 3 in self.nav_modes:
             return False
         return max(self.counted, len(self.listed)) < OVERDETERMINED or self.vdop is None
 
     @property
     def rounding_sd_ned_m(self) -> Vector3:
-        """One sigma of what the printed digits leave out."""
+        """One sigma of rounding to the printed digits."""
         place = self.place
         if place is None:
             return 0.0, 0.0, 0.0
@@ -182,7 +183,7 @@ class Epoch:
         return north, east, down
 
     def implausible(self) -> str | None:
-        """The counter of what no receiver can mean, None where all can be."""
+        """Counter of an implausible value; None without one."""
         height = (self.altitude_m or 0.0) + (self.separation_m or 0.0)
         if not within(height, HEIGHT_M):
             return "height_implausible"
@@ -203,7 +204,7 @@ class Epoch:
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:
-    """Its time of day; None where this kind has none or the field is empty. BadFieldError."""
+    """Time of day of a sentence; None without one. BadFieldError."""
     try:
         return parse_time_of_day(printed_time(sentence))
     except ValueError as error:
@@ -248,7 +249,7 @@ def _take_gns(epoch: Epoch, fields: Fields) -> None:
 
 
 _DATE_AT = 8
-"""Of RMC's fields, printed."""
+"""Field of the date in RMC."""
 
 
 def _take_rmc(epoch: Epoch, fields: Fields) -> None:
@@ -348,4 +349,4 @@ FORMATTERS: dict[str, Callable[[Epoch, Fields], None]] = {
     "HDT": _take_hdt,
     "THS": _take_ths,
 }
-"""The sentences that count, and how an epoch takes them."""
+"""Handlers of the used sentences."""

@@ -19,12 +19,12 @@ from pynmeagps.nmeatypes_core import DE, DT, GROUP, IN, LA, LN
 from pynmeagps.nmeatypes_get import NMEA_PAYLOADS_GET
 
 Fields = Mapping[str, Any]
-"""By the name that pynmeagps gives a field: float, int, date, or text; `lat` and `lon` degrees with
-the sign of their hemisphere. `printed`: the texts of all."""
+"""Values by pynmeagps' field names: float, int, date, or text; `lat` and `lon` degrees with the
+sign of their hemisphere. `printed`: the texts of all."""
 
 
 def _date(printed: str) -> date | str:
-    """Of ddmmyy; years 69 to 99 are 1969 to 1999, as POSIX has them. Empty when there is none."""
+    """Date of ddmmyy; years 69 to 99 are 1969 to 1999, as in POSIX. Empty for an invalid one."""
     if len(printed) != 6 or not printed.isdecimal():
         return ""
     year = int(printed[4:])
@@ -38,7 +38,7 @@ Convert = Callable[[str], Any]
 
 
 def _degrees(printed: str) -> float:
-    """Of dddmm.mm. ValueError where it is none, which pynmeagps passes as empty."""
+    """Degrees of dddmm.mm. ValueError for invalid text, which pynmeagps passes as empty."""
     found = dmm2ddd(printed)
     if found == "":
         raise ValueError(f"not an angle: {printed!r}")
@@ -83,7 +83,7 @@ def typed(formatter: str, printed: Sequence[str]) -> Fields:
 NO_DOP = 99.0
 """Receivers without a solution print 99.99."""
 MINUTE_M = 1852.0
-"""Of latitude."""
+"""Metres of a minute of latitude."""
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
 
 
@@ -98,7 +98,7 @@ class Printed(NamedTuple):
 
 
 class BadFieldError(ValueError):
-    """A sentence verified, but a field of it cannot be true."""
+    """Error: an implausible field in a verified sentence."""
 
 
 def number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
@@ -137,7 +137,7 @@ def dop(fields: Fields, name: str) -> float | None:
 
 
 def angle(fields: Fields, name: str) -> float | None:
-    """Of a circle, degrees."""
+    """Angle of a circle, in degrees."""
     value = number(fields, name, 0.0)
     if value is not None and value > 360.0:
         raise BadFieldError(f"{name} = {value} deg")
@@ -145,12 +145,12 @@ def angle(fields: Fields, name: str) -> float | None:
 
 
 def step(printed: str) -> float:
-    """One step of the last digit."""
+    """Step of the last digit."""
     return 10.0 ** -len(printed.partition(".")[2])
 
 
 def position(fields: Fields, first: int = 1) -> Printed | None:
-    """From the fields `lat`, `NS`, `lon`, `EW`, which follow one another from number `first` on."""
+    """Position from the fields `lat`, `NS`, `lon`, `EW`, consecutive from number `first` on."""
     lat, lon = number(fields, "lat"), number(fields, "lon")
     if lat is None or lon is None:
         return None

@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences, UBX and RTCM 3 frames out of one byte stream: no I/O.
+"""Splitter of NMEA 0183 sentences, UBX and RTCM 3 frames in one byte stream: no I/O.
 
     sentence    $ address , fields * hh          hh = XOR of what stands between $ and *
     UBX         B5 62 class id length16 payload ck_a ck_b     8-bit Fletcher from class on
@@ -29,7 +29,7 @@ is lines merged by an overrun."""
 MAX_UBX_PAYLOAD = 8192
 """A RXM-RAWX of 255 measurements takes 8176; a longer length is a false header."""
 MOST_UNREAD = 4096
-"""Bytes that nobody understood, kept to tell what they are: two seconds at 19,200 baud."""
+"""Most unrecognised bytes kept for identification: two seconds at 19,200 baud."""
 
 # Little-endian, up to the greatest, whose low byte is zero.
 _UBX_LENGTH = rb"(?:.[\x00-\x%02x]|\x00\x%02x)" % (
@@ -44,8 +44,8 @@ _START = re.compile(
     rb"|\xd3(?:\Z|[\x00-\x03](?:.{0,2}\Z|." + _RTCM_NUMBER + rb"))",
     re.DOTALL,
 )
-"""Prefixes of a sentence or frame, or of what ends too early. All else is passed over here, a
-stream of 0xD3 twelve times as fast as by a look at each byte."""
+"""Prefixes of a sentence or frame, possibly incomplete. All other bytes are skipped here, a stream
+of 0xD3 twelve times as fast as byte by byte."""
 _NOT_BODY = re.compile(rb"[^\x20-\x23\x25-\x29\x2b-\x7e]")  # anything but text, and $ and *
 _WHOLE = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{1,252})\*([0-9A-Fa-f]{2})")
 _ADDRESS = re.compile(r"[A-Z][A-Z0-9]{2,9}\Z")
@@ -94,7 +94,7 @@ def is_rdss_sentence(sentence: Sentence) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A verified binary frame, `raw` from its first sync byte to its last check byte."""
+    """Verified binary frame, `raw` from its first sync byte to its last check byte."""
 
     kind: Literal["ubx", "rtcm"]
     raw: bytes
@@ -121,12 +121,12 @@ class StreamSplitter(Splitter[Item]):
 
     @property
     def unread(self) -> bytes:
-        """The last bytes that belonged to nothing, line ends included."""
+        """Last unrecognised bytes, line ends included."""
         return bytes(self._unread[-MOST_UNREAD:])
 
     @property
     def summed(self) -> int:
-        """Bytes that the checks of binary frames worked on, of both kinds together."""
+        """Number of bytes that the checks of binary frames processed, of both kinds."""
         return self._fletcher.taken + self._crc.taken
 
     def _scan(self, items: list[Item], *, final: bool) -> None:
@@ -216,7 +216,7 @@ class StreamSplitter(Splitter[Item]):
     def _binary(
         self, at: int, length: int | None, kind: Literal["ubx", "rtcm"], items: list[Item]
     ) -> int | None:
-        """As `_sentence`, for a frame of `length` (None: not known yet)."""
+        """Handle a frame of `length` (None: unknown yet), as `_sentence`."""
         if length is None:
             return None
         buffer = self._buffer
@@ -247,7 +247,7 @@ class _WholeSentences:
         self._searched = 0
 
     def inside(self, buffer: bytearray, start: int, end: int) -> bool:
-        """True if one stands in start..end, as far as that has come."""
+        """True if one stands in start..end, as far as received."""
         self._search(buffer)
         found = self._found
         while found and found[0][0] < start:
@@ -274,7 +274,7 @@ class _WholeSentences:
 
 
 class NmeaSplitter:
-    """`StreamSplitter` for whoever wants the sentences only."""
+    """`StreamSplitter` for sentences only."""
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self._stream = StreamSplitter(counters)
@@ -287,7 +287,7 @@ class NmeaSplitter:
 
     @property
     def unread(self) -> bytes:
-        """As `StreamSplitter.unread`."""
+        """Unrecognised bytes, as `StreamSplitter.unread`."""
         return self._stream.unread
 
     def feed(self, data: bytes) -> list[Sentence]:
@@ -295,12 +295,12 @@ class NmeaSplitter:
         return [item for item in self._stream.feed(data) if isinstance(item, Sentence)]
 
     def finish(self) -> list[Sentence]:
-        """As `StreamSplitter.finish`."""
+        """Finish, as `StreamSplitter.finish`."""
         return [item for item in self._stream.finish() if isinstance(item, Sentence)]
 
 
 def _verifies(raw: bytes) -> bool:
-    """True if `$`...`*hh` carries the XOR of what stands between `$` and `*`."""
+    """True if `$`...`*hh` contains the XOR of the characters between `$` and `*`."""
     return b"%02X" % reduce(xor, raw[1:-3], 0) == raw[-2:].upper()
 
 

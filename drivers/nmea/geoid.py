@@ -1,4 +1,4 @@
-"""Geoid height above the ellipsoid, where a receiver does not say it.
+"""Geoid height above the ellipsoid, where a receiver does not state it.
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
@@ -17,7 +17,7 @@ BOUND_M = 107.0
 GEOID_SD_M = BOUND_M / math.sqrt(3.0)
 SLOPE_SD = 5e-5
 """One sigma of the slope of the geoid: deflections of the vertical are 5 to 10 arc seconds outside
-of high mountains."""
+high mountains."""
 EARTH_M = 6_371_000.0
 
 
@@ -30,8 +30,8 @@ class Geoid:
     def height(
         self, altitude_m: float, separation_m: float | None, lat_deg: float, lon_deg: float
     ) -> tuple[float, float]:
-        """Height above the ellipsoid (m), and one sigma (m) of N in it, 0 where it is printed; that
-        above the sea where nothing is known of N."""
+        """Height above the ellipsoid (m), and one sigma (m) of the geoid height in it, 0 where
+        printed; the height above the sea where the geoid is unknown."""
         if separation_m is not None:
             if abs(separation_m) <= BOUND_M:
                 self._known = separation_m, lat_deg, lon_deg

@@ -1,5 +1,5 @@
-"""Result of an NMEA epoch's sentences: a fix, a heading, a report of UTC, or the name of
-why there is none. No I/O, no clock.
+"""Fix, heading or UTC report from an NMEA epoch's sentences, or the name of the refusal. No I/O, no
+clock.
 
 The receivers' own protocols have theirs in `drivers.solution`; these say their quality, their date
 and their height in more ways than one.
@@ -29,12 +29,12 @@ from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_
 from drivers.plausible import SIGMA_M
 
 PLAIN_AFTER = 2
-"""Epochs with RMC or GLL in a row that have neither GGA nor GNS, after which their position is a
-fix: one may be damaged. A GGA at an instant of its own is none of these (plotters take turns)."""
+"""Consecutive epochs with RMC or GLL but neither GGA nor GNS, after which their position is a fix:
+a single GGA may be damaged. A GGA at an instant of its own does not count (plotters take turns)."""
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
 DATUMS = frozenset({"", "W84", "P90"})
-"""Of DTM: WGS 84, and PZ-90, which agrees with it to some centimetres since 2007 (PZ-90.02); others
-are up to hundreds of metres away."""
+"""Datums of DTM: WGS 84, and PZ-90, which agrees with it to some centimetres since 2007 (PZ-90.02);
+others differ by up to hundreds of metres."""
 
 
 class EpochJudge:
@@ -54,7 +54,7 @@ class EpochJudge:
         self._trust = TimeTrust()
         self._geoid = Geoid()
         self._without_gga = 0
-        """Epochs with RMC or GLL in a row that had neither GGA nor GNS."""
+        """Consecutive epochs with RMC or GLL but neither GGA nor GNS."""
 
     def in_two_parts(self) -> None:
         """The last epoch was no whole one: it has what one of them lacked."""
@@ -107,7 +107,7 @@ class EpochJudge:
             found.append(Heading(self._source, epoch.t_seen_ns, stamp, yaw))
 
     def _refusal(self, epoch: Epoch) -> str | None:
-        """Reason why this epoch gives no position; None when it does, or was never to give one."""
+        """Reason why this epoch gives no position; None if it does, or none is expected."""
         if epoch.quality == 6 or "E" in epoch.modes:
             return "dead_reckoning_refused"
         if not self._decoding.allow_simulator:
@@ -129,7 +129,7 @@ class EpochJudge:
         return epoch.implausible()
 
     def _date(self, epoch: Epoch, found: list[Measurement], *, valid: bool) -> date | None:
-        """The epoch's date, its own or the calendar's; reports the time when it is its own."""
+        """Date of the epoch, its own or the calendar's; reports the time for its own."""
         if epoch.time_of_day_ns is None:
             return None
         if epoch.day is not None and not self._calendar.plausible(epoch.day):

@@ -22,7 +22,7 @@ MOST_TRIES = 100
 MOSTLY = 0.98
 """Share of letters that are printed: at another rate, and in other protocols, a third."""
 SHOWN = 40
-"""Letters of a line that are told."""
+"""Characters shown of a line."""
 
 _LINE_ENDS = re.compile(rb"[\r\n]+")
 _PRINTED = re.compile(rb"[\t\x20-\x7e]")
@@ -73,8 +73,8 @@ def _sbf(d: bytes, at: int) -> int:
 
 
 def _novatel(d: bytes, at: int) -> int:
-    """AA 44 and 12 (header length8, message length16 at 8), 13 (length8) or Unicore's B5 (length16
-    at 6), crc32 behind: the length leads to the next."""
+    """Frame of NovAtel: AA 44 and 12 (header length8, message length16 at 8), 13 (length8) or
+    Unicore's B5 (length16 at 6), crc32 behind; the length leads to the next."""
     kind = d[at + 2 : at + 3]
     if kind == b"\x12":
         n = int.from_bytes(d[at + 3 : at + 4], "little")
@@ -127,8 +127,7 @@ _SWITCH = "switch on NMEA (GGA, RMC, GST) at the receiver"
 
 
 def _with_parity(data: bytes) -> int:
-    """Sentences that verify without the eighth bit, which a line of seven data bits has for its
-    parity."""
+    """Sentences that verify without the eighth bit, the parity of a line with seven data bits."""
     found = _SENTENCE.findall(bytes(byte & 0x7F for byte in data))
     return sum(reduce(xor, said) == int(check, 16) for said, check in found)
 
@@ -183,7 +182,7 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
 
 
 def named(data: bytes) -> str:
-    """Text on the protocol of these bytes, as a sentence; "" where nobody knows them."""
+    """Sentence on the protocol of these bytes; "" if unknown."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
             return f"{name} arrives, which is not read here: {remedy}"
@@ -191,7 +190,7 @@ def named(data: bytes) -> str:
 
 
 def _text(data: bytes) -> str:
-    """Of lines that a person could read: none is so at another rate."""
+    """Readable lines in these bytes, which no other baud rate produces."""
     lines = [line for line in _LINE_ENDS.split(data) if line.strip()]
     letters = sum(len(_PRINTED.findall(line)) for line in lines)
     if len(lines) < FEWEST + 1 or letters < MOSTLY * sum(map(len, lines)):

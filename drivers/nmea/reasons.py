@@ -1,5 +1,4 @@
-"""Reasons why a receiver's bytes give no fix, or a poorer one than they could: one sentence
-each."""
+"""Reasons why a receiver's bytes give no fix, or a poor one: one sentence each."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ REFUSALS = {
     "speed_implausible": "the receiver states a speed that no vehicle has",
     "sigma_too_large": "the receiver states that it does not know where it is (GST)",
 }
-"""By the counter of a refused epoch."""
+"""Reasons by the counter of a refused epoch."""
 TALKERS_NOT_READ = {
     "EC": "a chart display",
     "EI": "a chart display",
@@ -56,22 +55,21 @@ OWN_SENTENCES = {
     "GPFPD": "inertial systems: their own solution",
     "GTIMU": "inertial systems",
 }
-"""Owners of proprietary sentences, by their beginning, in which receivers tell place or
-attitude."""
+"""Owners of proprietary sentences, by prefix, with position or attitude."""
 ATTITUDES = ("PASHR", "PTNL,AVR", "PSAT,HPR", "PSSN,HRP", "PSTI,036", "PQTMTAR", "GPHPR", "GNHPR")
-"""Beginnings of sentences in which receivers of two antennas tell their heading with roll or
-pitch."""
+"""Prefixes of sentences of two-antenna receivers with heading, roll or pitch."""
 MOST_NAMES = 8
 """Most talkers and formatters to remember; the first are enough to name."""
 KIND_LETTERS = (2, 3)
-"""Of the field that names a kind (PUBX,00; PTNL,GGK; PSTI,030)."""
+"""Letters of the field that names a kind (PUBX,00; PTNL,GGK; PSTI,030)."""
 ROLLOVER = timedelta(weeks=1024)
 ROLLOVER_SPAN = timedelta(days=3653)
-"""A date that is right but for the rollover is of the ten years from this software's on."""
+"""Span of dates that are plausible after correction of a rollover: ten years from this software's
+on."""
 MANY = 3
-"""Sentences without a checksum before anybody hears of it: one may have lost its own."""
+"""Sentences without a checksum before a report; a single one may have lost its own."""
 FIRST_FIXES = 10
-"""Of a cold receiver, which may be two-dimensional for a while."""
+"""First fixes of a cold receiver, which may be two-dimensional for a while."""
 CHECKSUMS = (
     "sentences come without a checksum and are not used, for a damaged digit would pass: switch "
     "checksums on at the receiver"
@@ -83,18 +81,18 @@ class Received:
     """Received items that a decoder does not use, beside its counters."""
 
     talkers: Counter[str] = field(default_factory=Counter)
-    """Of sentences with a position."""
+    """Talkers of sentences with a position."""
     unused: Counter[str] = field(default_factory=Counter)
     """Formatters that are not read."""
     used: Counter[str] = field(default_factory=Counter)
-    """Those that are."""
+    """Used sentences."""
     statuses: Counter[str] = field(default_factory=Counter)
-    """Of RMC, that are no letter of the standard."""
+    """Statuses of RMC outside the standard."""
     datum: str = ""
-    """As DTM states it."""
+    """Datum of DTM."""
     implausible_date: date | None = None
     no_date: str = ""
-    """A date of RMC that is printed and is none."""
+    """Invalid printed date of RMC."""
 
 
 def note(names: Counter[str], name: str) -> None:
@@ -104,14 +102,15 @@ def note(names: Counter[str], name: str) -> None:
 
 
 def own_name(address: str, fields: Sequence[str]) -> str:
-    """A maker's own sentence by its address, and by its kind where the first field is that."""
+    """Name of a maker's own sentence by its address, and by its kind if the first field states
+    it."""
     kind = fields[0] if fields else ""
     is_kind = kind.isalnum() and len(kind) in KIND_LETTERS
     return f"{address},{kind}" if is_kind else address
 
 
 def wrong_checksums(counters: Counter[str]) -> str:
-    """Reason why no sentence verifies, where it is for their checksums; "" where it is not."""
+    """Reason why no sentence verifies, if it is the checksums; "" otherwise."""
     if counters["checksum_missing"] >= MANY > counters["sentences"]:
         return f"NMEA {CHECKSUMS}"
     if counters["checksum_bad"] >= MANY > counters["sentences"]:
@@ -147,8 +146,7 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
 
 
 def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
-    """Reason why sentences arrive and no fix comes of them. `refusal`: why the last epoch was
-    refused."""
+    """Reason why sentences arrive without a fix. `refusal`: that of the last epoch."""
     if refusal:
         return REFUSALS.get(refusal, refusal)
     if received.talkers and not POSITIONS & set(received.used):
@@ -191,7 +189,7 @@ def _heading(received: Received) -> str:
 
 
 def _attitude(received: Received) -> str:
-    """The sentence on a heading that comes in a maker's own form alone; "" where none does."""
+    """Sentence on a heading in a maker's own form alone; "" otherwise."""
     name = next((n for n in received.unused for own in ATTITUDES if n.startswith(own)), "")
     if not name or {"HDT", "THS"} & set(received.used):
         return ""
@@ -202,7 +200,7 @@ def _attitude(received: Received) -> str:
 
 
 def cautions(counters: Counter[str], received: Received, earliest: date) -> dict[str, str]:
-    """By counter: what makes the fixes poorer than the receiver could, and what was done."""
+    """Cautions by counter: limits on the quality of fixes, and the actions taken."""
     found = {}
     day = received.implausible_date
     if day is not None:

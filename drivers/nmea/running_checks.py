@@ -1,4 +1,4 @@
-"""Checks of any stretch of a growing buffer, each byte of which is worked on once.
+"""Incremental checksums over any stretch of a growing buffer, each byte processed once.
 
 A stream can hold a header that promises 8 KiB every six bytes. Summing what each of them claims
 would cost a thousand times the stream; sums that run along with it answer for any stretch at once.
@@ -141,7 +141,7 @@ class RunningCrc24q:
         self._crc = [0]
 
     def holds(self, buffer: bytearray, start: int, end: int) -> bool:
-        """True if start..end (LONGEST_RTCM bytes at most) ends with its CRC."""
+        """True if start..end (at most LONGEST_RTCM bytes) ends with its CRC."""
         known = len(self._crc) - 1
         if end > known:
             more = accumulate(buffer[known:end], _next_crc, initial=self._crc[-1])

@@ -18,19 +18,19 @@ ROUNDED_NS = 10_000_000
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
 MAX_STEP_NS = 10 * SECOND_NS
-"""A pause longer than this between two time reports proves nothing about the clock's rate."""
+"""Longest interval of two time reports that tests the clock's rate."""
 STEP_TOLERANCE_NS = SECOND_NS // 2
-"""A step may differ by this from the host's clock: serial jitter of two reports (0.05 to 0.2 s)."""
+"""Tolerance of a step against the host's clock: serial jitter of two reports (0.05 to 0.2 s)."""
 TRUSTED_STEPS = 2
 """Even steps in a row before the receiver's UTC is believed: it may jump by up to 18 s when it
 learns the leap seconds after a cold start."""
 BACKWARD_EPOCHS = 3
-"""Backward epochs in a row after which the receiver has set its clock back for good."""
+"""Backward epochs in a row after which the receiver's clock was set back for good."""
 LATEST = date(2099, 12, 31)
 """No two-digit year of RMC can say more."""
 
 _TIME_AT = {**dict.fromkeys(("GSA", "VTG", "HDT", "THS"), -1), "GLL": 4}
-"""Field of the time, where it is not the first; -1: none."""
+"""Field of the time, where not the first; -1: none."""
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d{1,9}))?\Z")
 _EPOCH_ORDINAL = date(1970, 1, 1).toordinal()
 
@@ -60,13 +60,13 @@ def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
 
 
 def printed_time(sentence: Sentence) -> str:
-    """As it is printed; empty where this kind has none, or the field is."""
+    """Printed time; empty where this kind has none, or the field is empty."""
     at = _TIME_AT.get(sentence.formatter, 0)
     return sentence.fields[at] if 0 <= at < len(sentence.fields) else ""
 
 
 def time_step_ns(sentence: Sentence) -> int:
-    """One step of the last digit of its time."""
+    """Step of the last digit of a sentence's time."""
     return int(10 ** (9 - min(9, len(printed_time(sentence).partition(".")[2]))))
 
 
@@ -78,7 +78,7 @@ def posix_ns(day: date, time_of_day_ns: int) -> int:
 
 
 class Calendar:
-    """Gives undated epochs the date that puts them nearest to the last dated one.
+    """Calendar that dates undated epochs nearest to the last dated one.
 
     Dates before `earliest` are refused: after a rollover of the GPS week an old receiver is
     1024 weeks off. So are dates after `LATEST`. Counts `implausible_date`.
@@ -97,7 +97,7 @@ class Calendar:
         return False
 
     def dated(self, day: date, time_of_day_ns: int, t_seen_ns: int) -> None:
-        """A plausible date came with this time of day."""
+        """Note a plausible date with this time of day."""
         self._utc_ns = posix_ns(day, time_of_day_ns)
         self._t_seen_ns = t_seen_ns
 
@@ -159,7 +159,7 @@ def _step_ns(before: tuple[date | None, int], after: tuple[date | None, int]) ->
 
 
 class TimeTrust:
-    """Believes a receiver's UTC once it says valid and has made even steps."""
+    """Trust in a receiver's UTC after a valid status and even steps."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int] | None = None
@@ -167,7 +167,7 @@ class TimeTrust:
         self._even = 0
 
     def report(self, utc_ns: int, t_seen_ns: int, *, valid: bool) -> bool | None:
-        """True if this time is to be trusted; None when it was reported already."""
+        """True if this time is trusted; None for a repeated report."""
         if self._last is not None:
             step, elapsed = utc_ns - self._last[0], t_seen_ns - self._last[1]
             if step == 0 and elapsed < STEP_TOLERANCE_NS:

@@ -35,7 +35,8 @@ GGA_S = 10.0
 """Network casters ask for a position every 5 to 60 s; ten seconds at 30 m/s are 300 m of a
 network's 30 km."""
 FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
-"""Casters lock out whom they see too often: most allow an attempt a minute for ever."""
+"""First and longest wait between attempts: casters lock out frequent clients; most allow an attempt
+a minute."""
 
 NtripState = Literal["starting", "waiting", "running", "lost", "refused"]
 
@@ -47,9 +48,9 @@ class NtripOptions(DriverOptions):
     """HOST or HOST:PORT."""
     mountpoint: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.+-]{1,100}$")]
     user: str = ""
-    """Its password is in the environment, FUSIOND_NTRIP_PASSWORD."""
+    """User name; the password is in the environment, FUSIOND_NTRIP_PASSWORD."""
     tls: bool = False
-    """The certificate must be the caster's and of an authority that the system trusts."""
+    """Use TLS; the caster's certificate must come from an authority that the system trusts."""
     send_gga: bool = False
     """Send the receiver's own position up: for mountpoints that make corrections for a place."""
 
@@ -74,7 +75,7 @@ class NtripOptions(DriverOptions):
 
 
 class _Frames:
-    """The RTCM 3 frames of a stream, and counters of what else it holds."""
+    """RTCM 3 frames of a stream, and counters of its other contents."""
 
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
@@ -92,13 +93,13 @@ class _Frames:
 
 
 def _reach(host: str, port: int, tls: bool) -> tuple[socket, ssl.SSLContext | None]:
-    """Connected, and what to verify the caster with; the authorities are read from files here."""
+    """Connection to the caster, with the means to verify it; reads the authorities' files."""
     context = ssl.create_default_context() if tls else None
     return connect(host, port), context
 
 
 def _without_tls(error: ssl.SSLError) -> str:
-    """Reason why no connection with TLS came about, and what would do."""
+    """Reason why a TLS connection failed, with the remedy."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return (
             f"its certificate is not accepted: {error.verify_message} (an authority of your own: "
@@ -131,7 +132,7 @@ class NtripClient:
     ) -> None:
         self.state: NtripState = "starting"
         self.detail = ""
-        """Reason why there are no corrections; empty while they come."""
+        """Reason for the absence of corrections; empty while they arrive."""
         self._options = options
         self._counters = counters
         self._write = write
@@ -141,7 +142,7 @@ class NtripClient:
         self._where = f"{options.caster}/{options.mountpoint}"
 
     async def run(self) -> None:
-        """Fetch corrections for ever, with longer and longer waits where there are none."""
+        """Fetch corrections indefinitely, with growing waits after failures."""
         while True:
             try:
                 await self._position_known()
@@ -162,13 +163,14 @@ class NtripClient:
             await asyncio.sleep(self._backoff.next())
 
     async def _position_known(self) -> None:
-        """A caster that makes corrections for a place closes, or is silent, until it knows it."""
+        """True once the position is known, without which a caster of local corrections closes or is
+        silent."""
         while self._options.send_gga and not self._gga():
             self._set_state("waiting", "the receiver has no position to send to the caster yet")
             await asyncio.sleep(FIRST_WAIT_S)
 
     async def _fetch(self) -> None:
-        """One connection, to its end, which is an exception."""
+        """Serve one connection to its end, which is an exception."""
         host, port = self._options.address
         reach = partial(_reach, host, port, self._options.tls)
         connected, context = await aside(reach, lambda orphan: orphan[0].close())

@@ -11,7 +11,7 @@ import base64
 import re
 
 HEADER_BYTES = 8192
-"""A longer head is none: the limit of most HTTP servers."""
+"""Most bytes of a head: the limit of most HTTP servers."""
 _SIZE_LINE_BYTES = 64
 _HEXADECIMAL = re.compile(rb"[0-9A-Fa-f]{1,8}")
 _SOURCE_TABLE = "gnss/sourcetable"
@@ -37,7 +37,7 @@ def request(host: str, port: int, mountpoint: str, user: str, password: str) -> 
 
 
 class CasterReply:
-    """`feed` bytes off the connection, get the corrections among them.
+    """Parser of a caster's reply: `feed` bytes of the connection, get the corrections among them.
 
     Raises CasterRefusedError where the answer is another than corrections.
     """
@@ -45,14 +45,13 @@ class CasterReply:
     def __init__(self) -> None:
         self.accepted = False
         self.over: EOFError | CasterRefusedError | None = None
-        """Reason why no more corrections follow on those that came: the caster ended them, or its
-        chunks make no sense."""
+        """Reason why the corrections end: the caster closed them, or its chunks are invalid."""
         self._buffer = bytearray()
         self._sought = 0
         """Earliest end of the head: not before."""
         self._chunked = False
         self._left = 0
-        """Bytes of the chunk that have not come, its closing CR LF included."""
+        """Missing bytes of the chunk, its closing CR LF included."""
 
     def feed(self, data: bytes) -> bytes:
         """The corrections that `data` brings."""
@@ -115,7 +114,7 @@ def _size(line: bytes) -> int | None:
 
 
 def _judge(first: str, head: bytes) -> None:
-    """True if corrections follow on a head that begins with the line `first`."""
+    """Evaluate a head that begins with the line `first`: do corrections follow?"""
     protocol, _, status = first.partition(" ")
     code = status.partition(" ")[0]
     if protocol != "ICY" and not protocol.startswith("HTTP/1."):

@@ -1,5 +1,5 @@
-"""BeiDou B-CNAV1 (B1C) and B-CNAV2 (B2a) as UBX-RXM-SFRBX hands them over: ephemeris, delays, and
-the ionosphere (BDGIM).
+"""BeiDou B-CNAV1 (B1C) and B-CNAV2 (B2a) from UBX-RXM-SFRBX: ephemeris, delays, and the ionosphere
+(BDGIM).
 
     B-CNAV1  subframe 1 in 3 words, undecoded; 2 in 19: 576 bits, CRC 24; 3 in 9: 240 bits, CRC 24
     B-CNAV2  one message in 9 words: PRN 6, type 6, second of week 18, data 234, CRC 24
@@ -24,13 +24,13 @@ from drivers.raw.subframes import Decoded, RefusedError, Subframe, bdgim, epheme
 from drivers.raw.weeks import WeekReference
 
 SUBFRAMES = {3: 1, 19: 2, 9: 3}
-"""Of B-CNAV1, by the words that it takes."""
+"""Words of B-CNAV1's subframes."""
 _SUBFRAME_2, _SUBFRAME_3, _MESSAGE = 576, 240, 264
 """Bits before the CRC."""
 MESSAGES = (10, 11, 30)
 FOLLOWS_S = 3
 REFERENCE_AXIS_M = {2: 42_162_200.0, 3: 27_906_100.0}
-"""By satellite type, IGSO and MEO; GEO (1) send neither message."""
+"""Reference axis by satellite type, IGSO and MEO; GEO (1) send neither message."""
 
 
 def _orbit(at: int) -> Table:
@@ -77,16 +77,16 @@ _ORBIT_1, _PLANE_1, _CLOCK_1 = 39, 242, 464
 _ORBIT_2, _PLANE_2, _CLOCK_2 = 61, 42, 42
 TABLE_1 = _orbit(_ORBIT_1) | _plane(_PLANE_1) | _clock(_CLOCK_1)
 _TYPE, _AXIS = 11, 13
-"""Within Ephemeris I: satellite type, 2 bits, and dA, 26 bits of 2^-9 m."""
+"""Fields of Ephemeris I: satellite type, 2 bits, and dA, 26 bits of 2^-9 m."""
 _DELAYS_1 = (s(557, 12, -34), s(533, 12, -34), s(545, 12, -34))
 _DELAYS_2 = (s(219, 12, -34), s(121, 12, -34), s(133, 12, -34))
-"""T_GD of B1C's pilot, T_GD of B2a's pilot, ISC of the data component of the message's own
+"""Delays: T_GD of B1C's pilot, T_GD of B2a's pilot, ISC of the data component of the message's own
 signal."""
 
 
 _IONOSPHERE_1, _IONOSPHERE_2 = bdgim_table(42), bdgim_table(145)
 IONOSPHERE_PAGE = 1
-"""Of subframe 3."""
+"""Page of the ionosphere in subframe 3."""
 
 
 def _checked(words: tuple[int, ...], length: int) -> Bits:
@@ -102,7 +102,8 @@ def _checked(words: tuple[int, ...], length: int) -> Bits:
 
 
 def _sqrt_a(bits: Bits, at: int) -> float:
-    """Of Ephemeris I that begins at `at`. RefusedError where no such satellite sends it."""
+    """Root of the axis of Ephemeris I that begins at `at`. RefusedError for an impossible
+    satellite."""
     reference = REFERENCE_AXIS_M.get(bits.unsigned(at + _TYPE, 2))
     if reference is None:
         raise RefusedError("ephemeris_implausible")
@@ -110,7 +111,7 @@ def _sqrt_a(bits: Bits, at: int) -> float:
 
 
 class Bcnav1Decoder:
-    """One satellite's subframes on B1C."""
+    """Decoder of one satellite's subframes on B1C."""
 
     def __init__(self) -> None:
         self._two: Bits | None = None
@@ -159,7 +160,7 @@ class Bcnav1Decoder:
 
 
 class Bcnav2Decoder:
-    """One satellite's messages on B2a."""
+    """Decoder of one satellite's messages on B2a."""
 
     def __init__(self) -> None:
         self._parts: dict[int, Bits] = {}
@@ -210,7 +211,7 @@ class Bcnav2Decoder:
 
 
 def _second_of(bits: Bits) -> int:
-    """BDT second of week at which this message began."""
+    """BDT second of week at the start of this message."""
     return bits.unsigned(12, 18) * FOLLOWS_S
 
 

@@ -1,4 +1,4 @@
-"""BeiDou D1 and D2 words as UBX-RXM-SFRBX hands them over: BCH(15,11,1) checked, parity taken out.
+"""BeiDou D1 and D2 words from UBX-RXM-SFRBX: BCH(15,11,1) checked, parity removed.
 
     word 1       15 bits free | 11 bits, 4 parity
     words 2-10   11 bits | 11 bits | 4 parity of the first | 4 parity of the second
@@ -67,7 +67,7 @@ def subframe_number(bits: Bits) -> int:
 
 
 def second_of_week(bits: Bits) -> int:
-    """BDT second of week at which this subframe began."""
+    """BDT second of week at the start of this subframe."""
     return bits.unsigned(18, 20)
 
 

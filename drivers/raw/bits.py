@@ -29,7 +29,7 @@ class Bits:
         return self.value >> (self.length - at - length) & ((1 << length) - 1)
 
     def signed(self, at: int, length: int) -> int:
-        """The same as two's complement."""
+        """Two's complement number."""
         n = self.unsigned(at, length)
         return n - (1 << length) if n >> (length - 1) else n
 
@@ -39,7 +39,7 @@ class Bits:
 
     @classmethod
     def join(cls, *parts: Bits) -> Bits:
-        """One string out of several."""
+        """Concatenate bit strings."""
         value = length = 0
         for part in parts:
             value = value << part.length | part.value
@@ -71,12 +71,12 @@ class Number:
 
 
 def u(at: int, length: int, exponent: int = 0, factor: float = 1.0) -> Number:
-    """Unsigned."""
+    """Unsigned number."""
     return Number(at, length, False, exponent, factor)
 
 
 def s(at: int, length: int, exponent: int = 0, factor: float = 1.0) -> Number:
-    """Signed."""
+    """Signed number."""
     return Number(at, length, True, exponent, factor)
 
 
@@ -94,8 +94,8 @@ def read(bits: Bits, table: Table) -> dict[str, Any]:
 
 
 def bdgim_table(at: int) -> tuple[Number, ...]:
-    """The nine coefficients of BDGIM in eighths of a TECU, 74 bits from bit `at` (table 7-10 of
-    BDS-SIS-ICD-B1C-1.0): the third and fourth have no sign, the fifth is negative always."""
+    """Table of BDGIM's nine coefficients in eighths of a TECU, 74 bits from bit `at` (table 7-10 of
+    BDS-SIS-ICD-B1C-1.0): the third and fourth have no sign, the fifth is always negative."""
     first = u(at, 10, -3), s(at + 10, 8, -3)
     mean = u(at + 18, 8, -3), u(at + 26, 8, -3), u(at + 34, 8, -3, -1.0)
     return (*first, *mean, *(s(at + k, 8, -3) for k in (42, 50, 58, 66)))
@@ -105,7 +105,7 @@ KlobucharTable = tuple[tuple[Number, ...], tuple[Number, ...]]
 
 
 def klobuchar_table(at: int) -> KlobucharTable:
-    """Alpha and beta of GPS and BeiDou, eight bits each, one behind the other from bit `at`."""
+    """Table of alpha and beta of GPS and BeiDou, eight bits each, from bit `at` on."""
     alpha = tuple(s(at + 8 * i, 8, e) for i, e in enumerate((-30, -27, -24, -24)))
     beta = tuple(s(at + 32 + 8 * i, 8, e) for i, e in enumerate((11, 14, 16, 16)))
     return alpha, beta

@@ -1,4 +1,4 @@
-"""GPS CNAV (L2C, L5) as UBX-RXM-SFRBX hands it over: the delays of the signals, of message 30.
+"""GPS CNAV (L2C, L5) from UBX-RXM-SFRBX: the signals' group delays of message 30.
 
     preamble 8, PRN 6, type 6, TOW 17, alert 1, data 238, CRC 24: 300 bits in ten words of 32
     type 30: T_GD and ISC of L1 C/A, L2C, L5 I5, L5 Q5, 13 bits of 2^-35 s each from bit 127 on
@@ -19,11 +19,11 @@ WORDS, LENGTH, COVERED = 10, 300, 276
 DELAYS_TYPE = 30
 _FIRST, _BITS, _WEIGHT_S = 127, 13, 2.0**-35
 SIGNALS = (("1C",), ("2S", "2L", "2X"), ("5I",), ("5Q",))
-"""Of the four corrections behind T_GD."""
+"""Signals of the four corrections behind T_GD."""
 
 
 class CnavDecoder:
-    """One GPS satellite's messages."""
+    """Decoder of one GPS satellite's messages."""
 
     def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
         """Result of a message. RefusedError by name."""

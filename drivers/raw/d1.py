@@ -48,7 +48,7 @@ _IONOSPHERE = klobuchar_table(60)
 
 
 class D1Decoder:
-    """One satellite's subframes."""
+    """Decoder of one satellite's subframes."""
 
     def __init__(self) -> None:
         self._parts = Parts()

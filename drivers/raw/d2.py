@@ -27,7 +27,7 @@ USED = {
     9: (42, 106),
     10: (42, 61),
 }
-"""Of each page that the orbit needs: its first bit used, and the one behind its last."""
+"""Used bits of each page of the orbit: the first, and the one behind the last."""
 
 TABLE = {
     "toc_s": u(23, 17, 3),
@@ -55,7 +55,7 @@ _IONOSPHERE = klobuchar_table(42)
 
 
 class D2Decoder:
-    """One geostationary satellite's subframes."""
+    """Decoder of one geostationary satellite's subframes."""
 
     def __init__(self) -> None:
         self._parts = Parts()

@@ -56,7 +56,7 @@ from drivers.raw.weeks import FIRST_RAWX_WEEK, LAST_WEEK, WeekReference, leap_se
 
 
 class MessageDecoder(Protocol):
-    """Of one satellite, one message."""
+    """Decoder of one satellite's message."""
 
     def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded: ...
 
@@ -93,7 +93,7 @@ class RawDecoder:
     ) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self.leap_seconds: int | None = None
-        """GPS time minus UTC as the receiver last said that it knows it."""
+        """GPS time minus UTC, as the receiver last confirmed."""
         self._source = source
         self._splitter = StreamSplitter(self.counters)
         self._t_seen_ns = 0
@@ -101,7 +101,7 @@ class RawDecoder:
         self._rtcm = RtcmDecoder(source, self._weeks, self.counters) if rtcm else None
         self._messages: dict[tuple[str, int, int], MessageDecoder] = {}
         self._ionosphere: dict[str, Klobuchar | Bdgim] = {}
-        """By model."""
+        """Last ionosphere by model."""
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[RawEvent]:
         """The events that `data`, seen at `t_seen_ns`, completes. Sentences are left out."""
@@ -134,7 +134,7 @@ class RawDecoder:
         self._weeks.note_utc(utc, self.leap_seconds)
 
     def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
-        """Result of a verified frame of RTCM 3 that did not come from the receiver."""
+        """Decode a verified RTCM 3 frame from another source than the receiver."""
         return [] if self._rtcm is None else self._rtcm.decode(frame, t_seen_ns)
 
     def decode(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
@@ -215,7 +215,7 @@ class RawDecoder:
         return [event for event in decoded if self._is_news(event)]
 
     def _is_news(self, event: NavigationMessage) -> bool:
-        """Every whole ephemeris counts, for its health and age; an ionosphere once."""
+        """True for every whole ephemeris, whose health and age matter; for an ionosphere once."""
         if isinstance(event, Ephemeris):
             self.counters["ephemerides"] += 1
             return True

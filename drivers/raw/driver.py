@@ -24,15 +24,15 @@ from drivers.ubx.messages import CLASS_NAV
 Found = Measurement | RawEvent
 
 NMEA_TIME_NS = 5_000_000_000
-"""Another message tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. That of
-RXM-RAWX is up to some milliseconds off, as the receiver's clock is."""
+"""Time without RMC or ZDA after which another message gives the time: five epochs at 1 Hz. That of
+RXM-RAWX is off by up to some milliseconds, with the receiver's clock."""
 UBX_FIX_NS = 5_000_000_000
-"""Fixes of NMEA are left out until none of UBX-NAV has come for this long.
+"""Time without UBX-NAV after which fixes of NMEA are used.
 
 Those of UBX-NAV are the same fixes with a velocity down and sigmas of their own."""
 SAME_FIX_NS = 20_000_000
-"""NMEA prints hundredths of a second, of what UBX gives in nanoseconds; fixes come 50 ms apart at
-the least."""
+"""Tolerance of equal instants: NMEA prints hundredths of a second, UBX gives nanoseconds; fixes are
+at least 50 ms apart."""
 
 
 class GnssOptions(NmeaOptions):
@@ -51,7 +51,7 @@ ALIVE_BY = ("sentences", "ubx_frames", "rtcm_frames")
 
 
 class GnssDecoder:
-    """One stream, three decoders: of sentences, of UBX-NAV, and of all other frames.
+    """Decoders of one stream: for sentences, for UBX-NAV, and for all other frames.
 
     Counts `nmea_fix_superseded`: the same fix comes by UBX-NAV, too.
     """
@@ -81,28 +81,27 @@ class GnssDecoder:
         )
         self._trust = TimeTrust()
         self._nmea_utc_ns: int | None = None
-        """UTC of RMC or ZDA when last told, else of the first epoch of RXM-RAWX."""
+        """Last UTC of RMC or ZDA, else of the first epoch of RXM-RAWX."""
         self._delays: set[int] = set()
-        """BeiDou satellites whose B-CNAV has come."""
+        """BeiDou satellites with received B-CNAV."""
         self.undelayed = 0
-        """BeiDou satellites of the last epoch, where all of them are tracked on B1C or B2a alone
-        and no group delay of any is known; 0 where one could serve."""
+        """BeiDou satellites of the last epoch that are tracked on B1C or B2a alone without a known
+        group delay; 0 if any is usable."""
         self._t_seen_ns = 0
 
     @property
     def refusal(self) -> str:
-        """Reason why the last epoch of NMEA, or else of UBX-NAV, gave no fix, by counter name."""
+        """Refusal of the last NMEA epoch, or else of UBX-NAV, by counter name."""
         return self._nmea.refusal or self._ubx.refusal
 
     @property
     def cautions(self) -> dict[str, str]:
-        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        """Cautions by counter: limits on the quality of fixes, and the actions taken."""
         return self._ubx.cautions | self._nmea.cautions
 
     @property
     def unread(self) -> str:
-        """Text on what arrives in the place of anything that is read, as a sentence; "" where
-        nothing tells."""
+        """Sentence on unreadable input; "" if unknown."""
         if not any(self.counters[name] for name in ALIVE_BY):
             return nothing_verified(self.counters, self._splitter.unread)
         received = self._nmea.received
@@ -110,7 +109,7 @@ class GnssDecoder:
 
     @property
     def gga(self) -> bytes:
-        """The last GGA with a position, or else the last fix of UBX-NAV as one; empty before."""
+        """Last GGA with a position, or else the last fix of UBX-NAV as one; empty before."""
         return self._nmea.gga or self._ubx.gga
 
     @property
@@ -132,7 +131,7 @@ class GnssDecoder:
         return [] if self._raw is None else self._raw.correct(frame, t_seen_ns)
 
     def silence(self) -> list[Found]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        """Handle a silence longer than any receiver's pause within an epoch (50 ms)."""
         found: list[Found] = []
         self._take_nmea(self._nmea.silence(), found)
         self._take_ubx(self._ubx.silence(), found)
@@ -196,7 +195,7 @@ class GnssDecoder:
             found.append(measurement)
 
     def _already(self, fix: PositionFix) -> bool:
-        """True if NMEA has told this very fix: the first one, where its sentences come first."""
+        """True if NMEA gave this fix already, at the first epoch when its sentences come first."""
         last, self._nmea_fix = self._nmea_fix, None
         if last is None or not isinstance(fix.stamp, UtcStamp):
             return False
@@ -217,7 +216,8 @@ class GnssDecoder:
         self.undelayed = 0 if served else len({s.prn for s in beidou})
 
     def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
-        """UTC of RXM-RAWX, where the receiver knows the leap seconds and no RMC or ZDA comes."""
+        """Report UTC of RXM-RAWX, if the receiver knows the leap seconds and sends no RMC or
+        ZDA."""
         if self._raw is None or self._raw.leap_seconds is None:
             return
         if not isinstance(epoch.stamp, UtcStamp):
@@ -230,14 +230,14 @@ class GnssDecoder:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
 
     def _known_from_nmea(self, utc_ns: int) -> bool:
-        """True if RMC or ZDA have told the time lately, or may yet."""
+        """True if RMC or ZDA gave the time recently, or still may."""
         if self._nmea_utc_ns is None:
             self._nmea_utc_ns = utc_ns
         return abs(utc_ns - self._nmea_utc_ns) < NMEA_TIME_NS
 
 
 class GnssDriver(ReceiverDriver):
-    """Reads the line, hands over raw observations and what the NMEA driver does.
+    """Driver for raw observations, with the output of the NMEA driver.
 
     PermanentDriverError when RTCM 3 is to be decoded and pyrtcm is not installed.
     """
@@ -291,7 +291,7 @@ class GnssDriver(ReceiverDriver):
 
     @property
     def cautions(self) -> dict[str, str]:
-        """As `ReceiverDriver`."""
+        """Cautions, as in `ReceiverDriver`."""
         return self._gnss.cautions
 
     def _useless_detail(self) -> str:
@@ -316,7 +316,6 @@ class GnssDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """Reason why nothing on the line verifies, as a sentence; "" where nothing that arrives
-        tells."""
+        """Reason why nothing on the line verifies, as a sentence; "" if unknown."""
         alive = any(self.counters[name] for name in self.alive_by)
         return "" if alive else self._gnss.unread

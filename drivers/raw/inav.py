@@ -1,4 +1,4 @@
-"""Galileo I/NAV as UBX-RXM-SFRBX hands it over: a page, its even and its odd half of 120 bits each.
+"""Galileo I/NAV from UBX-RXM-SFRBX: a page, its even and its odd half of 120 bits each.
 
     even, words 0-3    0 | type | data 112 | tail 6
     odd,  words 4-7    1 | type | data 16 | reserved 64 | CRC 24 | reserved 8 | tail 6
@@ -77,7 +77,7 @@ def data_word(words: tuple[int, ...]) -> Bits:
 
 
 class InavDecoder:
-    """One satellite's pages on one signal."""
+    """Decoder of one satellite's pages on one signal."""
 
     def __init__(self) -> None:
         self._parts = Parts()

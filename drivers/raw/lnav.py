@@ -1,4 +1,4 @@
-"""GPS LNAV as UBX-RXM-SFRBX hands it over: ten words of 30 bits, six of them parity.
+"""GPS LNAV from UBX-RXM-SFRBX: ten words of 30 bits, six of them parity.
 
     word     D29* D30* | d1 ... d24 | D25 ... D30     bits 31-30, 29-6, 5-0 of a U4
     D25..29  parity, IS-GPS-200 table 20-XIV
@@ -71,7 +71,7 @@ _EQUATIONS = (
 
 
 def parity(word: int) -> int:
-    """The six parity bits of a word, of which bits 31 to 6 count."""
+    """Six parity bits of a word, whose bits 31 to 6 are used."""
     above = word >> 6
     value = 0
     for equation in _EQUATIONS:
@@ -96,7 +96,7 @@ def subframe_bits(words: tuple[int, ...]) -> Bits:
 
 
 class LnavDecoder:
-    """One GPS satellite's subframes."""
+    """Decoder of one GPS satellite's subframes."""
 
     def __init__(self) -> None:
         self._parts: dict[int, Bits] = {}

@@ -45,7 +45,7 @@ CARRIER_HZ: dict[tuple[System, str], float] = {
 
 @immutable()
 class RawSignal:
-    """One signal of one satellite. Range rate is positive while the distance grows.
+    """Signal of one satellite. Range rate is positive while the distance grows.
 
     `sd_*` are what the receiver states, None where it does not; `cno_db_hz` likewise. A carrier
     with half a cycle open is None. It has been followed for `lock_s` (s) at least, as the receiver
@@ -65,13 +65,13 @@ class RawSignal:
 
     @property
     def satellite(self) -> str:
-        """Such as "C21"."""
+        """Name such as "C21"."""
         return f"{self.system}{self.prn:02d}"
 
 
 @immutable()
 class RawGnssEpoch:
-    """All signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
+    """Signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
 
     `stamp` is the same instant in UTC where the receiver knows the leap seconds.
     """
@@ -131,7 +131,7 @@ class Ephemeris:
 
     @property
     def satellite(self) -> str:
-        """Such as "C21"."""
+        """Name such as "C21"."""
         return f"{self.system}{self.prn:02d}"
 
 
@@ -148,8 +148,8 @@ class Klobuchar:
 
 @immutable()
 class Bdgim:
-    """BeiDou-3's ionosphere as B-CNAV broadcasts it: nine coefficients of spherical harmonics, in
-    TECU (1e16 electrons a square metre)."""
+    """Ionosphere of BeiDou-3 from B-CNAV: nine coefficients of spherical harmonics, in TECU (1e16
+    electrons a square metre)."""
 
     source: str
     t_seen_ns: int
@@ -158,7 +158,7 @@ class Bdgim:
 
 @immutable()
 class SignalDelays:
-    """Group delays of a GPS satellite as CNAV has them: T_GD (s) and, by signal, its inter-signal
+    """Group delays of a GPS satellite from CNAV: T_GD (s) and, by signal, its inter-signal
     correction (s)."""
 
     source: str
@@ -170,7 +170,7 @@ class SignalDelays:
 
     @property
     def satellite(self) -> str:
-        """Such as "G05"."""
+        """Name such as "G05"."""
         return f"{self.system}{self.prn:02d}"
 
 
@@ -179,7 +179,7 @@ CorrectionPart = Literal["orbit", "clock", "fast_clock", "bias", "accuracy"]
 
 @immutable()
 class Correction:
-    """A part of what a service says of a satellite beside its own ephemeris (RTCM SSR).
+    """Correction of a satellite's ephemeris by a service (RTCM SSR).
 
     It holds at GPS time `week`, `tow_s`, and comes anew every `interval_s`. Parts of one `solution`
     (provider, number, issue) belong together. `values`: of the orbit radial, along, across (m,
@@ -204,7 +204,7 @@ class Correction:
 
     @property
     def satellite(self) -> str:
-        """Such as "C21"."""
+        """Name such as "C21"."""
         return f"{self.system}{self.prn:02d}"
 
 

@@ -42,12 +42,12 @@ COMPRESSED_LABEL = "CRINEX VERS   / TYPE"
 
 
 class RinexError(ValueError):
-    """The file is none that can be read; the text says why."""
+    """Error: an unreadable file; the text is the reason."""
 
 
 def version_and_type(text: str) -> tuple[float, str]:
-    """Such as (3.05, "O"). RinexError where it is no RINEX 3 or 4
-    (of 2: `rinex2.as_version_3`)."""
+    """Version and type such as (3.05, "O"). RinexError unless it is RINEX 3 or 4 (for 2:
+    `rinex2.as_version_3`)."""
     first = text.partition("\n")[0]
     if first[LABEL].strip() != FIRST_LABEL:
         raise RinexError("no RINEX file: the first line does not say so")
@@ -104,15 +104,15 @@ class _Header:
 
 @dataclass(slots=True)
 class _Columns:
-    """Of one system: for each signal where its C, L, D and S stand, None where not."""
+    """Columns of C, L, D and S of each signal of a system, None where absent."""
 
     signals: list[tuple[str, list[int | None]]]
     factors: list[float]
 
 
 class ObservationReader:
-    """One file. Counts `epochs_raw`, `lines_unreadable`, `events_passed`, `measured_G` and so on,
-    `signal_unknown`, `prn_unknown`, `pseudorange_implausible`, `rate_implausible`,
+    """Reader of one file. Counts `epochs_raw`, `lines_unreadable`, `events_passed`, `measured_G`
+    and so on, `signal_unknown`, `prn_unknown`, `pseudorange_implausible`, `rate_implausible`,
     `half_cycle_open`."""
 
     def __init__(self, source: str, text: str, counters: Counter[str]) -> None:
@@ -136,7 +136,7 @@ class ObservationReader:
             raise RinexError(f"epochs in {self._header.time_system} time are not read")
 
     def epochs(self) -> Iterator[RawGnssEpoch]:
-        """In the order of the file."""
+        """Epochs in the order of the file."""
         for line in self._lines:
             if line[:1] != ">":
                 self._counters["lines_unreadable"] += bool(line.strip())

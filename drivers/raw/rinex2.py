@@ -28,14 +28,14 @@ _CODES: dict[str, dict[str, str]] = {
     "E": {"C1": "1X", "C5": "5X", "C7": "7X", "C8": "8X", "C6": "6X"},
     "C": {"C1": "2I", "C2": "2I", "C7": "7I", "C6": "6I"},
 }
-"""By system: the signal of each kind of range."""
+"""Signal of each kind of range, by system."""
 _SERVES = {"1": ("C1", "P1"), "2": ("P2", "C2")}
-"""Of a band with two kinds of range the one that its carrier belongs to, best first."""
+"""Preferred range of a band with two kinds, the one of the carrier first."""
 
 
 def as_version_3(text: str) -> str:
-    """A file of RINEX 2 as one of 3.05, any other text as it is. RinexError for a kind of file that
-    is not read."""
+    """Convert a RINEX 2 file to 3.05; other text is unchanged. RinexError for an unsupported kind
+    of file."""
     head, _, body = text.partition("\n")
     if head[LABEL].strip() != FIRST_LABEL:
         return text
@@ -104,8 +104,7 @@ def _observations(lines: Iterator[str], system: str) -> Iterator[str]:
 
 
 def _types(line: str, before: list[str]) -> list[str]:
-    """The observables of a header line behind those of the lines before it: its number begins the
-    list anew."""
+    """Observables of a header line appended to those before; a number starts a new list."""
     return ([] if line[:6].strip() else before) + line[6:60].split()
 
 
@@ -148,7 +147,7 @@ def _year(text: str) -> int:
 
 
 def _date(line: str) -> str:
-    """As RINEX 3 prints it."""
+    """Date in RINEX 3's format."""
     month, day, hour, minute = (int(line[at : at + 3]) for at in (3, 6, 9, 12))
     second = float(line[15:26])
     return f" {_year(line[1:3]):04} {month:02} {day:02} {hour:02} {minute:02}{second:11.7f}"

@@ -48,7 +48,7 @@ _MESSAGES: dict[tuple[str, str], str] = {
     ("C", "CNV1"): "bcnav1",
     ("C", "CNV2"): "bcnav2",
 }
-"""By system and RINEX 4's name."""
+"""Messages by system and RINEX 4's name."""
 _ION: dict[tuple[str, str], System] = {("G", "LNAV"): "G", ("C", "D1D2"): "C"}
 _ION_3: dict[str, tuple[System, int]] = {
     "GPSA": ("G", 0),
@@ -57,9 +57,9 @@ _ION_3: dict[str, tuple[System, int]] = {
     "BDSB": ("C", 1),
 }
 _LINES, _LINES_CNAV, _LINES_GPS_CNAV = 8, 10, 9
-"""Of a record, with its first."""
+"""Number of lines of a record, including the first."""
 _TGD, _ISC = 25, 27
-"""Places of delays in a record of GPS CNAV, the clock's three before them."""
+"""Places of delays in a record of GPS CNAV, after the clock's three numbers."""
 
 # Where numbers stand, the clock's three before them; all messages share what comes first.
 _ORBIT = (
@@ -78,7 +78,7 @@ class Broadcast(NamedTuple):
 
 
 def navigation(source: str, text: str, counters: Counter[str]) -> list[Broadcast]:
-    """All of a file, in its order. RinexError where it is none.
+    """Messages of a file in order. RinexError for another file.
 
     Counts `ephemerides`, `ionospheres`, `records_unreadable`, `ephemeris_implausible`,
     `satellite_unknown`, and `<system>_not_used` or `<message>_not_used`.
@@ -105,7 +105,7 @@ def navigation(source: str, text: str, counters: Counter[str]) -> list[Broadcast
 
 
 def _records(lines: list[str], version: float) -> Iterator[tuple[str, str, str, list[str]]]:
-    """System, number, "EPH LNAV" (RINEX 4) or "EPH" (3), and the lines of each record."""
+    """Records: system, number, "EPH LNAV" (RINEX 4) or "EPH" (3), and lines."""
     head, record = "", list[str]()
     for line in (*lines, ">" if version >= 4.0 else "X"):
         starts = line[:1] == ">" if version >= 4.0 else line[:1].isalpha()

@@ -43,7 +43,7 @@ from drivers.raw.ubx import MAX_PRN, PSEUDORANGE_M
 from drivers.raw.weeks import BDT_BEHIND_GPS_S, WEEK_S, WeekReference, leap_seconds, utc_ns
 
 MSM_SYSTEMS: dict[int, System] = {107: "G", 109: "E", 112: "C"}
-"""By the message number without its last digit, which is the kind of MSM."""
+"""Systems by MSM message number without its last digit, the kind of MSM."""
 MSM_KINDS = frozenset({4, 5, 6, 7})
 OTHER_MSM = {
     108: "glonass_not_used",
@@ -53,7 +53,7 @@ OTHER_MSM = {
 }
 SYSTEM_PARAMETERS = 1013
 SSR = frozenset((*MESSAGES, *GLONASS, *OTHERS))
-"""Corrections: fusiond reads them itself (drivers.raw.ssr)."""
+"""Message numbers of corrections, decoded in drivers.raw.ssr."""
 MJD_1980_01_06 = 44_244
 """Day 0 of GPS time as a modified Julian date."""
 EPHEMERIDES: dict[int, System] = {1019: "G", 1042: "C", 1045: "E", 1046: "E"}
@@ -108,7 +108,7 @@ Parse = Callable[[bytes], Any]
 
 
 def message_number(frame: bytes) -> int:
-    """Number of a frame's message, 0 of one that is too short for one."""
+    """Message number of a frame, 0 of one too short."""
     return int.from_bytes(frame[3:5], "big") >> 4 if len(frame) >= 8 else 0
 
 
@@ -180,7 +180,7 @@ class RtcmDecoder:
         return found
 
     def flush(self) -> list[RawEvent]:
-        """The epoch that is open, when there is one."""
+        """Open epoch, if any."""
         epoch, signals = self._epoch, tuple(self._signals.values())
         self._epoch = None
         self._signals.clear()
@@ -197,8 +197,8 @@ class RtcmDecoder:
         return [RawGnssEpoch(self._source, self._t_seen_ns, stamp, week, tow_s, signals)]
 
     def _parameters(self, bits: Bits) -> None:
-        """1013: day (DF051, modified Julian), second of UTC's day (DF052), leap seconds (DF054); a
-        day or leap seconds that cannot be are not known."""
+        """Note the system parameters of 1013: day (DF051, modified Julian), second of UTC's day
+        (DF052), leap seconds (DF054); implausible ones are None."""
         self._counters["rtcm_system_parameters"] += 1
         day, second, leap = bits.unsigned(24, 16), bits.unsigned(40, 17), bits.unsigned(62, 8)
         if not within(leap, PLAUSIBLE_LEAP_SECONDS):

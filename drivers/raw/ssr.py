@@ -45,24 +45,24 @@ MESSAGES = {
 }
 
 INTERVALS_S = (1, 2, 5, 10, 15, 30, 60, 120, 240, 300, 600, 900, 1800, 3600, 7200, 10800)
-"""DF391."""
+"""Update intervals of DF391."""
 _HEADER_BITS = 67
-"""Without the datum's."""
+"""Bits of the header without the datum's."""
 _ISSUE_BITS: dict[System, tuple[tuple[int, int], ...]] = {
     "G": ((8, 0),),
     "E": ((10, 0),),
     "C": ((10, 8), (10, 24)),
 }
-"""Of the issue, and behind it."""
+"""Bits of the issue, and behind it."""
 _ORBIT = ((22, 1e-4), (20, 4e-4), (20, 4e-4), (21, 1e-6), (19, 4e-6), (19, 4e-6))
 _CLOCK = ((22, 1e-4), (21, 1e-6), (27, 2e-8))
 _HIGH_RATE = ((22, 1e-4),)
 _BIAS = 14, 0.01
 LARGEST_M, LARGEST_M_S = 100.0, 0.1
-"""Of a correction and of its rate. Broadcast orbits and clocks are metres off, BeiDou's
-geostationary ones tens of metres; a satellite that is a hundred off is at fault, not corrected."""
+"""Largest plausible correction and its rate. Broadcast orbits and clocks are metres off, BeiDou's
+geostationary ones tens of metres; a satellite a hundred off is faulty."""
 ACCURACY_M = (0.0, 5.4665)
-"""DF389: 0 is not known, 63 worse than the second."""
+"""Accuracies of DF389: 0 is unknown, 63 worse than the second."""
 
 SIGNALS: dict[System, tuple[str, ...]] = {
     "G": (
@@ -87,7 +87,7 @@ class _Head(NamedTuple):
 
 
 class _UnreadableError(Exception):
-    """The message ends before what it says it has."""
+    """Error: a message shorter than it states."""
 
 
 _Found = list[tuple[int, CorrectionPart, int, tuple[float, ...], tuple[str, ...]]]
@@ -103,7 +103,7 @@ class SsrDecoder:
         self._counters = counters
 
     def decode(self, number: int, bits: Bits, t_seen_ns: int) -> list[Correction]:
-        """Result of a message by its `number`, one of `MESSAGES`, `GLONASS` or `OTHERS`."""
+        """Decode a message by its `number`, one of `MESSAGES`, `GLONASS` or `OTHERS`."""
         if number not in MESSAGES:
             name = "ssr_glonass_not_used" if number in GLONASS else "ssr_not_used"
             self._counters[name] += 1
@@ -255,7 +255,7 @@ def _layout(system: System, kind: int, bits: Bits, head: _Head) -> tuple[int, in
 
 
 def accuracy_m(index: int) -> float | None:
-    """One sigma by DF389; None where it is not known."""
+    """One sigma by DF389; None if unknown."""
     if not 0 < index < 63:
         return None if index == 0 else ACCURACY_M[1]
     return (math.pow(3.0, index >> 3) * (1.0 + 0.25 * (index & 7)) - 1.0) * 1e-3

@@ -1,4 +1,4 @@
-"""Subframes of one satellite gathered until they make an ephemeris: what every message shares.
+"""Collection of one satellite's subframes into an ephemeris: the common part of every message.
 
 A decoder of a message takes one verified block (a subframe, page or word) at a time and returns
 what it completes. What it refuses it names by raising `RefusedError`.
@@ -120,8 +120,8 @@ def check_orbit(found: Ephemeris) -> None:
 
 
 def week_of_toe(week: int, tow_s: float, toe_s: float) -> int:
-    """The week of `toe_s` when `week` and `tow_s` are those of the transmission: toe is never
-    half a week away."""
+    """Week of `toe_s`, given `week` and `tow_s` of the transmission: toe is never half a week
+    away."""
     if toe_s - tow_s > HALF_WEEK_S:
         return week - 1
     if toe_s - tow_s < -HALF_WEEK_S:

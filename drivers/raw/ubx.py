@@ -24,10 +24,11 @@ RAWX = b"\x02\x15"
 SFRBX = b"\x02\x13"
 
 PSEUDORANGE_M = (1.5e7, 5.0e7)
-"""A GPS satellite overhead is 20,200 km away, an IGSO one at the horizon 42,000 km; the rest is
-room for a receiver clock of 17 ms."""
+"""Range of pseudoranges: a GPS satellite overhead is 20,200 km away, an IGSO one at the horizon
+42,000 km; the rest is a margin for a receiver clock of 17 ms."""
 MAX_RATE_M_S = 10_000.0
-"""A satellite moves at 3.9 km/s at most, a vehicle below 1 km/s, and a clock 10 ppm off adds 3."""
+"""Largest range rate: a satellite moves at 3.9 km/s at most, a vehicle below 1 km/s, and a clock 10
+ppm off adds 3."""
 MAX_PRN: dict[System, int] = {"G": 32, "E": 36, "C": 63}
 SYSTEM_BY_ID: dict[int, System] = {0: "G", 2: "E", 3: "C"}
 OTHER_SYSTEMS = {1: "sbas", 5: "qzss", 6: "glonass", 7: "navic"}
@@ -81,7 +82,7 @@ _BY_SIGNAL = {
 
 @dataclass(frozen=True, slots=True)
 class Rawx:
-    """An epoch as the receiver states it. `leap_seconds` is None while it does not know them."""
+    """Epoch as stated by the receiver. `leap_seconds` is None while unknown."""
 
     tow_s: float
     week: int

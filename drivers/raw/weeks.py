@@ -58,12 +58,12 @@ def utc_ns(week: int, tow_s: float, leap_seconds: int) -> int:
 
 
 def utc_as_reported(week: int, tow_s: float, leap: int | None) -> int:
-    """The same by the leap seconds that the receiver told; by the table where it told none."""
+    """UTC by the receiver's leap seconds, or by the table without them."""
     return utc_ns(week, tow_s, leap_seconds(week, tow_s) if leap is None else leap)
 
 
 class WeekReference:
-    """The newest full instant of GPS time, and what it makes of shortened weeks.
+    """Newest full instant of GPS time, as a reference for shortened weeks.
 
     `earliest`: without a reference a 10-bit week is the first that is not before this date.
     """
@@ -74,16 +74,16 @@ class WeekReference:
         self._assumed = False
 
     def note(self, week: int, tow_s: float) -> None:
-        """The stream said this GPS time in full."""
+        """Note a full GPS time of the stream."""
         self._gps_s = week * WEEK_S + tow_s
         self._assumed = False
 
     def note_tow(self, week: int, tow_s: float) -> None:
-        """An instant whose week is from `week_of_tow`: as good as the reference was."""
+        """Note an instant whose week comes from `week_of_tow`, as good as the reference."""
         self._gps_s = week * WEEK_S + tow_s
 
     def note_utc(self, t_utc_ns: int, leap_s: int | None = None) -> None:
-        """Somebody who is to be believed said UTC."""
+        """Note UTC from a trusted source."""
         utc_s = t_utc_ns * 1e-9 - GPS_EPOCH_S
         self.note(0, utc_s + (leap_seconds(0, utc_s) if leap_s is None else leap_s))
 
@@ -96,7 +96,7 @@ class WeekReference:
         return self._nearest(count, 1024, self._gps_s)
 
     def bdt_week(self, count: int, tow_s: float) -> int:
-        """The BeiDou week of D1's and D2's 13 bits, transmitted at about `tow_s` of BDT."""
+        """BeiDou week of D1's and D2's 13 bits, transmitted at about `tow_s` of BDT."""
         return self._wide(count, 8192, BDT_WEEK, tow_s)
 
     def galileo_week(self, count: int, tow_s: float) -> int:
@@ -104,13 +104,13 @@ class WeekReference:
         return self._wide(count, 4096, GALILEO_WEEK, tow_s) + GALILEO_WEEK
 
     def week_of_tow(self, tow_s: float) -> int | None:
-        """The GPS week in which `tow_s` is nearest to the reference; None without one."""
+        """GPS week in which `tow_s` is nearest to the reference; None without one."""
         if self._gps_s is None:
             return None
         return round((self._gps_s - tow_s) / WEEK_S)
 
     def _wide(self, count: int, modulus: int, offset: int, tow_s: float) -> int:
-        """A week count so long that it is itself the reference where there is no better one."""
+        """Week of a long count, which serves as the reference without a better one."""
         if self._gps_s is None or self._assumed:
             self.note(count + offset, tow_s)
             return count

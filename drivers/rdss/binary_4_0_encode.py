@@ -35,7 +35,7 @@ from drivers.rdss.messages import (
 )
 
 HEADER = 7
-"""Bytes that tell the length: name 5, length 2."""
+"""Bytes up to the length: name 5, length 2."""
 OVERHEAD = 11
 """Bytes around the payload: name 5, length 2, address 3, XOR 1."""
 MAX_LENGTH = 240

@@ -21,38 +21,38 @@ PROBE_NS = 3 * SECOND
 FEEDBACK_NS = 3 * SECOND
 FIX_EXPECTED_NS = 5 * SECOND
 GIVE_UP_NS = 10 * SECOND
-"""After the request was written; all three PROTOCOLS 1.5."""
+"""Timeouts after the request was written; all three PROTOCOLS 1.5."""
 LEAST_MARGIN_NS = SECOND // 10
-"""Over the service frequency, whose clock is the terminal's: a late wake-up of either side (our
-choice). It doubles with each refusal for the spacing."""
+"""Least margin over the service interval, which the terminal's clock counts: a delayed wake-up of
+either side (our choice). It doubles with each refusal for the spacing."""
 MOST_MARGIN_NS = SECOND
 """The margin of PROTOCOLS 1.5."""
 WAIT_MARGIN_NS = SECOND
 """Over a wait that is stated in whole seconds (PROTOCOLS 1.5)."""
 BITS_A_BYTE = 10
-"""On the wire: start, eight, stop."""
+"""Bits of a byte on the wire: start, eight, stop."""
 BEAM_POLL_NS = 5 * SECOND
 USABLE_LEVEL = 2
 """Least beam level that carries a transmission (PROTOCOLS 1.2, ZJXX)."""
 HOLD_NS = 60 * SECOND
 """Low battery (PROTOCOLS 1.5); also after an alarm that a retry did not clear (our choice)."""
 DEFAULT_SERVICE_S = 60
-"""For a card that states 0: the spacing most often seen in the field."""
+"""Service interval for a card that states 0: the most common one in the field."""
 POLL_NS = 10 * SECOND
-"""Pace of the harmless reads between requests, so that a dead terminal is noticed (our choice)."""
+"""Interval of reads between requests, which reveal a dead terminal (our choice)."""
 POLL_REPLY_NS = SECOND
-"""A request waits this long behind a read, so that replies do not interleave (our choice)."""
+"""Wait of a request behind a read, so that replies do not interleave (our choice)."""
 BEAMS_STALE_NS = 30 * SECOND
-"""Beam levels older than this are read again before a request (our choice)."""
+"""Age of beam levels from which they are read again before a request (our choice)."""
 BEAM_ATTEMPTS = 3
-"""Beam reads without an answer before the terminal is taken not to support them."""
+"""Unanswered beam reads after which the terminal is assumed not to support them."""
 HINT_SD_M = 10.0
-"""A height better than this is given to the centre, if it is not known what the centre has itself:
-a 10 m horizontal result needs it (1.5)."""
+"""Largest height sigma that is given to the centre, if the centre's own is unknown: a 10 m
+horizontal result needs it (1.5)."""
 HINT_AGE_NS = 5 * SECOND
-"""A 10 % grade at 72 km/h changes the height by 10 m in this time."""
+"""Longest age of a height: a 10 % grade at 72 km/h changes it by 10 m."""
 TIMEOUTS_ALARM = 3
-"""Requests in a row without a fix that an operator should know of (our choice)."""
+"""Requests in a row without a fix from which an event is reported (our choice)."""
 
 
 class State(StrEnum):
@@ -79,7 +79,7 @@ SendKind = Literal["read", "request"]
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """Write these bytes now; a `request` makes the terminal transmit, a `read` does not."""
+    """Action: write bytes; a `request` makes the terminal transmit, a `read` does not."""
 
     data: bytes
     kind: SendKind
@@ -170,7 +170,7 @@ REFUSALS = {
         "no_permission", State.READY, "the card has no permission to ask for positions", retries=0
     ),
 }
-"""Only for a request of ours in flight. The outcomes below count whenever they come."""
+"""Refusals of a request of ours in flight. The outcomes below count at any time."""
 ALWAYS = frozenset(
     {
         Outcome.LOW_BATTERY,

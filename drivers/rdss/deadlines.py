@@ -1,4 +1,4 @@
-"""Action of each state of an RDSS terminal at its deadline: reads, requests, messages.
+"""Actions of an RDSS terminal's states at their deadlines: reads, requests, messages.
 
 The states are those of `drivers.rdss.terminal`, and all that is sent is sent here.
 """
@@ -49,11 +49,11 @@ _POLLS: tuple[Callable[[int], Request], ...] = (
     BeamPowerRequest,
 )
 _BLOCKED_POLLS: tuple[Callable[[int], Request], ...] = (SelfTestRequest, BeamPowerRequest)
-"""While nothing may be transmitted: the self test may tell when that ends."""
+"""Reads during a transmission ban: the self test may show its end."""
 
 
 class Deadlines:
-    """Of one terminal. Its counters are those of `Terminal`."""
+    """Deadlines of one terminal. Its counters are those of `Terminal`."""
 
     def __init__(
         self,
@@ -65,13 +65,13 @@ class Deadlines:
         self.counters = counters
         self.height = height
         self.quiet_until_ns = 0
-        """A poll waits for its answer until then."""
+        """Deadline of a poll's reply."""
         self._options = options
         self._session = session
         self._polls = 0
 
     def due(self, t_ns: int, actions: list[Action]) -> None:
-        """Do what the state does now."""
+        """Execute the state's action."""
         _DUE[self._session.state](self, t_ns, actions)
 
     def _read(self, kind: Callable[[int], Request], actions: list[Action]) -> None:

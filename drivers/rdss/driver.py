@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 ZONES_H = (0, 8)
 """T is UTC or Beijing time, by vendor; whoever holds the clock finds out which."""
 FRAME_SLACK_NS = SECOND // 2
-"""A frame that has begun is overdue after its own length on the wire and this (PROTOCOLS 1.2)."""
+"""Time beyond a frame's own length on the wire after which it is overdue (PROTOCOLS 1.2)."""
 NAMES_LOGGED = 32
 STATUS_S = 1.0
 """The status counts down in whole seconds."""
@@ -67,29 +67,30 @@ class RdssOptions(DriverOptions):
     height_m: (
         Annotated[float, Field(gt=-MAX_ORDINARY_HEIGHT_M, lt=MAX_ORDINARY_HEIGHT_M)] | None
     ) = None
-    """Ellipsoidal height of the antenna where it is known and constant (a ship)."""
+    """Ellipsoidal height of the antenna, if known and constant (a ship)."""
     use_solution_height: bool = True
-    """Give the navigation solution's height to the centre while it knows it better than the centre
-    does: its sigma is below the `height_sd_m` of the source's `aiding`."""
+    """Send the navigation solution's height to the centre while it is better than the centre's: its
+    sigma is below the `height_sd_m` of the source's `aiding`."""
     use_barometer: bool = False
-    """Without a height to give, give the pressure of the vehicle's own barometer."""
+    """Send the pressure of the vehicle's barometer when no height is available."""
     pressure_unit: Literal["Pa", "0.1 Pa"] = "Pa"
-    """Of the pressure in a request: public sources disagree."""
+    """Unit of the pressure in a request: public sources disagree."""
     request_interval_s: PositiveFloat | None = None
     """Wanted spacing of requests; the card's service frequency is never undercut."""
     suppression_hold_s: Annotated[float, Field(ge=60.0)] = 600.0
-    """After a suppression that nobody lifts, try again after this."""
+    """Time after an unlifted suppression until the next attempt."""
     transmit: bool = True
-    """False: the terminal is read, and never asked for a fix, with which it would transmit."""
+    """False: the terminal is only read and never asked for a fix, which makes it transmit."""
     message_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """Share of the card's transmissions for messages while fixes wait, too."""
     message_expiry_s: PositiveFloat = 3600.0
-    """A message that could not be sent or confirmed for so long is given up."""
+    """Time after which an unsent or unconfirmed message is given up."""
     message_carriage: Carriage = "binary"
     """Encoding of reports, receipts and texts that ask for one: `binary`, `ascii` where only
     printable characters pass, `bcd` where only digits do."""
     timeout_s: Annotated[float, Field(ge=20.0)] = 30.0
-    """Nothing intelligible for this long: look again who is there. Reads go out every 10 s."""
+    """Time without intelligible input after which the terminal is searched again. Reads go out
+    every 10 s."""
 
 
 def _utc_ns(clock: DeviceClock) -> int:
@@ -165,8 +166,8 @@ class RdssDriver:
     def height_hint(
         self, height_m: float, sd_m: float, t_ns: int, centre_sd_m: float | None = None
     ) -> None:
-        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma;
-        `centre_sd_m` is that of the height that the centre takes by itself, if known."""
+        """Set the ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one
+        sigma; `centre_sd_m` is that of the centre's own height, if known."""
         self._terminal.height.hint(height_m, sd_m, t_ns, centre_sd_m)
 
     def pressure_hint(self, pressure_pa: float, t_ns: int) -> None:
@@ -182,7 +183,7 @@ class RdssDriver:
     # ------------------------------------------------------------------ short messages
 
     def post_text(self, key: str, receiver: int, text: str, receipt: bool, t_ns: int) -> None:
-        """Queue a text for a card under the sender's own name for it.
+        """Queue a text for a card under the sender's key.
 
         Raises `MessageRefusedError`.
         """
@@ -196,17 +197,17 @@ class RdssDriver:
 
     @property
     def outbox(self) -> Outbox:
-        """The messages that wait, for whoever keeps them."""
+        """Waiting messages, for storage."""
         return self._terminal.outbox
 
     @property
     def inbox(self) -> Inbox:
-        """Inbox of messages that came, for whoever keeps it."""
+        """Inbox of received messages, for storage."""
         return self._terminal.inbox
 
     @property
     def card(self) -> int | None:
-        """The card's number, once it is known."""
+        """Number of the card, once known."""
         identity = self._terminal.identity
         return None if identity is None else identity.user or None
 
@@ -266,7 +267,7 @@ class RdssDriver:
         self._wake.set()
 
     async def _keep_time(self) -> None:
-        """Call the state machine when it is due, and give up frames whose rest does not come."""
+        """Call the state machine when due, and give up overdue frames."""
         while True:
             self._wake.clear()
             self.inputs.take("due")
@@ -289,7 +290,7 @@ class RdssDriver:
         self._say_status()
 
     def _say_status(self) -> None:
-        """`silent` once every baud rate has been probed in vain, or nobody answers any more."""
+        """Set `silent` once every baud rate has been probed in vain, or replies have ended."""
         state: State = "starting"
         absent = self._line.detail or self._why_closed
         if not self._open:
@@ -330,7 +331,7 @@ class RdssDriver:
                 self._settle_family()
 
     def _settle_family(self) -> None:
-        """Once the terminal has said who it is, only its family is listened to."""
+        """Restrict decoding to the terminal's family, once identified."""
         family = self._terminal.family
         if len(self._decoders) > 1 and family is not None:
             decoder = self._decoders[family]

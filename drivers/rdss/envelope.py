@@ -1,5 +1,4 @@
-"""Envelope of short messages between vehicles with fusiond: an envelope with kind, version and
-check.
+"""Envelope of short messages between vehicles with fusiond: kind, version and check.
 
     0    1  0xF8 + kind
     1    n  body
@@ -42,19 +41,19 @@ Carriage = Literal["binary", "ascii", "bcd"]
 
 
 class CutError(FieldError):
-    """An envelope that is shorter or longer than it says."""
+    """Error: an envelope shorter or longer than it states."""
 
 
 class DamagedError(FieldError):
-    """An envelope whose check or content cannot be."""
+    """Error: an envelope with a wrong check or contents."""
 
 
 class VersionError(FieldError):
-    """An envelope of a version or a kind that is not known here."""
+    """Error: an envelope of an unknown version or kind."""
 
 
 class Envelope(NamedTuple):
-    """`crc` is that of the envelope, by which its receipt names it."""
+    """Envelope; its `crc` identifies it in receipts."""
 
     kind: int
     body: bytes
@@ -104,7 +103,7 @@ def read_receipt(body: bytes) -> Receipted:
 
 
 def carried(envelope: bytes, carriage: Carriage) -> Wording:
-    """An envelope as a terminal carries it."""
+    """Encode an envelope as a terminal's text."""
     match carriage:
         case "binary":
             return mixed(envelope)
@@ -115,7 +114,7 @@ def carried(envelope: bytes, carriage: Carriage) -> Wording:
 
 
 def opened(wording: Wording) -> Envelope | None:
-    """The envelope that a message holds, None where it is somebody else's kind of message.
+    """Envelope in a message, None for other messages.
 
     CutError, DamagedError, VersionError for one that is ours by its mark and cannot be read.
     """

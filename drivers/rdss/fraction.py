@@ -1,4 +1,4 @@
-"""The last byte of T in a 4.0 position reply: tenths or hundredths of a second, by vendor."""
+"""Last byte of the time T in a 4.0 position reply: tenths or hundredths of a second, by vendor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FractionReader:
         return self._unit
 
     def read(self, value: int) -> tuple[float, float]:
-        """The fraction of a second and the bound of its error, both in s."""
+        """Fraction of a second and the bound of its error, both in s."""
         if value > 99 or (self._unit == "0.1" and value > 9):
             return 0.5, 0.5  # neither unit allows it: the whole second is all that is known
         if self._unit == "0.1":

@@ -111,4 +111,4 @@ class FrameDecoder(ABC):
 
     @abstractmethod
     def _read(self, whole: bytes) -> Message | None:
-        """The message of a frame as long as it claims; None, and counted, if it is damaged."""
+        """Message of a complete frame; None, and counted, if damaged."""

@@ -9,14 +9,14 @@ from drivers.standard_atmosphere import LAPSE_K_M, T0_K, pressure_height_m
 
 ZERO_CELSIUS_K = 273.15
 PRESSURE_PA = (22_632.0, 104_857.0)
-"""From the tropopause, where the standard atmosphere's formula ends, to what 20 bits of 0.1 Pa
-hold; 4 % above the highest mean pressure at any shore."""
+"""Plausible pressures: from the tropopause, where the standard atmosphere's formula ends, to the
+limit of 20 bits of 0.1 Pa; 4 % above the highest mean pressure at any shore."""
 
 
 class HeightSource:
-    """The solution's height while it is fresh and better than the centre's, else the configured
-    one, else the pressure of the vehicle's barometer, else none: the centre then uses its terrain
-    model and the antenna's height above the ground.
+    """Height for a request: the solution's while fresh and better than the centre's, else the
+    configured one, else the pressure of the vehicle's barometer, else none: the centre then uses
+    its terrain model and the antenna's height above the ground.
 
     `given_sd_m` is the sigma of the height of the last request, None where it is not known.
     """
@@ -30,8 +30,8 @@ class HeightSource:
     def hint(
         self, height_m: float, sd_m: float, t_ns: int, centre_sd_m: float | None = None
     ) -> None:
-        """Ellipsoidal height of the antenna and its sigma, as of `t_ns`; `centre_sd_m` is the sigma
-        of the height that the centre takes by itself."""
+        """Set the ellipsoidal height of the antenna and its sigma, as of `t_ns`; `centre_sd_m` is
+        the sigma of the centre's own height."""
         limit_m = HINT_SD_M if centre_sd_m is None else centre_sd_m
         self._hint = (height_m, sd_m, t_ns) if sd_m < limit_m else None
 

@@ -30,15 +30,15 @@ Seen = tuple[int, int, int]
 
 
 class Inbox:
-    """Hands on all that comes, whatever is wrong with it. `seen` are the texts that asked for a
-    receipt, by which one that comes again is known."""
+    """Inbox; it passes on all messages, damaged ones too. `seen` are the texts that requested a
+    receipt, to recognise repetitions."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self.seen: OrderedDict[Seen, None] = OrderedDict()
 
     def mail_of(self, message: Text, t_ns: int) -> MailReady:
-        """Mail that a message becomes which the terminal has handed over."""
+        """Mail from a message of the terminal."""
         session = self._session
         session.counters["messages_received"] += 1
         wording = Wording(message.payload, message.encoding, message.odd)
@@ -129,7 +129,7 @@ class Inbox:
 
 
 def _opened(wording: Wording) -> tuple[Envelope | None, Fault]:
-    """The envelope, or what is wrong with it."""
+    """Envelope, or the name of its fault."""
     try:
         return opened(wording), ""
     except CutError:

@@ -1,4 +1,4 @@
-"""Mail of an RDSS driver: those that came, and how those sent fare.
+"""Short messages of an RDSS driver: those received, and the state of those sent.
 
 It stands by itself: a daemon without a terminal loads no more than this.
 """
@@ -11,7 +11,8 @@ from drivers.immutable import immutable
 from drivers.rdss.report import PositionReport
 
 TextEncoding = Literal["chinese", "code", "mixed"]
-"""Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes."""
+"""Encodings: Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes.
+"""
 Kind = Literal["text", "report", "receipt"]
 Stage = Literal[
     "queued",
@@ -26,8 +27,8 @@ Stage = Literal[
     "no_permission",
     "unsayable",
 ]
-"""`queued`: waits for its turn, or for another attempt. `sent`: the terminal has taken it and a
-receipt is awaited, or none was asked for, and that is its end.
+"""Stages. `queued`: waits for its turn or another attempt. `sent`: accepted by the terminal; a
+receipt is expected, or none was requested, which is its end.
 
 Ends: `delivered` (its receipt came), `unconfirmed` (written as often or as long as it may be, and
 nobody said that it left or arrived), `failed` (refused as often), `expired` (it never left),
@@ -71,7 +72,7 @@ class MessageReceived:
 
 @immutable()
 class MessageStage:
-    """Stage of one of our messages: `key` is its sender's name for it, `why` in words."""
+    """Stage of a sent message: `key` is the sender's name for it, `why` the reason as text."""
 
     source: str
     t_seen_ns: int
@@ -87,13 +88,13 @@ class MessageStage:
 
     @property
     def over(self) -> bool:
-        """True if this is its end."""
+        """True for a final stage."""
         return self.stage in ENDS or (self.stage == "sent" and not self.wants_receipt)
 
 
 @immutable()
 class FleetFix:
-    """The place of another card, which the centre tells: a queried one's, or a reported one.
+    """Position of another card by the centre, queried or reported.
 
     Degrees, metres; `time_of_day_s` in the terminal's zone, without a date.
     """

@@ -1,4 +1,4 @@
-"""Messages between RDSS terminal and host, whichever wire family they use.
+"""Messages between RDSS terminal and host, for both wire families.
 
 Both codecs (`binary_4_0`, `text_2_1`) decode to these classes and encode from them, in both
 directions. `user` is the card number in the frame's address field, 0 where the frame has none or
@@ -22,11 +22,11 @@ FORBIDDEN = frozenset({"JJZH", "ZHSQ", "JMSZ", "CCJMS"})
 
 
 class EncodeError(ValueError):
-    """This message cannot be said in this family, or must never be sent."""
+    """Error: a message that this family cannot encode, or that must never be sent."""
 
 
 class FieldError(ValueError):
-    """A frame with a good checksum holds a value that cannot be true."""
+    """Error: an implausible value in a verified frame."""
 
 
 # --------------------------------------------------------------------------- host to terminal
@@ -152,7 +152,8 @@ class Identity:
     user_class: int = 0
     comm_level: int = 0
     encryption: int = 0
-    """As sent (4.0) or 1 for E, 0 for N (2.1); public sources invert it: for logs only."""
+    """Encryption as sent (4.0) or 1 for E, 0 for N (2.1); public sources invert it: for logs only.
+    """
     subordinates: int = 0
     serial: int = 0
 
@@ -314,7 +315,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """A well-formed frame that this project does not read: name and payload or field text."""
+    """Well-formed frame of an unsupported kind: name and payload or field text."""
 
     name: str
     payload: bytes
@@ -344,13 +345,13 @@ class Decoder(Protocol):
 
     @property
     def awaited_bytes(self) -> int:
-        """Greatest length of the frame that has begun and is not complete, 0 for none."""
+        """Largest length of the incomplete frame, 0 for none."""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take what arrived; the messages that are complete."""
+        """Feed received bytes; the complete messages."""
 
     def expire(self) -> list[Message]:
-        """Give up the frame that has begun (its rest is overdue) and look behind its `$`."""
+        """Give up the overdue frame and search behind its `$`."""
 
 
 def ascii_name(raw: bytes) -> str:
@@ -372,7 +373,7 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 
 def check_date(year: int, month: int, day: int) -> None:
-    """FieldError unless the day exists and lies in the years that BeiDou receivers print."""
+    """Check that a day exists and is plausible for BeiDou receivers. Raises FieldError."""
     check_range("year", year, 1980, 2399)
     try:
         date(year, month, day)

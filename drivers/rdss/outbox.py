@@ -37,13 +37,13 @@ from drivers.rdss.wording import Wording, level_bits, worded
 MOST_WAITING = 32
 """Half an hour of a card of 60 s; who queues more gets a refusal (our choice)."""
 MOST_ATTEMPTS = 5
-"""Of ten messages, each lost with its receipt in three of ten, one in fifty is then told as
-unconfirmed: 1 - 0.7^2 is 0.51, to the fifth 0.03 (our choice)."""
+"""Attempts of a message: of ten, each lost with its receipt in three of ten, one in fifty is then
+reported as unconfirmed: 1 - 0.7^2 is 0.51, to the fifth 0.03 (our choice)."""
 MOST_REFUSALS = 3
-"""In a row, without a reason that passes by itself: public code asks three times (1.5)."""
+"""Refusals in a row without a transient reason: public code asks three times (1.5)."""
 RECEIPT_SPACINGS = 6
-"""Turns of a card like ours in which a receipt may come: every other turn is the other's fixes',
-and two messages may go before it (our choice)."""
+"""Turns of a similar card within which a receipt may come: every other turn is for its fixes, and
+two messages may precede it (our choice)."""
 RANKS: dict[Kind, int] = {"receipt": 0, "text": 1, "report": 2}
 BLOCKED = frozenset(
     {
@@ -56,7 +56,7 @@ BLOCKED = frozenset(
 
 @dataclass(slots=True)
 class Outgoing:
-    """One message. `wordings` in order of preference: the first that the card allows is sent.
+    """Outgoing message. `wordings` in order of preference: the first that the card allows is sent.
 
     `receipted` is what its receipt will name, None where it asks for none. Instants are monotonic
     ns; `stage` is `queued`, or `sent` while the receipt is awaited.
@@ -95,7 +95,7 @@ class Outbox:
     changes: list[Change] = field(default_factory=list)
     number: int = 0
     carriage: Carriage = "binary"
-    """Of texts that ask for a receipt, and of receipts."""
+    """Encoding of texts with a receipt, and of receipts."""
     comm_level: int | None = None
     spacing_ns: int = 0
     in_flight: Outgoing | None = None
@@ -147,7 +147,7 @@ class Outbox:
         self._queue(Outgoing(key, receiver, "receipt", (wording,), t_ns))
 
     def restore(self, messages: Sequence[Outgoing], number: int) -> None:
-        """Go on with what a run before left: what was in flight may go twice."""
+        """Restore the last run's messages; one in flight may be sent twice."""
         self.waiting = list(messages)
         self.number = number
         for message in self.waiting:
@@ -162,7 +162,7 @@ class Outbox:
         return carried(envelope, self.carriage), Receipted(number, crc_of(envelope))
 
     def _look_at(self, wording: Wording) -> None:
-        """Refuse what the card, once it is known, will never send."""
+        """Refuse a message that the known card can never send."""
         if self.comm_level is None:
             return
         most = level_bits(self.comm_level)
@@ -181,7 +181,7 @@ class Outbox:
     # ------------------------------------------------------------------ sending
 
     def next(self, t_ns: int) -> Outgoing | None:
-        """The message whose turn it is."""
+        """Next message in turn."""
         due = [m for m in self.waiting if m.stage == "queued" and m.not_before_ns <= t_ns]
         return min(due, key=lambda m: (RANKS[m.kind], m.attempts > 0, m.created_ns), default=None)
 
@@ -191,7 +191,7 @@ class Outbox:
         return min((min(m.not_before_ns, self._end_ns(m)) for m in self.waiting), default=None)
 
     def wording(self, message: Outgoing) -> Wording | None:
-        """Wording for this card; None, and its end, if it cannot be."""
+        """Wording for this card; None ends the message."""
         most = level_bits(self.comm_level or 0)
         for wording in message.wordings:
             if wording.bits <= most:
@@ -203,17 +203,17 @@ class Outbox:
         return None
 
     def unsayable(self, message: Outgoing, why: str) -> None:
-        """The terminal's family has no words for it."""
+        """Refuse a message that the terminal's family cannot encode."""
         self._end(message, "unsayable", why)
 
     def written(self, message: Outgoing) -> None:
-        """It is in the terminal's hands."""
+        """Note that the message was written to the terminal."""
         self.in_flight, self.doubtful = message, None
         message.attempts += 1
         self.counters["messages_written"] += 1
 
     def accepted(self, t_ns: int) -> None:
-        """The terminal says that it has sent what is in flight, or what it was silent about."""
+        """Note the terminal's acceptance of the message in flight, or of one it did not confirm."""
         message = self.in_flight or self.doubtful
         self.in_flight = self.doubtful = None
         if message is None or message not in self.waiting:
@@ -229,7 +229,7 @@ class Outbox:
         self._report(message, "sent", "awaiting its receipt")
 
     def refused(self, outcome: Outcome, t_ns: int) -> None:
-        """The terminal refuses what is in flight."""
+        """Note the terminal's refusal of the message in flight."""
         message, self.in_flight = self.in_flight, None
         if message is None:
             return
@@ -246,7 +246,7 @@ class Outbox:
         self._report(message, "queued", f"refused: {outcome}")
 
     def unanswered(self) -> None:
-        """No feedback came for what is in flight: it may have left, and goes again."""
+        """Requeue the message in flight after a missing feedback; it may have been sent."""
         message, self.in_flight = self.in_flight, None
         if message is None:
             return
@@ -258,7 +258,7 @@ class Outbox:
             self._report(message, "queued", "no feedback: it may have left")
 
     def receipt(self, sender: int, receipted: Receipted) -> None:
-        """A receipt has come from this card."""
+        """Note a receipt from this card."""
         for message in self.waiting:
             if message.receiver == sender and message.receipted == receipted:
                 self._end(message, "delivered", "")
@@ -266,7 +266,7 @@ class Outbox:
         self.counters["receipt_unmatched"] += 1
 
     def settle(self, t_ns: int) -> None:
-        """End what has expired, and queue again what has no receipt."""
+        """End expired messages, and requeue those without a receipt."""
         for message in [m for m in self.waiting if m is not self.in_flight]:
             if t_ns >= self._end_ns(message):
                 # Written before: it may have left, or arrived.
@@ -300,7 +300,7 @@ class Outbox:
         self.changes.append(Change(message, stage, why))
 
     def take_changes(self) -> Iterator[Change]:
-        """Those since the last call."""
+        """Changes since the last call."""
         changes, self.changes = self.changes, []
         return iter(changes)
 

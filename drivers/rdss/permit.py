@@ -34,11 +34,11 @@ class TransmitPermit:
         return not self.silent and self.suppressed_until_ns is None
 
     def grant(self) -> None:
-        """Lifted by whoever may, the hold is over, or another card is in the terminal."""
+        """Lift the suppression: by its authority, after the hold time, or for another card."""
         self.silent, self.suppressed_until_ns = False, None
 
     def suppress(self, t_ns: int) -> bool:
-        """The terminal says that it is suppressed; True if that is news."""
+        """Note a suppression by the terminal; True if new."""
         news = self.suppressed_until_ns is None
         self.suppressed_until_ns = t_ns + self._hold_ns
         self._inbound_changed = False
@@ -56,7 +56,7 @@ class TransmitPermit:
         self._inbound_free = self._inbound
 
     def lifted_by_feedback(self, feedback: Feedback, t_ns: int, written_ns: int | None) -> bool:
-        """Does this feedback say that transmission is allowed again?
+        """True if this feedback shows that transmission is allowed again.
 
         Flag 8 while suppressed is read as "lifted" (one vendor); if it means radio silence, the
         terminal refuses the next request with it and we fall silent. The feedback of a request
@@ -106,7 +106,7 @@ class Pace:
 
     @property
     def spacing_ns(self) -> int:
-        """From one transmission to the next, at the least."""
+        """Least interval of transmissions."""
         return (self.service_s or DEFAULT_SERVICE_S) * SECOND + self.margin_ns + self._wire_ns
 
     @property
@@ -124,18 +124,18 @@ class Pace:
         return max(self.free_ns, self.requested_ns + self._interval_ns)
 
     def written(self, t_ns: int, size: int, baud: int, *, fix: bool) -> None:
-        """A transmission of so many bytes was written."""
+        """Note that a transmission of so many bytes was written."""
         self.written_ns = t_ns
         self._wire_ns = size * BITS_A_BYTE * SECOND // baud
         if fix:
             self.requested_ns, self.asap = t_ns, False
 
     def not_before(self, t_ns: int) -> None:
-        """Nothing before this instant."""
+        """Forbid transmission before this instant."""
         self._not_before_ns = max(self._not_before_ns, t_ns)
 
     def too_early(self, t_ns: int, stated_s: float | None) -> None:
-        """The terminal refuses a transmission for its spacing: wait, and keep a greater margin.
+        """Wait and increase the margin after a refusal for the spacing.
 
         Not where seconds are left to wait: then somebody else has used the card.
         """
@@ -144,8 +144,8 @@ class Pace:
         self.wait(t_ns, stated_s)
 
     def wait(self, t_ns: int, stated_s: float | None) -> None:
-        """Not before the stated wait, of whole seconds, and one second. No wait, or one above twice
-        the service frequency, which nobody can mean, is the service frequency (PROTOCOLS 1.2)."""
+        """Wait the stated whole seconds and one more. An absent or implausible wait, above twice
+        the service interval, is the service interval (PROTOCOLS 1.2)."""
         service = self.service_s or DEFAULT_SERVICE_S
         wait_s = stated_s if stated_s is not None and stated_s <= 2 * service else service
         self.not_before(t_ns + int(wait_s * SECOND) + WAIT_MARGIN_NS)

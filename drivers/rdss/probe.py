@@ -15,7 +15,7 @@ ENCODE: dict[Family, Callable[[Message], bytes]] = {
 
 
 class Probe:
-    """One rate after the other, the card asked for in every family: harmless reads only.
+    """Probe of baud rates, each with a request for the card in every family: harmless reads only.
 
     `in_vain` after a whole round without an answer; it goes on all the same.
     """
@@ -40,7 +40,7 @@ class Probe:
         self._asked = 0
 
     def next(self) -> list[Action]:
-        """Ask at this rate, or at the next one if this has been asked at."""
+        """Request at this rate, or after a request at the next one."""
         actions: list[Action] = []
         if self._asked:
             self._at = (self._at + 1) % len(self._bauds)

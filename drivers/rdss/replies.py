@@ -1,4 +1,4 @@
-"""Replies: effect of a message on the request cycle.
+"""Effect of each message from the terminal on the request cycle.
 
 Refusals lead where the table `REFUSALS` says; suppression, silence, a low battery and a missing
 card count whenever they are told. A fix counts once, for the last request written.
@@ -185,7 +185,7 @@ class Replies:
             self._on_refusal(feedback, t_ns, actions)
 
     def _on_message(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> bool:
-        """True if a feedback is for a message of ours, and what it changes."""
+        """True if a feedback concerns a message of ours; applies its effect."""
         session = self._session
         awaited = session.state is State.AWAIT_MESSAGE
         outcome = feedback.outcome
@@ -231,7 +231,7 @@ class Replies:
             session.hold(t_ns, refusal.text)
 
     def _forget_refused(self) -> None:
-        """A request refused before it was accepted will have no fix."""
+        """Forget a request that was refused before acceptance, which will have no fix."""
         if self._session.state is State.AWAIT_FEEDBACK:
             self._session.answerable = False
 

@@ -26,7 +26,7 @@ import struct
 from typing import NamedTuple
 
 MODES = ("waiting", "aligning", "navigating", "coasting", "invalid")
-"""By number; those of `fusiond.navigation.solution.Mode`."""
+"""Modes by number, as in `fusiond.navigation.solution.Mode`."""
 REPORT, SHORT_REPORT = 1, 2
 FULL = struct.Struct(">IBii3sB3sHH")
 SHORT = struct.Struct(">3s3s3s")
@@ -39,8 +39,7 @@ FULL_SIGMAS, SHORT_SIGMAS = 255, 14
 
 
 class PositionReport(NamedTuple):
-    """Position report of a vehicle by its own solution; degrees, metres, one sigma. None: not
-    known.
+    """Position report of a vehicle by its own solution; degrees, metres, one sigma. None: unknown.
 
     `t_s` is POSIX; of a short report, which has no date, the second of its day (`dated` is False).
     `sd_ned_m` of a short report is one figure for north and east.
@@ -91,7 +90,7 @@ def encode_short(report: PositionReport) -> bytes:
 
 
 def decode_report(kind: int, body: bytes) -> PositionReport:
-    """The report of a body of this kind. ValueError for what no report says."""
+    """Report from a body of this kind. ValueError for an invalid one."""
     return _decode_full(body) if kind == REPORT else _decode_short(body)
 
 
@@ -151,7 +150,7 @@ def _clipped(steps: float, greatest: int) -> int:
 
 
 def _course(course_deg: float) -> int:
-    """That of 360 deg less half a step is north, and the last step says that none is known."""
+    """Encode a course: 360 deg less half a step is north, and the last step means unknown."""
     step = round(course_deg / 360.0 * 2**16) % 2**16
     return step if step != UNKNOWN_16 else 0
 

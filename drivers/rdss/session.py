@@ -1,4 +1,4 @@
-"""State of the terminal in the request cycle, and the moves between its states.
+"""State of the terminal in the request cycle, and its transitions.
 
 `replies` changes it by what the terminal says, `terminal` by what is due.
 """
@@ -23,7 +23,7 @@ from drivers.rdss.probe import Probe
 
 
 class Session:
-    """State, deadline of the state, and what was read. Instants are monotonic ns.
+    """State with its deadline and data. Instants are monotonic ns.
 
     `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
     asked for since; `beams_said` is all that was said of the beams last. `answerable`: the last
@@ -86,12 +86,12 @@ class Session:
         self.deadline_ns = deadline_ns
 
     def search(self, t_ns: int) -> None:
-        """Look who is there."""
+        """Start the search for a terminal."""
         self.probe.restart()
         self.enter(State.PROBING, t_ns)
 
     def proceed(self, t_ns: int) -> None:
-        """Card known, nothing in flight: on to the next request, or to why there is none."""
+        """Continue with the card known and nothing in flight: to the next request, or to a wait."""
         if self.permit.silent:
             self.enter(State.SILENT, t_ns)
         elif not self.permit.granted:
@@ -106,8 +106,8 @@ class Session:
         self.enter(State.HOLDING, t_ns)
 
     def abandon(self) -> None:
-        """Stop waiting for the request in flight, of which the next keeps clear of its late answer,
-        or for the feedback on a message."""
+        """Stop waiting for the request in flight, whose delayed reply the next one avoids, or for
+        the feedback on a message."""
         if self.state is State.AWAIT_MESSAGE:
             self.outbox.unanswered()
         if self.state in IN_FLIGHT and self.pace.requested_ns is not None:

@@ -102,7 +102,7 @@ class Terminal:
         return self._replies.take(message, t_ns, family)
 
     def tick(self, t_ns: int) -> list[Action]:
-        """Do what is due. Call at `next_deadline_ns` or at any other time."""
+        """Execute due actions. Call at `next_deadline_ns` or at any other time."""
         session = self._session
         self._t_ns = t_ns
         self.outbox.settle(t_ns)
@@ -158,7 +158,7 @@ class Terminal:
 
     @property
     def inbox(self) -> Inbox:
-        """Inbox of those that came."""
+        """Inbox of received messages."""
         return self._replies.inbox
 
     @property
@@ -189,7 +189,7 @@ class Terminal:
 
     @property
     def family(self) -> Family | None:
-        """Of the terminal that answered last."""
+        """Family of the terminal that last replied."""
         return self._session.family
 
     @property
@@ -204,7 +204,7 @@ class Terminal:
 
     @property
     def unanswered_round(self) -> bool:
-        """Every baud rate has been probed and nobody answered."""
+        """True if every baud rate was probed without a reply."""
         return self._session.state is State.PROBING and self._session.probe.in_vain
 
     @property

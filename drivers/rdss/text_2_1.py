@@ -245,7 +245,7 @@ def _clock(f: Fields) -> Message | None:
 
 
 def _self_test(f: Fields) -> Message | None:
-    """Only the form with 8 fields: the count differs from vendor to vendor."""
+    """Self test, in the form with 8 fields only; the count differs between vendors."""
     if len(f) != 8:
         return None
     remaining = f[7]
@@ -265,8 +265,8 @@ def _self_test(f: Fields) -> Message | None:
 
 
 def _text_payload(field: str, encoding: TextEncoding) -> tuple[bytes, bool]:
-    """Code and mixed text is printed as hex, of a code perhaps an odd number of digits; Chinese
-    text stands as it is."""
+    """Payload of a field: hexadecimal for code and mixed text, a code with possibly an odd number
+    of digits; Chinese text is plain."""
     if encoding == "chinese":
         return field.encode("latin-1"), False
     odd = encoding == "code" and len(field) % 2 == 1
@@ -322,7 +322,7 @@ class Decoder(FrameDecoder):
     BETWEEN = b"\r\n"
 
     def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
-        """A sentence ends with its first control character, that one included."""
+        """Length of a sentence, which ends with its first control character."""
         fault = _header_fault(bytes(buffer[at + 1 : at + _HEADER]))
         if fault:
             return 0, fault
@@ -348,7 +348,7 @@ class Decoder(FrameDecoder):
 
 
 def _header_fault(header: bytes) -> str:
-    """Name of what is wrong with the (perhaps not complete) name and comma behind `$`."""
+    """Fault of the possibly incomplete name and comma behind `$`."""
     if len(header) >= 5 and header[:4].isalpha() and header[:4].isupper() and header[4] == 0:
         return "other_family"
     name = header[:5]

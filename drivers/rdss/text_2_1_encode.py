@@ -73,7 +73,7 @@ def _print(value: float | None) -> str:
 
 
 def _print_time(time_of_day_s: float, decimals: int) -> str:
-    """hhmmss.ss, never rounded into a 60th second that is not there."""
+    """Format hhmmss.ss without rounding up to 60 seconds."""
     scale: int = 10**decimals
     whole, part = divmod(int(time_of_day_s * scale + 1e-6), scale)
     text = "{:02d}{:02d}{:02d}".format(*split_time(whole))

@@ -1,4 +1,4 @@
-"""Texts as a terminal carries them, and how much of a card's allowance each takes.
+"""Text encodings of short messages, and the share of a card's limit that a text takes.
 
     chinese   GB 2312, two bytes a character          7 bits a byte in the air
     code      decimal digits, two a byte              4 bits a digit
@@ -19,12 +19,12 @@ from drivers.rdss.mail import TextEncoding
 PLAIN_BITS = (110, 408, 628, 848)
 ENCRYPTED_BITS = (140, 360, 580, 1680)
 LEVEL_BITS = (0, *map(min, PLAIN_BITS, ENCRYPTED_BITS))
-"""By communication level: 0, 110, 360, 580, 848."""
+"""Bits by communication level: 0, 110, 360, 580, 848."""
 MIXED = b"\xa4"
 
 
 class Wording(NamedTuple):
-    """A payload as TXSQ and CCTXA take it; `odd` as in `TextRequest`."""
+    """Payload for TXSQ and CCTXA; `odd` as in `TextRequest`."""
 
     payload: bytes
     encoding: TextEncoding
@@ -39,7 +39,7 @@ class Wording(NamedTuple):
 
 
 def level_bits(comm_level: int) -> int:
-    """The most bits of one message of a card of this level."""
+    """Most bits of one message of a card of this level."""
     return LEVEL_BITS[min(comm_level, len(LEVEL_BITS) - 1)]
 
 
@@ -80,6 +80,6 @@ def plain_text(wording: Wording) -> str | None:
 
 
 def _printable(text: str) -> str | None:
-    """Without line ends and tabs; None where other control characters say that it is no text."""
+    """Text without line ends and tabs; None with other control characters, which no text has."""
     flat = text.replace("\r", " ").replace("\n", " ").replace("\t", " ")
     return flat if flat.isprintable() else None

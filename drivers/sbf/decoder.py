@@ -27,7 +27,7 @@ from drivers.solution_decoder import SolutionDecoder
 PVT, POSITION_COVARIANCE, VELOCITY_COVARIANCE, DOP = 4007, 5906, 5908, 4001
 ATTITUDE, ATTITUDE_COVARIANCE, TIME, END_OF_PVT = 5938, 5939, 5914, 5921
 QUALITY = {1: 1, 2: 2, 4: 4, 5: 5, 6: 2, 7: 4, 8: 5, 10: 2}
-"""By PVT mode: stand-alone, differential, RTK fixed and float, SBAS, moving base, PPP."""
+"""Quality by PVT mode: stand-alone, differential, RTK fixed and float, SBAS, moving base, PPP."""
 FIXED_LOCATION = 3
 DATUMS = frozenset({0, 19, 30, 31, 34})
 """WGS 84/ITRS; that of the base; ETRS89, NAD83(2011), GDA2020, which are a plate's own and within
@@ -77,10 +77,10 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
     """
 
     _when: tuple[int, int] = (NO_32, NO_16)
-    """Of the epoch that is open: time of week (ms) and week."""
+    """Time of the open epoch: time of week (ms) and week."""
     _leap_seconds: int | None = None
     _heading: tuple[tuple[int, int], float, int] | None = None
-    """An attitude whose covariance may come: its instant, heading (rad), and when it was seen."""
+    """Attitude that awaits its covariance: instant, heading (rad), and arrival."""
 
     def _make_splitter(self) -> BlockSplitter:
         return BlockSplitter(self.counters)
@@ -207,7 +207,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
         )
 
     def _attitude(self, body: bytes, when: tuple[int, int], found: list[Measurement]) -> None:
-        """Kept until its covariance has come, or the next one."""
+        """Keep an attitude until its covariance or the next one arrives."""
         self._report_heading(None, found)
         _, _, _, error, mode, heading_deg = _ATTITUDE.unpack_from(body)
         if error & 3 or not mode or not NO_NUMBER < heading_deg < math.inf:

@@ -70,7 +70,7 @@ class BlockSplitter(Splitter[Block]):
 
 
 def _length(buffer: bytearray, at: int) -> int | None:
-    """Of the block at `at`; 0 when it is none, None when that is not known yet."""
+    """Length of the block at `at`; 0 for none, None if incomplete."""
     if len(buffer) < at + _HEADER:
         return None
     length = int.from_bytes(buffer[at + 6 : at + 8], "little")

@@ -40,7 +40,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
     """
 
     _known: tuple[int, int] | None = None
-    """An iTOW, and the UTC that it is."""
+    """Reference iTOW with its UTC."""
 
     def _make_splitter(self) -> StreamSplitter:
         return StreamSplitter(self.counters)
@@ -103,7 +103,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
         return _solution(epoch) if epoch.rank or epoch.fix is not None else None
 
     def _utc_of(self, itow_ms: int) -> int | None:
-        """UTC of an iTOW by the last one of which it was told; None before one."""
+        """UTC of an iTOW by the last reference; None before one."""
         if self._known is None:
             return None
         since_ms = (itow_ms - self._known[0] + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2

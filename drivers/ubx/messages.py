@@ -1,4 +1,4 @@
-"""UBX-NAV messages, little endian, out of verified frames into the epoch that they belong to.
+"""Parser of UBX-NAV messages, little endian, from verified frames into their epoch.
 
     PVT 0x07      everything; POSLLH 0x02, VELNED 0x12 and HPPOSLLH 0x14 parts of it, finer
     SOL 0x06      what PVT was before generation 7: ECEF, GPS time
@@ -58,7 +58,7 @@ class NavEpoch:
     covariance_ned_m: Vector3 | None = None
     v_rank: int = 0
     v_ecef_m_s: tuple[Vector3, float] | None = None
-    """With its sigma; turned to the place when the epoch is whole."""
+    """ECEF velocity with its sigma, rotated to NED when the epoch is complete."""
     v_ned_m_s: Vector3 | None = None
     sd_v_m_s: float | None = None
     covariance_v_m_s: Vector3 | None = None
@@ -67,7 +67,7 @@ class NavEpoch:
     vdop: float | None = None
 
     def place(self, rank: int, where: Vector3, sd_h_m: float, sd_v_m: float) -> None:
-        """A position (rad, rad, m) with the sigma of the horizontal plane and of the height."""
+        """Set a position (rad, rad, m) with its horizontal and vertical sigma."""
         if rank >= self.rank:
             self.rank = rank
             self.lat_rad, self.lon_rad, self.height_m = where
@@ -79,7 +79,7 @@ class NavEpoch:
             self.v_rank, self.v_ned_m_s, self.sd_v_m_s = rank, v, sd_m_s * _EVEN_3
 
     def whole(self) -> None:
-        """No more will come of this epoch: what needed its place gets it."""
+        """Complete the epoch: convert all that needs its position."""
         if self.v_ecef_m_s is not None and self.lat_rad is not None and self.lon_rad is not None:
             v, sd_m_s = self.v_ecef_m_s
             self.velocity(1, north_east_down(v, self.lat_rad, self.lon_rad), sd_m_s)
@@ -256,7 +256,7 @@ MESSAGES: dict[int, tuple[str, int, int, Callable[[NavEpoch, bytes], None]]] = {
     0x20: ("TIMEGPS", _TIMEGPS.size, 0, _timegps),
     0x21: ("TIMEUTC", _TIMEUTC.size, 0, _timeutc),
 }
-"""By identifier: name, least length, where iTOW stands, and how an epoch takes it."""
+"""Messages by identifier: name, least length, offset of iTOW, and handler."""
 END_OF_EPOCH = 0x61
 RELPOSNED = 0x3C
 

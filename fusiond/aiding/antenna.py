@@ -1,4 +1,4 @@
-r"""The point of a vehicle that a receiver's antenna is, and how it moves.
+r"""Position and velocity of a receiver's antenna on the vehicle, from its lever arm.
 
     v_a = v + C (w x l),   d v_a = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl
 

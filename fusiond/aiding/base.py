@@ -30,13 +30,13 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
-"""Choice of when the error estimate is fed back into the navigation state: right after the
-measurement; not before a measurement says so; or now, all that was held."""
+"""Time at which the error estimate is fed back into the navigation state: at once; held until a
+measurement releases it; or now, with everything held."""
 POSITION, VELOCITY, NO_SLIP, SPEED = range(1, 5)
-"""Kinds of packed rows, of which positions and velocities always apply."""
+"""Kinds of packed rows; positions and velocities always apply."""
 LENT_ROWS = 3
-"""Measurements of so many rows at most write their innovations to what a filter lends them: nearly
-all."""
+"""Largest number of rows whose innovations go into the filter's own memory, for nearly all
+measurements."""
 
 
 @compiled("f8(f8[::1])")
@@ -54,7 +54,7 @@ class Innovation(NamedTuple):
 
     @staticmethod
     def unwritten(rows: int, size: int) -> Innovation:
-        """Of so many rows and states, for a measurement to write it."""
+        """Unwritten innovation of so many rows and states, for a measurement to fill."""
         return Innovation(np.empty(rows), np.empty((rows, size)), np.empty(rows))
 
 
@@ -108,8 +108,7 @@ class Renewal(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Kind of a measurement's row, number of rows of its innovation, body of its row
-    (fusiond.aiding.packed)."""
+    """Packed measurement: kind, number of rows of its innovation, body (fusiond.aiding.packed)."""
 
     kind: int
     rows: int
@@ -117,14 +116,14 @@ class Packed(NamedTuple):
 
 
 class NotApplicable(NamedTuple):
-    """The measurement does not hold in this state; `outcome` names why."""
+    """Refusal of a measurement in this state; `outcome` is its name."""
 
     outcome: str
 
 
 @immutable()
 class AidingMeasurement:
-    """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
+    """Aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
     `gate` is the probability with which a consistent innovation passes. What a measurement is, it
     says itself: timeline, navigator, verdicts and alignment ask it and know no kind of measurement
@@ -132,29 +131,31 @@ class AidingMeasurement:
     """
 
     screened: ClassVar[bool] = False
-    """Its rows are gated one by one, and a bad one goes alone (fusiond.estimators.screening)."""
+    """True if its rows are gated one by one, so that a bad one is left out alone
+    (fusiond.estimators.screening)."""
     period: ClassVar[float] = math.inf
-    """An innovation that is an angle repeats with it."""
+    """Period of an innovation that is an angle."""
     locates: ClassVar[bool] = False
-    """It bounds the horizontal position: a solution that has it is not coasting."""
+    """True if it bounds the horizontal position, which ends coasting."""
     moves: ClassVar[bool] = False
-    """It bounds the horizontal velocity."""
+    """True if it bounds the horizontal velocity."""
     rolls: ClassVar[bool] = False
-    """It measures a speed along the vehicle."""
+    """True if it measures a speed along the vehicle."""
     constraint: ClassVar[bool] = False
-    """Not measured but known of the vehicle: its innovations are neither independent nor white, and
-    no verdict on a sigma follows from them."""
+    """True for a constraint of the vehicle's motion instead of a measurement: its innovations are
+    neither independent nor white and allow no verdict on a sigma."""
     no_slip: ClassVar[bool] = False
-    """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
-    attitude or the IMU's mounting is wrong."""
+    """True if it holds while the vehicle moves the way it faces. Repeated refusals mean a slide, a
+    wrong attitude or a wrong IMU mounting."""
     shown: ClassVar[attrgetter[Any] | None] = None
     """Value that a frozen sensor repeats to the bit; else the first of its `candidates` says it."""
     waits: ClassVar[bool] = False
-    """Its `feedback` is not always at once."""
+    """True if its `feedback` may be held."""
     placed: ClassVar[bool] = False
-    """Its corrections depend on the place: it is folded in as it is `at` the filter's."""
+    """True if its corrections depend on the position: it is applied as corrected by `at` for the
+    filter's position."""
     delayed: ClassVar[bool] = False
-    """It comes seldom and long after its instant, as what must be asked for does."""
+    """True if it arrives seldom and long after its instant, as a requested one does."""
 
     source: str
     t_ns: int
@@ -164,8 +165,7 @@ class AidingMeasurement:
 
     @property
     def device(self) -> str:
-        """Device that measured it: a device may send positions and velocities under names of their
-        own."""
+        """Device of the measurement; its positions and velocities may have different sources."""
         return self.source
 
     @property
@@ -175,23 +175,23 @@ class AidingMeasurement:
 
     @property
     def shares(self) -> tuple[str, ...]:
-        """Blocks of the model whose states are an error that successive ones share."""
+        """Blocks of the model for errors that successive measurements share."""
         return ()
 
     @property
     def remembers(self) -> bool:
-        """True if its innovation goes by an instant of which the state keeps a clone: the clone and
-        the position are known by their difference, many digits better than each."""
+        """True if its innovation depends on an instant of which the state keeps a clone: the
+        difference of clone and position is known to more digits than either."""
         return False
 
     @property
     def renewal(self) -> Renewal | None:
-        """Change of the errors that successive ones share, at its instant."""
+        """Change of the shared errors at its instant."""
         return None
 
     def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:
-        """Clone of `state` for the next one, when the filter has looked at it and made `codes` of
-        its rows."""
+        """Clone of `state` for the next measurement, after the filter has given `codes` to its
+        rows."""
         return None
 
     @property
@@ -205,33 +205,31 @@ class AidingMeasurement:
         return None
 
     def at(self, nav: Array) -> AidingMeasurement:
-        """The measurement as it is for a vehicle in the navigation state (10,), which is the
-        filter's at the measurement's instant: itself, unless its corrections depend on the
-        place."""
+        """Measurement corrected for the navigation state (10,) at its instant; the measurement
+        itself, unless its corrections depend on the position."""
         return self
 
     def without_attitude(self, way: HeadingHistory) -> AidingMeasurement | None:
-        """The measurement for a vehicle whose attitude nobody knows, the state being that of one
-        that faces north and is level: of a lever arm only its upward part is known, and the rest is
-        noise; of the `way` that it faces, what headings say. None where the measurement says
-        nothing without an attitude."""
+        """Measurement for a vehicle of unknown attitude, with a state that faces north and is
+        level. Of a lever arm only the upward part is known, the rest is noise; `way` is the heading
+        by other measurements. None where an attitude is required."""
         return None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        """The innovation at `state`, or the name of why there is none."""
+        """Innovation at `state`, or the name of its refusal."""
         raise NotImplementedError
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
-        """Receive the outcome, for a receiver that keeps count of its rows
-        (fusiond.estimators.screening); called again when a rewind brings it again."""
+        """Receive the outcomes of its rows, for a receiver that counts them
+        (fusiond.estimators.screening); repeated after a rewind."""
 
     def candidates(self) -> Sequence[Candidate]:
         """Candidates for the start of alignment."""
         return ()
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
-        """Of a screened measurement, the series of innovations that a verdict judges: of each by
-        name this epoch's row (m,). Other measurements are one series, under their source's name.
+        """Innovation series of a screened measurement for the verdicts: by name, this epoch's row
+        (m,). Other measurements have one series, named after their source.
 
         `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows were used.
         """
@@ -275,7 +273,7 @@ class Linearised(Protocol):
 
 
 def level_arm_m(lever: Vector3) -> float:
-    """One sigma (m) of each horizontal axis of a lever arm that may point anywhere."""
+    """One sigma (m) of each horizontal axis of a lever arm of unknown direction."""
     return math.hypot(lever[0], lever[1]) / math.sqrt(2.0)
 
 
@@ -287,7 +285,7 @@ def rate_columns(h: Array, rows: slice, model: Model, per_rate: Array) -> None:
 
 
 def misaligned_axes(state: State, block: str) -> tuple[Array, list[int]]:
-    """C exp[m x] (3, 3), from the axes of a sensor to navigation axes, and the slots of m.
+    """Rotation C exp[m x] (3, 3) from a sensor's axes to navigation axes, and the slots of m.
 
     m (rad, body axes) turns the body's axes into the sensor's; it is the estimate of the block of
     that name. C and no slots where the model has no such block.

@@ -1,4 +1,4 @@
-r"""Bearing: azimuth and elevation of a known point, as a radar (SAR) sees it from the vehicle.
+r"""Bearing of a known point: azimuth and elevation, as from a radar (SAR) on the vehicle.
 
     d = C_ne (p - r) - C l                 from the antenna to the point, north-east-down (m)
     u = exp[m x]^T C^T d                   the same in sensor axes
@@ -71,11 +71,12 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 SAR_BLOCK = SAR_MISALIGNMENT
 STEEPEST_ELEVATION_RAD = math.radians(80.0)
-"""As for heading: the azimuth's errors grow as 1 / cos(E), here almost sixfold."""
+"""Largest elevation, as for heading: the azimuth's errors grow as 1 / cos(E), here almost sixfold.
+"""
 
 
 def line_of_sight(place: Vector3, point: Vector3) -> Array:
-    """From a place to a point, both lat, lon (rad), height (m): (3,) m, NED at the place."""
+    """Vector (3,), m, NED from one position to another, both lat, lon (rad), height (m)."""
     separation = np.subtract(to_ecef(*point), to_ecef(*place))
     return np.asarray(ned_axes(place[0], place[1]).T @ separation, dtype=np.float64)
 
@@ -113,7 +114,7 @@ class BearingMeasurement(AidingMeasurement):
         return found
 
     def _oriented(self, state: State, of: Oriented) -> Innovation | NotApplicable:
-        """The innovation at a measured attitude, whose noise is the rows' as well."""
+        """Innovation at a measured attitude, whose noise is added to the rows'."""
         model, measured = state.model, dcm_from_rpy(*of.rpy)
         slots = model.slots_of(of.block) if of.block else []
         x, y, z = (float(state.xi[slot]) for slot in slots) if slots else (0.0, 0.0, 0.0)
@@ -136,7 +137,7 @@ class BearingMeasurement(AidingMeasurement):
         return Innovation(z_and_h[:, 0].copy(), z_and_h[:, 1:].copy(), np.ones(2))
 
     def _linearised(self, state: State) -> Innovation | NotApplicable:
-        """The innovation with its slopes in all of the navigation errors, estimated or held."""
+        """Innovation with its derivatives by all navigation errors, estimated or held."""
         nav = state.nav
         lat, lon, height = float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT])
         to_ned, slots = misaligned_axes(state, self.block)

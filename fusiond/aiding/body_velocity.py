@@ -79,12 +79,12 @@ _NO_SLIP_BODY, _SPEED_BODY = Struct("<7d6q"), Struct("<7d9q")
 
 @lru_cache(maxsize=64)
 def _blocks(drift: str, scale: str, latency: str) -> tuple[tuple[str, int], ...]:
-    """The blocks of the parameters in order, with how many states each has."""
+    """Blocks of the parameters in order, each with its number of states."""
     return (MOUNTING, 2), (AXLE_LEVER, 1), (drift, 1), (scale, 1), (latency, 1)
 
 
 def _slots(model: Model, drift: str, scale: str = "", latency: str = "") -> Indices:
-    """Slots (6,) of the parameters, by the names of the blocks of drift, scale and latency."""
+    """Slots (6,) of the parameters, by names of the blocks of drift, scale and latency."""
     return model.slots_or_missing(*_blocks(drift, scale, latency))
 
 
@@ -219,8 +219,8 @@ def speed_rows(
     r: Array,
 ) -> None:
     """Write z (1,), H (1, n) and r (1,) of a wheel's `speed` with that variance. `rounding` (0 or
-    1,): the slot of the share of a step `rounded` (m/s; 0: none) that its rounding takes off, of
-    whose sigma at the start, `initial` (n,), the variance is rid."""
+    1,): the slot of the rounding error as a share of the step `rounded` (m/s; 0: none), whose
+    variance at the start, of sigma `initial` (n,), is subtracted."""
     _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, FORWARD, z, h)
     z[0] -= speed
     r[0] = variance
@@ -251,8 +251,8 @@ def direction_of(
     z: Array,
     h: Array,
 ) -> float:
-    """Sign of the forward velocity of a filter with P (n, n), or (0, 0) where none is known; 0
-    where it is not beyond `SIGN_SIGMAS` of its sigma. z (1,) and H (1, n) are used up."""
+    """Sign of the forward velocity of a filter with P (n, n); 0 if within `SIGN_SIGMAS` of zero,
+    (0, 0) if unknown. z (1,) and H (1, n) are used up."""
     _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, FORWARD, z, h)
     variance = 0.0
     for i in range(p.shape[0]):
@@ -285,7 +285,7 @@ def no_slip_rows(
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,), H (m, n) and r (m,) of no velocity to the right, and down."""
+    """Write z (m,), H (m, n) and r (m,) of zero velocity to the right and down."""
     _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, drifts, RIGHT, z, h)
     r[0] = sd * sd
     if r.shape[0] > 1:

@@ -18,8 +18,8 @@ STEADY = (0.0, 1.0)
 
 
 class PositionCandidate(NamedTuple):
-    """Geodetic position (rad, rad, m above the ellipsoid), `sd` (m) north, east, down; without a
-    height where it is None."""
+    """Geodetic position (rad, rad, m above the ellipsoid), `sd` (m) north, east, down; None for an
+    unknown height."""
 
     t_ns: int
     lat_rad: float
@@ -47,9 +47,9 @@ class VelocityCandidate(NamedTuple):
 
 
 class SpeedCandidate(NamedTuple):
-    """Speed (m/s) along the forward axis, or its amount, as a wheel says it. `rounding_sd_m_s` is
-    the part of `sd_m_s` that is the same as long as the speed is: no mean takes it away. Beside
-    `sd_m_s` it drifts, as a process of first order of that sigma (m/s) and time (s)."""
+    """Speed (m/s) along the forward axis, or its magnitude, from a wheel. `rounding_sd_m_s` is the
+    part of `sd_m_s` that is constant at a constant speed and does not average out. It also drifts,
+    as a first-order process of that sigma (m/s) and time constant (s)."""
 
     t_ns: int
     speed_m_s: float
@@ -59,7 +59,7 @@ class SpeedCandidate(NamedTuple):
 
 
 class HeadingCandidate(NamedTuple):
-    """True heading (rad) of the body's forward axis, as `how` measured it.
+    """True heading (rad) of the body's forward axis; `how` names its origin.
 
     `own_sd_rad` is the part of sigma that is of this measurement alone, `shared` the rest: blocks
     of the model, with what each of their states turns the heading by."""
@@ -73,7 +73,7 @@ class HeadingCandidate(NamedTuple):
 
 
 class HeightCandidate(NamedTuple):
-    """Ellipsoidal height (m), for a position of the same measurement that has none."""
+    """Ellipsoidal height (m), for a position of the same measurement without one."""
 
     height_m: float
     sd_m: float

@@ -1,4 +1,4 @@
-r"""Anchor of carriers: the epoch from which they are counted, with a clone of the antenna's place.
+r"""Reference epoch of carrier phases, with a clone of the antenna's position.
 
 A carrier L, with the satellite's clock and the atmosphere taken off, is a range but for a constant
 as long as it is followed. Against an anchor epoch a, with s the satellite (ECEF, m), p the antenna,
@@ -81,30 +81,31 @@ X, VX, RANGE, RATE, RANGE_VARIANCE, RATE_VARIANCE, SHARED = 0, 3, 6, 7, 8, 9, 10
 SPAN, CARRIER, CARRIER_VARIANCE, WALK, SLOT, ISSUE = 13, 14, 15, 16, 17, 18
 
 SLOTS, COLUMNS = 3 * 64, 9
-"""Of what an epoch leaves: a row a satellite, by its slot."""
+"""Shape of an epoch's output: one row for each satellite, by its slot."""
 _ALIVE, _CARRIER, _X, _ISSUE, _OFFSET, _V, _LAST = 0, 1, 2, 5, 6, 7, 8
 # Slot 0 is no satellite's: 1 if there is an anchor; when it was (s); sums of d^2 / 2 s^2 and of
 # their degrees of freedom.
 _THERE, _T, _SUM, _COUNT = range(4)
 
 LONGEST_S = 30.0
-"""A line of sight turns by 4 mrad within it, which makes 2 mm of a place that is 0.5 m off."""
+"""Longest age (s): a line of sight turns by 4 mrad within it, 2 mm for a position error of 0.5 m.
+"""
 WAITS_S = 1.0
 ENOUGH = 4
-"""Carriers that tell position and clock."""
+"""Fewest carriers that determine position and clock."""
 ON_EARTH_M = 1e6
-"""Of a place from the earth's centre: without a clone the state is 0."""
+"""Least distance (m) of a position from the earth's centre; without a clone the state is 0."""
 FLOOR_M = 1e-3
-"""One sigma of a clone at least: a covariance of which a part is another's to the last digit is
-none any more after some updates."""
+"""Least sigma of a clock: a covariance in which one part equals another to the last digit becomes
+indefinite after some updates."""
 DRIFT_M_SQRT_S = 0.011
-"""Walk of orbits and clocks over minutes, by 2 mm/s that last for 30 s: 0.16 m in 200 s, and errors
-of 0.5 m that last for half an hour change by 0.24 m."""
+"""Random walk of orbits and clocks over minutes, from 2 mm/s that last for 30 s: 0.16 m in 200 s,
+and errors of 0.5 m that last for half an hour change by 0.24 m."""
 PRIOR_COUNT, MOST_COUNT = 20.0, 1000.0
-"""Weight of the model's noise of phases as a number of independent ones; older than so many are
+"""Weight of the modelled phase noise in independent phases, and the number after which old ones are
 forgotten by halves: a minute of a sky at 1 Hz."""
 SCALE = (0.1, 10.0)
-"""Of their variance, from a tenth: 1 mm at the zenith."""
+"""Scale of the phase variance, from a tenth: 1 mm at the zenith."""
 CLIPPED = 9.0
 """No change counts as more than three sigma: a slip is no noise."""
 
@@ -137,8 +138,8 @@ def anchored(values: Array, k: int, before: Array) -> bool:
 def since_anchor(
     values: Array, k: int, before: Array, px: float, py: float, pz: float, scale: float
 ) -> tuple[float, float, float]:
-    """Of a satellite from a place (ECEF, m) at the anchor: its distance, how much its carrier has
-    grown since (m), and the variance (m^2) of that."""
+    """Distance of a satellite from a position (ECEF, m) at the anchor, growth of its carrier since
+    (m), and its variance (m^2)."""
     row = before[int(values[SLOT, k])]
     x, y, z = row[_X] - px, row[_X + 1] - py, row[_X + 2] - pz
     distance = math.sqrt(x * x + y * y + z * z)
@@ -150,7 +151,8 @@ def since_anchor(
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8)")
 def _inverse(a: Array, out: Array, more: float) -> None:
-    """Write the inverse of A + `more` I (4, 4), which is positive, by Gauss and Jordan."""
+    """Write the inverse of A + `more` I (4, 4), which is positive definite, by Gauss-Jordan
+    elimination."""
     for i in range(4):
         for j in range(4):
             out[i, j] = a[i, j]
@@ -170,7 +172,7 @@ def _inverse(a: Array, out: Array, more: float) -> None:
 
 @compiled("void(f8[::1], f8, f8, f8, f8[::1], f8[:, ::1])", allocates=True)
 def antenna(nav: Array, l0: float, l1: float, l2: float, place: Array, of_error: Array) -> None:
-    """Write the place of an antenna (3,), ECEF, and its error's part of the navigation errors.
+    """Write an antenna's position (3,), ECEF, and its derivatives by the navigation errors.
 
     That (3, 9) is true minus computed; l the lever arm (m, body axes).
     """
@@ -221,8 +223,8 @@ def _fit(
     z: Array,
     inverse: Array,
 ) -> int:
-    """Write H (n, 4), residuals z (2, n) of carriers and of their changes, and the inverse of
-    H^T W H + I; of how many satellites. `left` has what the next epoch's changes are from."""
+    """Write H (n, 4), residuals z (2, n) of carriers and of their changes, and the inverse of H^T W
+    H + I; the number of satellites. `left` is the reference of the next epoch's changes."""
     information, of_z, solved = np.zeros((4, 4)), np.zeros((2, 4)), np.empty(4)
     count = 0
     for k in range(values.shape[1]):
@@ -258,8 +260,8 @@ def _fit(
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])", allocates=True)
 def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
-    """Take what carriers' residuals tell at an epoch into the rows of `left` of those that are
-    anchored: constants, and how noisy phases are; from the antenna's `place` and at the anchor."""
+    """Update the anchored rows of `left` by an epoch's carrier residuals: constants and phase
+    noise, from the antenna's `place` at present and at the anchor."""
     n = values.shape[1]
     sights, z, inverse = np.empty((n, 4)), np.empty((2, n)), np.empty((4, 4))
     of_b = np.zeros(4)
@@ -310,8 +312,8 @@ def go_on(
     before: Array,
     left: Array,
 ) -> bool:
-    """Write what an epoch at `t_s` leaves after one that left `before`; whether it is an anchor, of
-    a filter that has `cloned` the last one or not.
+    """Write the output of an epoch at `t_s` after one with output `before`; True if it is an
+    anchor, for a filter that has `cloned` the last one or not.
 
     `codes` (m,) of its rows, 0 of what was used, or none; the `first` of rates and carriers;
     `place` (3,) of the antenna, and as it is estimated at the `anchor`.
@@ -354,7 +356,7 @@ def go_on(
 
 @compiled("void(f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True)
 def phase_noise(values: Array, place: Array, age: float, left: Array, noise: Array) -> None:
-    """Write the covariance (4, 4) of what an anchor's phases add to B and C.
+    """Write the covariance (4, 4) that an anchor's phases add to B and C.
 
     That with what has changed over the `age` (s) of the one before it. To `left` goes the variance
     of each satellite's constant.

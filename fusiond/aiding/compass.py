@@ -34,22 +34,22 @@ DEVIATION, DISTURBANCE = "compass_deviation", "compass_disturbance"
 
 
 def deviation(name: str, sd_rad: float) -> Block:
-    """a, b and c, each with the same sigma, so that at any heading their sum has `sd_rad`, and at
-    opposite ones nothing in common: var(a + b sin psi + c cos psi) = 2 s^2."""
+    """States a, b and c, each with the same sigma, so that their sum has `sd_rad` at any heading
+    and is uncorrelated at opposite ones: var(a + b sin psi + c cos psi) = 2 s^2."""
     each = sd_rad / math.sqrt(2.0)
     return Block(name, "rad", ("a", "b", "c"), (-1, -1, -1), initial=each)
 
 
 def disturbance(name: str, sd_rad: float, lasts_s: float) -> Block:
-    """d."""
+    """State d."""
     return Block(name, "rad", ("d",), (-1,), initial=sd_rad, steady=sd_rad, tau_s=lasts_s)
 
 
 @immutable()
 class CompassMeasurement(HeadingMeasurement):
-    """A compass's heading with the declination added (rad), `sd_rad` of its white noise;
-    `deviation` and `disturbance` name the model's blocks of the rest, of which one sigma in all is
-    `lasting_sd_rad`; the latter counts `disturbed` times."""
+    """Heading of a compass with the declination added (rad), `sd_rad` of its white noise.
+    `deviation` and `disturbance` name the model's blocks of further errors, with a total sigma of
+    `lasting_sd_rad`; the disturbance is scaled by `disturbed`."""
 
     deviation: str
     disturbance: str
@@ -58,7 +58,7 @@ class CompassMeasurement(HeadingMeasurement):
 
     @property
     def _by(self) -> tuple[float, float, float, float]:
-        """By how much each state turns it."""
+        """Derivatives of the compass reading by the states."""
         return lasting(self.yaw_rad, self.disturbed)
 
     def without_attitude(self, way: HeadingHistory) -> CourseMeasurement | None:
@@ -89,5 +89,5 @@ class CompassMeasurement(HeadingMeasurement):
 
 
 def lasting(yaw: float, disturbed: float) -> tuple[float, float, float, float]:
-    """By how much a, b, c and d turn the compass of a vehicle that heads `yaw`."""
+    """Error of the compass by a, b, c and d for a vehicle with heading `yaw`."""
     return 1.0, math.sin(yaw), math.cos(yaw), disturbed

@@ -1,4 +1,4 @@
-r"""Shares of a receiver's error: each fix's own, lasting for seconds, and longer.
+r"""Division of a receiver's error into a white part, one of seconds, and a longer one.
 
 A receiver states one sigma, s, of all that is wrong with a fix. One that errs anew with each fix is
 averaged out; one that fixes share for half a minute (multipath, satellites that come and go) or
@@ -57,27 +57,27 @@ that counts."""
 LAG_S, STEP_S = 20.0, 2.0
 """Means of fixes that are compared lie so far apart; each is of so much time."""
 NONE = 0.5
-"""Probability that a receiver has nothing of a kind of error: nobody knows."""
+"""Prior probability that a receiver lacks a kind of error; no data exist."""
 AT_FIRST, FIRST_STEPS = 0.75, 4.0
-"""Share of the variance that is taken to be shared before fixes have shown it, and how many steps,
-each axis one, it is worth. A filter that has once been too sure of its place stays so; one that was
-not is as sure as it may be with the next fix that counts as white."""
+"""Initial share of the variance that is shared, and its weight in steps of one axis. A filter that
+was too sure of its position stays so; one that was too cautious recovers with the next white fix.
+"""
 FOR_SECONDS = 0.5
-"""Part of the shared error that is over in seconds, worth one lag: a choice."""
+"""Part of the shared error that lasts for seconds, with the weight of one lag: a choice."""
 LEAST_WHITE = 0.01
 """Share of the variance that is white at least: a tenth of sigma. A receiver that smooths its fixes
 repeats its error; how it follows a turn is in no share."""
 GAP_S = 2.5
-"""Fixes farther apart than this leave too much of the way between them to two velocities."""
+"""Longest interval of fixes: beyond it two velocities do not determine the displacement."""
 SETTLES_NS = 10_000_000_000
-"""Age beyond which nothing more comes: the timeline's least buffer takes nothing that is later.
-So the order in which fixes come leaves no trace."""
+"""Age beyond which no fix can still arrive, by the timeline's shortest buffer; the order of arrival
+then has no effect."""
 FORGETS_S = 600.0
 """Streets change."""
 LEAST_SCATTER = 1e-3
-"""No estimate of a share is surer than this."""
+"""Least scatter of a share's estimate."""
 FAR_SIGMAS = 4.0
-"""An estimate that lies farther outside of 0 to 1 says no more than one that lies so far."""
+"""Distance of an estimate outside of 0 to 1, in sigmas, at which it is cut off."""
 
 # Of the array that the kernels read: the last fix (ns, an integer; rad, rad; m/s; its sigma; its
 # variance), u north and east and the variance that the velocities' noise has walked. Sums over both
@@ -91,9 +91,9 @@ FAR_SIGMAS = 4.0
     _NEAR, _NEAR_ACROSS, _NEAR_SPEEDS, _WALKS, _ALIKE, _STEPS, _KEPT, _SINCE, _MEAN,
 ) = range(24)  # fmt: skip
 SHOWN = _KEPT - _FAR
-"""Numbers of what fixes have shown: sums, of which a share counts as so much less of it."""
+"""Numbers that describe observed fixes: sums, with less weight for a share."""
 MOST_SHOWN = 1e9
-"""A receiver that is a kilometre off has shown nothing of its noise; nor are its sums kept."""
+"""Largest error in the sums: a receiver that is off by a kilometre shows nothing of its noise."""
 _POINT = 8
 _POINTS = _MEAN + _POINT
 _T, _U, _V, _OF_WALK, _OF_VARIANCE, _OF = 0, 1, 3, 5, 6, 7
@@ -106,8 +106,8 @@ _BEFORE_ALL_NS = -(1 << 62)
 
 
 class Fix(NamedTuple):
-    """Instant (ns), latitude and longitude (rad), the horizontal variance (m^2) that is stated for
-    an axis, horizontal velocity (m/s) and its sigma."""
+    """Fix: instant (ns), latitude and longitude (rad), stated variance (m^2) of a horizontal axis,
+    horizontal velocity (m/s) and its sigma."""
 
     t_ns: int
     lat_rad: float
@@ -150,7 +150,7 @@ def _keep(packed: Array) -> None:
 
 @compiled("void(f8[::1])")
 def _compare(packed: Array) -> None:
-    """The last point with the first, where a lag lies between them."""
+    """Compare the last point with the first, if a lag lies between them."""
     before = packed[_POINTS : _POINTS + _POINT]
     at = _POINTS + _POINT * (int(packed[_KEPT]) - 1)
     now = packed[at : at + _POINT]
@@ -229,7 +229,7 @@ def _take(
 
 @compiled("f8(f8, f8)")
 def share_of(x: float, sigma: float) -> float:
-    """Expectation of a share whose estimate is `x`, of scatter `sigma`."""
+    """Expectation of a share with estimate `x` and scatter `sigma`."""
     x = min(max(x, -FAR_SIGMAS * sigma), 1.0 + FAR_SIGMAS * sigma)
     a, b, root = -x / sigma, (1.0 - x) / sigma, math.sqrt(0.5)
     at_a = math.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi)
@@ -245,8 +245,9 @@ def share_of(x: float, sigma: float) -> float:
 
 @compiled("f8(f8, f8, f8, f8)")
 def _by_speed(total: float, across: float, speeds: float, offset_variance: float) -> float:
-    """Part of a sum of d^2 that fix and velocity of two instants make. `across` is
-    that of d dv, `speeds` that of dv^2; `offset_variance` that of delta over that of one d."""
+    """Part of a sum of d^2 that is due to the offset between fix and velocity. `across` is the sum
+    of d dv, `speeds` that of dv^2; `offset_variance` is the variance of delta over that of one d.
+    """
     if not (offset_variance > 0.0 and speeds > 0.0 and total > 0.0):
         return 0.0
     delta = across / (speeds + 1.0 / offset_variance)
@@ -296,9 +297,9 @@ def _shares(packed: Array, offset_sd_s: float, wanders: bool, out: Array) -> Non
 
 
 class FixErrors:
-    """Of one receiver; `offset_sd_s` is one sigma of delta, and without `wanders` nothing lasts for
-    `LASTS_S`. Fixes may come in any order: what counts for one is of those that were valid
-    `SETTLES_NS` before it."""
+    """Errors of one receiver's fixes; `offset_sd_s` is one sigma of delta, and without `wanders` no
+    error lasts for `LASTS_S`. Fixes may arrive in any order: a fix uses those valid `SETTLES_NS`
+    before it."""
 
     __slots__ = ("_found", "_known", "_offset_sd_s", "_packed", "_waiting", "_wanders")
 
@@ -309,11 +310,11 @@ class FixErrors:
         self._known: deque[tuple[int, Shares]] = deque([(_BEFORE_ALL_NS, self._now())])
 
     def take(self, fix: Fix) -> None:
-        """Take a fix of the receiver, with its velocity."""
+        """Add a fix of the receiver, with its velocity."""
         insort(self._waiting, fix)
 
     def shares(self, t_ns: int) -> Shares:
-        """Those that count for a fix of `t_ns`."""
+        """Shares for a fix of `t_ns`."""
         settled, known = t_ns - SETTLES_NS, self._known
         due = 0
         for fix in self._waiting:
@@ -337,7 +338,7 @@ class FixErrors:
         return tuple(np.clip(self._packed[_FAR:_KEPT], -MOST_SHOWN, MOST_SHOWN).tolist())
 
     def take_up(self, shown: tuple[float, ...]) -> None:
-        """Begin with what another drive has shown."""
+        """Resume with another drive's result."""
         self._packed[_FAR:_KEPT] = shown
         self._known = deque([(_BEFORE_ALL_NS, self._now())])
 

@@ -1,4 +1,4 @@
-"""Headings and attitudes of a vehicle that has no inertial unit, by their instants.
+"""Headings and attitudes over time, for a vehicle without an inertial unit.
 
 Between two attitudes it turns evenly, but for a change of its rate of as much as the rate itself;
 after the last one it stands as then, but for that rate. A heading alone says that it is level, as a
@@ -15,20 +15,20 @@ from typing import NamedTuple
 Vector3 = tuple[float, float, float]
 
 HOLDS_NS = 1_000_000_000
-"""For so long a heading counts: a vehicle in a street's corner turns by a fifth of a right angle
-meanwhile, and its speed along the heading is 5 % less."""
+"""Time (s) for which a heading is valid: a vehicle in a street corner turns by a fifth of a right
+angle, and its speed along the heading is 5 % less."""
 KEPT_NS = 12_000_000_000
-"""Older ones are too old for the timeline, which goes back by ten seconds."""
+"""Age beyond which headings are dropped; the timeline rewinds by ten seconds."""
 LEVEL_SD_RAD = 0.05
 """One sigma of roll and of pitch on a road: main roads climb by 6 % at most, and bank in bends by
 as much (AASHTO, A Policy on Geometric Design of Highways and Streets, 2018, 3.3 and 3.4)."""
 CORNER_RAD_S, STEADY_RAD_S = 0.31, math.radians(0.5)
-"""One sigma of how fast it turns where two attitudes do not tell: in a street's corner; and the
-least where they do, a sixth of an aircraft's standard turn."""
+"""One sigma of the turn rate without two attitudes, as in a street corner; and its least value with
+them, a sixth of an aircraft's standard turn."""
 
 
 class KnownHeading(NamedTuple):
-    """A heading (rad) at an instant, with its sigma; `lasts` if later ones err as it does."""
+    """Heading (rad) at an instant, with its sigma; `lasts` if later ones share its error."""
 
     t_ns: int
     yaw_rad: float
@@ -55,8 +55,8 @@ class Oriented(NamedTuple):
 
 
 class HeadingHistory:
-    """Headings that have come, and how fast (m/s, one sigma) the vehicle slides sideways; infinite
-    for one that need not go the way it faces, of which a heading says nothing."""
+    """Received headings, and the lateral velocity (m/s, one sigma) of the vehicle; infinite for one
+    that may move in any direction, for which a heading is no constraint."""
 
     def __init__(self, slips_m_s: float = math.inf) -> None:
         self.slips_m_s = slips_m_s
@@ -89,8 +89,8 @@ class HeadingHistory:
         del kept[: bisect_left(kept, kept[-1].t_ns - KEPT_NS, key=_instant)]
 
     def oriented_at(self, t_ns: int) -> Oriented | None:
-        """The attitude at `t_ns`, by those around it, or by the last heading; None where neither
-        counts any more."""
+        """Attitude at `t_ns`, interpolated, or from the last heading; None where neither is
+        valid."""
         kept = self._attitudes
         at = bisect_right(kept, t_ns, key=_instant)
         near = [one for one in kept[max(0, at - 1) : at + 1] if abs(one.t_ns - t_ns) <= HOLDS_NS]
@@ -116,7 +116,7 @@ _instant = attrgetter("t_ns")
 
 
 def _rate(a: Oriented, b: Oriented) -> float:
-    """One sigma (rad/s) of a change of the rate at which it turns from one to the other."""
+    """One sigma (rad/s) of a change of the turn rate between two headings."""
     span_s = (b.t_ns - a.t_ns) * 1e-9
     if not 0.0 < span_s <= HOLDS_NS * 1e-9:
         return CORNER_RAD_S
@@ -124,8 +124,8 @@ def _rate(a: Oriented, b: Oriented) -> float:
 
 
 def _between(a: Oriented, b: Oriented, t_ns: int) -> Oriented:
-    """By a line; a rate that changes evenly by r over the span T errs by r s (T - s) / (2 T) of it
-    at s."""
+    """Linear interpolation; a turn rate that changes evenly by r over the span T causes an error of
+    r s (T - s) / (2 T) at s."""
     span_s, s = (b.t_ns - a.t_ns) * 1e-9, (t_ns - a.t_ns) * 1e-9
     if span_s == 0.0:
         return a

@@ -1,4 +1,4 @@
-r"""Height of the body origin above the ellipsoid, or by the pressure of the air.
+r"""Height of the body origin above the ellipsoid, or by air pressure.
 
     ellipsoidal:    z = -(h^ - h) = dr_D + v
     barometric:     y = (1 + k) h + b + c (v_N^2 + v_E^2) / (2 g) + v

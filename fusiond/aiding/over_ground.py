@@ -1,4 +1,4 @@
-r"""A wheel's speed and a heading, of a vehicle whose attitude nobody knows.
+r"""Wheel speed and heading for a vehicle of unknown attitude.
 
 A vehicle that does not slide goes the way it faces, psi, or backwards. With f = (cos psi, sin psi,
 0), s the side slip, and what a wheel errs by as in fusiond.aiding.body_velocity
@@ -34,15 +34,15 @@ from fusiond.navigation.strapdown import VD, VE, VN
 Array = NDArray[np.float64]
 
 SIGN_SIGMAS = 3.0
-"""A velocity beyond as many of its sigmas has the other sign once in 740."""
+"""Sigmas beyond which a velocity's sign is wrong once in 740."""
 BRAKES_M_S2 = 1.0
-"""One sigma of what a car brakes or speeds up by at a comfortable limit."""
+"""One sigma of a car's acceleration or braking at a comfortable limit."""
 FIRST = 3
 """First row of the velocity in the error state."""
 
 
 def _variance(p: Array | None, axis: Array) -> float:
-    """Of the velocity along an axis (3,)."""
+    """Variance of the velocity along an axis (3,)."""
     if p is None:
         return 0.0
     return max(float(axis @ p[FIRST : FIRST + 3, FIRST : FIRST + 3] @ axis), 0.0)
@@ -50,7 +50,7 @@ def _variance(p: Array | None, axis: Array) -> float:
 
 @immutable()
 class CourseMeasurement(AidingMeasurement):
-    """No velocity across a heading `yaw_rad` with `sd_rad`, but for a slip of sigma `slips_m_s`.
+    """Zero velocity across a heading `yaw_rad` with `sd_rad`, with a slip of sigma `slips_m_s`.
 
     `blocks` name the model's blocks of what the heading is off by, in the order of `shares` (k,):
     what each of their states turns it by.
@@ -134,8 +134,8 @@ class GroundSpeed(AidingMeasurement):
         return Innovation(np.array([z - y]), h, np.array([variance]))
 
     def _forward(self, state: State) -> tuple[Array, float] | None:
-        """The vehicle's forward axis (3,) and the sigma (rad) of its heading; None where it is not
-        known, or, of a wheel that knows no direction, which way along it the vehicle goes."""
+        """Vehicle's forward axis (3,) and the sigma (rad) of its heading; None if unknown, or if
+        the direction of travel is unknown for a wheel without sign."""
         v, p = state.nav[VN : VD + 1], state.covariance
         faced, sd_rad = self.way.at(self.t_ns), 0.0
         if faced is not None:

@@ -1,4 +1,4 @@
-"""Measurements as rows of numbers, of which one compiled kernel makes innovations.
+"""Measurements as packed rows of numbers, from which one compiled kernel computes innovations.
 
 A timeline that runs again has hundreds of them, and a call of Python for each would cost more than
 all that a filter does with it. Position, velocity, no slip and a wheel's speed have such a row;
@@ -27,21 +27,22 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 HEADER = Struct("<3qd4q")
-"""Kind, instant (ns), number of rows, gate (chi-square), number of its series. Then what its rows
-and its device are to the bank (fusiond.estimators.fault_bank), and what is asked of it."""
+"""Header of a row: kind, instant (ns), number of rows, gate (chi-square), series number. Then the
+measures and device for the bank (fusiond.estimators.fault_bank), and the requests."""
 KIND, T_NS, ROWS, GATE, SERIES, MEASURES, OF_DEVICE, ASKED, BODY = range(9)
 MEASURED, MOTION_ASKED = 1, 2
-"""Of `ASKED`: it is no constraint; whether the vehicle moves is to be told with its outcome."""
+"""Flags of `ASKED`: a measurement, not a constraint; motion of the vehicle is to be reported with
+the outcome."""
 SIZE = 40
 """Numbers of a row."""
 APPLIES, TOO_SLOW, NO_DIRECTION = range(3)
 NAMES = ("", "too_slow", "direction_unknown")
-"""Results of a kernel, and what they are called."""
+"""Names of a kernel's results."""
 
 
 @compiled("i8[::1](i8[::1], i8)", forceinline=True, allocates=True)
 def _slots(ints: Indices, at: int) -> Indices:
-    """List of slots whose length is at `at`."""
+    """Slots of a list whose length is at `at`."""
     return ints[at + 1 : at + 1 + ints[at]]
 
 
@@ -59,7 +60,7 @@ def packed_rows(
     h: Array,
     r: Array,
 ) -> int:
-    """Write z (m,), H (m, n) and r (m,) of the row `x` (SIZE,); whether it `APPLIES`.
+    """Write z (m,), H (m, n) and r (m,) of the row `x` (SIZE,); returns `APPLIES` or a refusal.
 
     `state`: a filter's state (10,), parameters (n,) and last step, with P (n, n); `model`: columns
     and sigmas at the start of its parameters (n,), and whether it holds the height.

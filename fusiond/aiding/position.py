@@ -90,7 +90,7 @@ def markov_sd_of(axis: int, markov_m: float, sd: Vector3) -> float:
 
 @compiled("void(UniTuple(f8, 9), i8[::1], f8[:, :], f8[::1])", forceinline=True, allocates=True)
 def _add_of_turned_lever(c: Matrix, rest: Indices, p: Array, r: Array) -> None:
-    """Add to r (m,) the variance of phi x C dl by P (n, n), whose slots `rest` (3,) are dl's."""
+    """Add to r (m,) the variance of phi x C dl by P (n, n), with dl in the slots `rest` (3,)."""
     u, x = np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         for a in range(3):

@@ -1,5 +1,4 @@
-r"""Preintegrated IMU data of a measurement: an acceleration, with the force's own errors, and a
- turn.
+r"""Preintegrated IMU data of a measurement: acceleration, with accelerometer errors, and rotation.
 
     a = C f + g,   d a = [f x] phi + C e,   e = db + ds f       (computed minus true, body axes)
 
@@ -37,12 +36,12 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 CLEAR = 3.0
-"""Sigmas of its noise beyond which a smoothed rate is a turn."""
+"""Sigmas of noise beyond which a smoothed rate is a turn."""
 
 
 @compiled("f8(f8[::1], i8)", forceinline=True)
 def turning(step: Array, axis: int) -> float:
-    """Rate (rad/s) about an axis of the body, smoothed, that is no noise, of a `step` (28,)."""
+    """Smoothed rate (rad/s) about a body axis of a `step` (28,); zero within its noise."""
     rate: float = step[STEP_SMOOTH_RATE_B + axis]
     left = rate * rate - CLEAR * CLEAR * step[STEP_NOISE_B + axis]
     return left / rate if left > 0.0 else 0.0

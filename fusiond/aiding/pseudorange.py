@@ -94,7 +94,7 @@ Indices = NDArray[np.int64]
 RANGE_BIAS = ("range_bias", "range_bias_down")
 """Blocks of the displacement: north and east, down."""
 RANGE_SHARED = ("range_ionosphere", "range_troposphere", "range_beidou_2")
-"""Blocks, of one state each, of what the models leave in all ranges."""
+"""Blocks of one state each for model residuals shared by all ranges."""
 _CLONED = (CARRIER_ANCHOR, CARRIER_CLOCK)
 _BLOCKS = (
     *((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS, RANGE_SHARED),
@@ -102,13 +102,13 @@ _BLOCKS = (
 )
 _NOTHING_KEPT = np.zeros((4, 4))
 NO_CLOCK = -1
-"""In place of a clock offset: the range knows no receiver clock."""
+"""Index of a range without a receiver clock offset."""
 
 
 def epoch_values(position: ArrayLike, velocity: ArrayLike, *rows: ArrayLike) -> Array:
-    """The values of an epoch of n satellites as the measurement takes them (19, n): positions,
-    velocities (n, 3), and as `rows` (n,) ranges, rates, and their variances; no shared errors, no
-    carriers. ValueError for other shapes."""
+    """Values (19, n) of an epoch of n satellites: positions, velocities (n, 3), and as `rows` (n,)
+    ranges, rates, and their variances; no shared errors, no carriers. ValueError for other shapes.
+    """
     parts = [np.asarray(part, float).T for part in (position, velocity, *rows)]
     if any(part.shape[-1:] != parts[-1].shape for part in parts):
         raise ValueError(f"shapes differ: {[part.T.shape for part in parts]}")
@@ -125,7 +125,7 @@ def nothing_left() -> Array:
 
 @immutable(eq=False)
 class PseudorangeMeasurement(AidingMeasurement):
-    """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
+    """Ranges and rates of one epoch to n satellites, corrected for all but geometry and clock.
 
     `values` (19, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
     turned to the axes at reception, m, m/s), `ranges` (m), `rates` (m/s; positive: going away) and
@@ -180,7 +180,7 @@ class PseudorangeMeasurement(AidingMeasurement):
         return bool(self._anchored().any())
 
     def _anchored(self) -> NDArray[np.bool_]:
-        """(n,): carriers that have been followed since the anchor."""
+        """Carriers (n,) that have been followed since the anchor."""
         n = len(self.satellites)
         return np.fromiter((anchored(self.values, k, self.before) for k in range(n)), bool, n)
 
@@ -269,8 +269,8 @@ class PseudorangeMeasurement(AidingMeasurement):
         return replace(self, values=values, lever=lever, before=nothing, left=nothing)
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
-        """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of
-        the whitened innovations of its ranges and of its rates over the root of their number.
+        """Innovations (2,) for each satellite system with a clock, by its letter: the sums of the
+        whitened range and rate innovations over the root of their number.
 
         White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
         form one series. A system without a range or without a rate in the epoch has none.

@@ -1,4 +1,4 @@
-"""Compiled kernels of `fusiond.aiding.pseudorange`: its rows, what is measured, sums by clock."""
+"""Compiled kernels of `fusiond.aiding.pseudorange`: Jacobian, measured values, clock sums."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 UNUSED_VARIANCE = 1e6
-"""(m/s)^2, of a rate that nothing has measured, of a carrier that has no anchor."""
+"""Variance (m/s)^2 of an unmeasured rate or of a carrier without an anchor."""
 
 
 @compiled("void(b1[::1], f8[::1])", forceinline=True)
 def _hold(active: NDArray[np.bool_], g: Array) -> None:
-    """Nothing is told of navigation errors that are not estimated: zero in the row `g` (n,)."""
+    """Zero the row `g` (n,) for navigation errors that are not estimated."""
     for j in range(CORE_SIZE):
         if not active[j]:
             g[j] = 0.0

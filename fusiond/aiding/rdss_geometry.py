@@ -39,16 +39,16 @@ ELEVATION_MASK_RAD = math.radians(5.0)
 """Customary mask: below it the troposphere is crossed over more than ten zenith thicknesses
 (1 / sin 5 deg = 11.5) and no model corrects the range to the figures used here."""
 MAX_AMPLIFICATION = 12.0
-"""Largest singular value of G, metres of fix for one metre of slant range, that is still a fix.
-Beyond it 10 m of height error alone moves the fix by more than 100 m, the coarsest class that the
-centre states. With 80 and 140 deg E it is met within 3.4 deg of the equator midway (4.6 deg at
-70 deg E), so the service area from 5 to 55 deg N lies inside; satellites that stand close together
-meet it anywhere."""
+"""Largest singular value of G, metres of fix for one metre of slant range, of a valid fix. Beyond
+it 10 m of height error alone moves the fix by more than 100 m, the coarsest class that the centre
+states. With 80 and 140 deg E it is reached within 3.4 deg of the equator midway (4.6 deg at 70 deg
+E), so the service area from 5 to 55 deg N lies inside; satellites close together reach it anywhere.
+"""
 
 
 class Sensitivity(NamedTuple):
-    """`ranges` G (2, 2), m of north/east for 1 m in each slant range; `height` g (2,), for 1 m of
-    height."""
+    """Sensitivities: `ranges` G (2, 2), m of north/east for 1 m in each slant range; `height` g
+    (2,), for 1 m of height."""
 
     ranges: Array
     height: Array
@@ -71,7 +71,7 @@ class RdssGeometry:
     def sensitivity(
         self, lat_rad: float, lon_rad: float, height_m: float
     ) -> Sensitivity | NotApplicable:
-        """G and g at a geodetic place (rad, rad, m above the ellipsoid).
+        """Sensitivities G and g at a geodetic position (rad, rad, m above the ellipsoid).
 
         `satellite_below_horizon`: one of the two stands below `ELEVATION_MASK_RAD`.
         `no_geometry`: G exceeds `MAX_AMPLIFICATION`; at the equator both sight lines lie in the
@@ -100,7 +100,7 @@ class RdssGeometry:
         sd_range_m: float,
         sd_height_m: float,
     ) -> Covariance | NotApplicable:
-        """Covariance of a fix at a place (rad, rad, m), and its two parts.
+        """Covariance of a fix at a position (rad, rad, m), and its two parts.
 
         `sd_range_m` of each one-way slant range, `sd_height_m` of the height used; one sigma, not
         negative (ValueError). Outcomes as in `sensitivity`. Source: paper 000, eq. 4.
@@ -117,7 +117,7 @@ class RdssGeometry:
 
 
 def with_floor(total: Array, class_m: float) -> Array:
-    """The least covariance (2, 2), m^2, that is nowhere below `total` nor below `class_m` squared.
+    """Least covariance (2, 2), m^2, that is bounded below by `total` and by `class_m` squared.
 
     The terminal's precision class (20 or 100 m) is taken as one sigma of each horizontal axis:
     eigenvalues of `total` below `class_m`^2 are lifted to it and the axes of the ellipse stay, so

@@ -111,7 +111,7 @@ class RdssPositionMeasurement(AidingMeasurement):
         return Innovation(z, h, np.ones(2))
 
     def candidates(self) -> tuple[PositionCandidate, ...]:
-        """The fix without its height, which is a measurement of its own where it is believed."""
+        """Fix without its height, which is a measurement of its own where believed."""
         sd_n, sd_e = math.sqrt(self.covariance[0]), math.sqrt(self.covariance[2])
         place = self.lat_rad, self.lon_rad, None
         return (PositionCandidate(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
@@ -119,7 +119,7 @@ class RdssPositionMeasurement(AidingMeasurement):
 
 @immutable()
 class HeldFeedback(AidingMeasurement):
-    """The instant at which an estimate that was held is fed back."""
+    """Instant at which a held estimate is fed back."""
 
     waits: ClassVar[bool] = True
 

@@ -1,4 +1,4 @@
-r"""Evidence for or against rest beside a quiet sensor: measured speeds, and quiet at speed.
+r"""Evidence for or against rest beside a quiet IMU: measured speeds, and quiet while driving.
 
     m = sum(v_k) / n,   s = max(sd / sqrt(n), s_0),   contradicts rest if m^2 / s^2 > chi2(0.999)
 
@@ -57,8 +57,8 @@ class Measured(NamedTuple):
 
 
 class _Speed(NamedTuple):
-    """A velocity or speed (m/s) with its sigma, the part of that which no mean takes away, and what
-    it drifts by: sigma (m/s) and time (s)."""
+    """Velocity or speed (m/s) with its sigma, its part that does not average out, and its drift:
+    sigma (m/s) and time constant (s)."""
 
     t_ns: int
     v: tuple[float, ...]
@@ -68,8 +68,8 @@ class _Speed(NamedTuple):
 
 
 class _Sum(NamedTuple):
-    """Of the first `number` speeds of a span: of their variances and of each axis; the largest part
-    that no mean takes away."""
+    """Sums over the first `number` speeds of a span: variances and axes; the largest part that does
+    not average out."""
 
     number: int
     variance: float
@@ -77,7 +77,7 @@ class _Sum(NamedTuple):
     rounding: float
 
     def of(self, rows: Sequence[_Speed]) -> _Sum:
-        """With more of them, in order: the same bits as of all at once."""
+        """Sums with further rows in order, bit for bit as computed at once."""
         variance, total, rounding = self.variance, list(self.v), self.rounding
         for row in rows:
             variance += row.sd * row.sd
@@ -88,7 +88,7 @@ class _Sum(NamedTuple):
 
 
 def _drifted(first: _Speed, last: _Speed, number: int) -> float:
-    """Variance (m/s)^2 of the mean of what so many speeds from `first` to `last` drift by."""
+    """Variance (m/s)^2 of the mean drift of so many speeds from `first` to `last`."""
     sd, time_s = last.drifts
     if not sd:
         return 0.0
@@ -99,7 +99,7 @@ def _drifted(first: _Speed, last: _Speed, number: int) -> float:
 
 
 class RestEvidence:
-    """Speeds that were measured, and the quiet windows that were none of rest."""
+    """Measured speeds, and the quiet windows that were not rest."""
 
     def __init__(self) -> None:
         self.waiting: deque[AidingMeasurement] = deque(maxlen=MOST_WAITING)
@@ -107,12 +107,12 @@ class RestEvidence:
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
         self._by_span: dict[tuple[int, int], Measured] = {}
-        """Results of `measured` by span, asked for at every tick and again by each rewind: of those
-        that no speed has come into since."""
+        """Results of `measured` by span, requested at every tick and after each rewind; dropped
+        when a speed arrives in the span."""
         self._by_span_until_ns = 0
-        """The latest end of them."""
+        """Latest end of the cached spans."""
         self._sums: dict[tuple[str, int], _Sum] = {}
-        """By source and begin of a span: a standstill is asked about at each speed of minutes."""
+        """Sums by source and start of a span; a standstill of minutes is tested with each speed."""
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
@@ -146,7 +146,7 @@ class RestEvidence:
                     del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def catch_up(self) -> None:
-        """Take in what waits."""
+        """Process waiting speeds."""
         if self.waiting:
             waiting = tuple(self.waiting)
             self.waiting.clear()
@@ -181,7 +181,7 @@ class RestEvidence:
         return Measured(contradicts, math.sqrt(best), surely)
 
     def _sum(self, source: str, speeds: list[_Speed], first: int, last: int, begin_ns: int) -> _Sum:
-        """Of a source's speeds `first` to `last`-1, begun where that of a shorter span ended."""
+        """Sum over a source's speeds `first` to `last`-1, continued from that of a shorter span."""
         known = self._sums.get((source, begin_ns))
         if known is None or known.number > last - first:
             known = _Sum(0, 0.0, (0.0,) * len(speeds[first].v), LEAST_SD_M_S)
@@ -220,7 +220,7 @@ class RestEvidence:
             del self._at_speed[row]
 
     def smooth_ride(self, t_ns: int) -> bool:
-        """True if, before `t_ns`, the vehicle has been as quiet at speed as at rest: then quiet
-        says nothing."""
+        """True if, before `t_ns`, the vehicle was as quiet at speed as at rest, so that quiet
+        proves nothing."""
         first = bisect_right(self._at_speed, t_ns - SMOOTH_NS)
         return bisect_left(self._at_speed, t_ns) - first >= SMOOTH_WINDOWS

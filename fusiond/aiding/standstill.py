@@ -1,4 +1,4 @@
-r"""Standstill: zero velocity and zero rate, where rest has stood its tests.
+r"""Zero-velocity and zero-rate updates, once the vehicle is confirmed at rest.
 
     z = v^ - 0 = dv + v
     z = mean of w^ over the window - C^T w_ie = e + v
@@ -76,7 +76,7 @@ SCATTERS = 0.95
 
 
 def _rate_error(state: State, mean_rate: Array) -> Array:
-    """Mean rates (3,) or (k, 3) less the bias's estimate and the Earth's."""
+    """Mean rates (3,) or (k, 3) less the estimated bias and the Earth's rate."""
     lat = state.nav[LAT]
     bias = np.array([sum(state.xi[s] for s in state.model.parameters(9 + j)) for j in range(3)])
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
@@ -101,7 +101,7 @@ def _normalised(v: list[float], p: list[list[float]], least: float) -> float:
 
 @lru_cache(maxsize=64)
 def _evenly(windows: int, window_s: float) -> float:
-    """Over the variance by which so many of a creep scatter, that of its turn, at the most."""
+    """Ratio of the mean scatter of a creep's windows to the variance of its turn, at most."""
     lags = range(1, windows)
     alike = sum((windows - d) * math.exp(-d * window_s / CREEP_LASTS_S) for d in lags)
     alike *= 2.0 / (windows * (windows - 1))
@@ -121,7 +121,7 @@ class Rest:
     window_s: float = 1.0
 
     def doubt(self, state: State) -> str | None:
-        """The name of what refutes rest; None if nothing does."""
+        """Name of the refutation of rest; None without one."""
         p, w = state.covariance, self.window
         if p is None:
             return "moving" if state.speed > self.max_speed_m_s else None
@@ -151,12 +151,12 @@ class Rest:
         return None
 
     def _measured(self, windows: int) -> Measured:
-        """In the last of so many windows."""
+        """Number of windows in the last measurement."""
         end_ns = self.window.end_ns
         return self.rest_evidence.measured(end_ns - round(windows * self.window_s * 1e9), end_ns)
 
     def creeps(self, state: State) -> Array:
-        """Variances (3,), rad^2/s^2, of what may have turned though nothing has refuted rest."""
+        """Variances (3,), rad^2/s^2, of a possible slow turn although rest is not refuted."""
         p, w = state.covariance, self.window
         if p is None:
             return np.zeros(3)
@@ -170,7 +170,7 @@ class Rest:
 
     def _turns(self, state: State, p: Array) -> bool:
         """True if an axis has turned in the window, or in the run of windows, by more than bias and
-        noise make."""
+        noise allow."""
         w, free = self.window, self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2
         errors = _rate_error(state, np.array((w.mean_rate, w.run_rate))).tolist()
         for axis in range(3):
@@ -195,7 +195,7 @@ class ZeroVelocityUpdate(AidingMeasurement):
 
     @property
     def rests_s(self) -> float:
-        """Until the next window has said as much, and is no more than half of one late."""
+        """Duration (s) of proven rest: to the next window, with half a window's tolerance."""
         return 1.5 * self.rest.window_s
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

@@ -56,12 +56,12 @@ Array = NDArray[np.float64]
 
 _BODY = Struct("<10d8q")
 SUFFIX = "_velocity"
-"""Suffix that a receiver's velocity adds to its name."""
+"""Suffix of a source's name for a receiver's velocity."""
 AVERAGED = 0.5
-"""One sigma of what an average leaves of a velocity that changes within it, as a share of what its
-lag makes: of a change at once it is between nothing and all. With 0.5 what steps of stamps and
-forces explain of drive_0708 (receiver's lag 0.13 s) is chi-square (mean l / p of 1.1 and 0.9; 5.2
-and 1.7 without it, with seven decisions in six runs; 0.7 and 0.6 with 1)."""
+"""One sigma of a velocity's averaging error, as a share of the effect of its lag; a sudden change
+leaves between nothing and all. With 0.5 the steps of stamps and forces that explain drive_0708
+(receiver's lag 0.13 s) follow chi-square (mean l / p of 1.1 and 0.9; 5.2 and 1.7 without it, with
+seven decisions in six runs; 0.7 and 0.6 with 1)."""
 CORNER_RAD_S = 0.2
 """Usual turn rate of a vehicle at a street corner: a quarter turn in six to eight seconds.
 By so much times its lever arm an antenna goes its own way."""

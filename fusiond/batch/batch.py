@@ -14,7 +14,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from fusiond.batch.drives import drive_row
+from fusiond.batch.log_row import drive_row
 from fusiond.configuration.load import config_digest, load_config
 from fusiond.files.parquet_rows import Row, RowFile
 from fusiond.workers.outcome import Outcome, Runner
@@ -29,7 +29,7 @@ def run_batch(
     runner: Runner,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
-    """Number of rows that were there, and of new rows by how they ended.
+    """Write a row for each log; the counts of rows by outcome.
 
     Raises `ConfigError`, `MissingPackageError`, `TableError` for an `out` that is no file of rows,
     OSError; of what happens to a log nothing.

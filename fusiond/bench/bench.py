@@ -60,7 +60,7 @@ from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.raw_epoch import raw_epoch
 from fusiond.bench.start import start
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
@@ -96,7 +96,7 @@ LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
 
 
 def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[str, Any]:
-    """The figures, with the versions and the processor that they hold for."""
+    """Run the benchmarks; figures with versions and processor."""
     product = _product()
     figures: dict[str, Any] = {}
     products: list[float] = []
@@ -174,7 +174,7 @@ def _product() -> Callable[[], float]:
 
 
 def _filter(steps: int, rate_hz: float = IMU_RATE_HZ) -> tuple[Model, KalmanEstimator, ImuBuffer]:
-    """A filter at rest at time 0 and `steps` noisy samples ahead of it."""
+    """Filter at rest at time 0 with `steps` noisy samples ahead of it."""
     imu = Imu(rate_hz=rate_hz)
     model = make_model("ins21", imu_noise(imu))
     buffer = ImuBuffer(rate_hz, steps / rate_hz, np.eye(3), 0.0, imu.gap_s)
@@ -248,7 +248,7 @@ def _one_source() -> list[Linearised]:
 
 
 def _three_sources() -> list[Linearised]:
-    """A position of each source each second, one after the other."""
+    """Positions of three sources in turn, one from each source every second."""
     count = len(LOCAL_FILTERS)
     return [
         _fix(LOCAL_FILTERS[k % count], (k + 1) * 1_000_000_000 // count)
@@ -259,7 +259,7 @@ def _three_sources() -> list[Linearised]:
 def _step_ratio(
     make: Callable[[Model, float], Estimator], measurements: list[Linearised], repetitions: int
 ) -> float:
-    """Processor time of an estimator's second over the centralised filter's, taken in turns.
+    """Ratio of an estimator's processor time to the centralised filter's, measured in turns.
 
     100 IMU samples and the measurements, in order of validity; median over the repetitions.
     """

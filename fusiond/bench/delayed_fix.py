@@ -1,4 +1,4 @@
-"""The worst tick: a fix that is 10 s late, on a vehicle with much to do again.
+"""Worst tick: a fix that is 10 s late, with much to process again after the rewind.
 
 IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at
 100 Hz. The tick in which the late fix comes takes it in, runs the last 10 s again with 2000 samples
@@ -23,13 +23,12 @@ from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 RATE_HZ, FIXES_HZ = 200.0, 10.0
 DELAY_S = 10.0
 AT_S, EVERY_S = 110.0, 1.0
-"""Delay of the first fix after the start, and how long the drive then goes on until the next
-does."""
+"""Time of the first delayed fix after the start, and the interval between delayed fixes."""
 SAMPLES, TICK_SAMPLES = round(RATE_HZ / FIXES_HZ), round(RATE_HZ / 100.0)
 
 
 class Drive:
-    """A navigator that is run from measurement to measurement, with delayed fixes inserted."""
+    """Navigator that is run from measurement to measurement, with delayed fixes inserted."""
 
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
@@ -64,7 +63,7 @@ class Drive:
         return work
 
     def go_on(self, until_s: float) -> None:
-        """Advance to that instant, at which an epoch comes next."""
+        """Advance to `until_s`, the instant of the next epoch."""
         until = round(until_s * RATE_HZ)
         while self._row < until:
             self.fix()
@@ -73,12 +72,12 @@ class Drive:
         assert self.navigator.started is not None
 
     def tick(self) -> None:
-        """The samples of one tick, and the solution after them."""
+        """Add the samples of one tick and read its solution."""
         self._feed(TICK_SAMPLES)
         self.navigator.solution(int(self._times[self._row - 1]))
 
     def to_next_fix(self) -> None:
-        """The samples until the next epoch, and of it, come; the filter has run until the tick
+        """Add the samples up to and including the next epoch, and run the filter up to the tick
         before."""
         self._feed(SAMPLES - TICK_SAMPLES)
         rows = slice(self._row, self._row + TICK_SAMPLES)

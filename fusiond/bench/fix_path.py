@@ -32,7 +32,7 @@ class FixPath(NamedTuple):
 
     @property
     def modules(self) -> int:
-        """In how many modules they are."""
+        """Number of modules that contain these functions."""
         return len({module for module, _ in self.calls})
 
 

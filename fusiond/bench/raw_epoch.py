@@ -18,7 +18,7 @@ import numpy as np
 from drivers.raw.messages import RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
 from fusiond.gnss.orbit import is_beidou_geo
@@ -35,7 +35,7 @@ EPOCHS = 100
 
 
 def raw_epoch(_: int) -> Callable[[], int]:
-    """Work of `EPOCHS` epochs, each with all that the daemon does with one."""
+    """Work of `EPOCHS` epochs, each processed as in the daemon."""
     truth = SCENARIOS["drive"].truth(10.0)
     receiver = GnssRaw(truth, GnssRawOptions(signals=SIGNALS), np.random.default_rng(1))
     section = RawAiding(systems=("G", "C"))

@@ -1,4 +1,4 @@
-"""Cost of `fusiond process` before its first row: a process of its own, kernels in the cache.
+"""Cost of `fusiond process` before its first row, in a new process with cached kernels.
 
 From the start of the interpreter over imports, kernels linked, files read and a vehicle that stands
 until it is aligned, to the first rows; the few hundred rows of the file are a hundredth of that.
@@ -22,7 +22,7 @@ from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 
 DRIVE_S = 70.0
-"""The scenario `drive` moves off after a minute, and is aligned four seconds later."""
+"""Length of the drive: `drive` moves off after a minute and is aligned four seconds later."""
 CONFIG = """\
 [imu]
 rate_hz = 100.0
@@ -33,7 +33,7 @@ lever_arm_m = [0, 0, -1]
 
 
 def start(folder: Path) -> Callable[[], float]:
-    """Seconds of processor time, user and system, of one run over files made in `folder`."""
+    """Processor time (s), user and system, of one run on files made in `folder`."""
     files = simulate(SCENARIOS["drive"], folder, duration_s=DRIVE_S).files
     config = folder / "start.toml"
     config.write_text(CONFIG)

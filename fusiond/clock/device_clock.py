@@ -1,4 +1,4 @@
-"""Mapping a device's counter to the host's monotonic clock from samples that arrive late.
+"""Mapping of a device's counter to the host's monotonic clock, from delayed samples.
 
     d_i = t_seen_i - ticks_i = offset + delay_i,    delay_i >= its least value
 
@@ -17,9 +17,10 @@ from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
 _BUCKETS = 16
 _SLEW_DIVISOR = 100
-"""An upward correction stretches the spacing of samples by at most 1 %."""
+"""Divisor of an upward correction: it stretches the spacing of samples by at most 1 %."""
 _JITTER_NS = 50 * MILLISECOND_NS
-"""Beyond the jitter of a serial line (1 to 16 ms for USB); 5000 ppm of drift over the window."""
+"""Jitter limit: above the jitter of a serial line (1 to 16 ms for USB); 5000 ppm of drift over the
+window."""
 _DELAYED_FOR_NS = 120 * SECOND_NS
 """A busy host is late for seconds; what lasts for two minutes is the device's clock."""
 _CONFIRM_SAMPLES = 3
@@ -101,7 +102,7 @@ class DeviceClock:
         self._odd: list[tuple[int, int]] = []
 
     def to_monotonic(self, ticks_ns: int, t_seen_ns: int) -> int:
-        """Monotonic instant (ns) of `ticks_ns`, which came in at `t_seen_ns`.
+        """Monotonic instant (ns) of `ticks_ns`, which arrived at `t_seen_ns`.
 
         Not after it, but for one nanosecond a sample where only that keeps them in order.
         """
@@ -128,13 +129,14 @@ class DeviceClock:
         return t_ns
 
     def _is_odd(self, ticks_ns: int, last_ns: int, t_seen_ns: int) -> bool:
-        """Ahead of its own arrival, or behind the sample before: lateness explains neither."""
+        """True for a count after its own arrival, or before the last sample: no latency explains
+        it."""
         assert self._filter.offset_ns is not None
         early_ns = ticks_ns + self._filter.offset_ns - t_seen_ns
         return early_ns > _JITTER_NS or ticks_ns < last_ns - _JITTER_NS
 
     def _follow(self, ticks_ns: int, t_seen_ns: int) -> bool:
-        """True if the counts held back, with this one, are the clock's new reading."""
+        """True if the rejected counts and this one form the clock's new reading."""
         assert self._filter.offset_ns is not None
         self._counters["device_tick_odd"] += 1
         d = t_seen_ns - ticks_ns

@@ -24,13 +24,13 @@ _STEP_NS = MILLISECOND_NS
 """NTP slews at 500 ppm at most (adjtimex(2)); with 1000 ppm and 1 ms allowed the rest are steps."""
 _SLEW_PER_NS = 1000
 _BRACKET_NS = 50_000
-"""Reading realtime between two monotonic readings further apart than this was interrupted."""
+"""Longest bracket of a realtime reading by two monotonic ones; a longer one was interrupted."""
 _SLEPT_NS = 10 * MILLISECOND_NS
 """Boottime minus monotonic is constant while the host runs; reading both takes microseconds."""
 _AFTER_STEP_NS = 2 * SECOND_NS
-"""Frames stamped before a step of the system clock are out of the kernel's queue by then."""
+"""Time after a step of the system clock until no frame in the kernel's queue has an older stamp."""
 _BELIEVE_STEP_NS = 120 * SECOND_NS
-"""A step that is taken back within two minutes was a mistake (chrony makes its own at start)."""
+"""Time after which a step is believed; chrony reverts its own first step within two minutes."""
 
 ReadClock = Literal["realtime", "boottime"]
 
@@ -51,7 +51,7 @@ class HostTime(Protocol):
 
 
 class SystemTime:
-    """The clocks of this machine."""
+    """Clocks of this computer."""
 
     monotonic_ns = staticmethod(time.monotonic_ns)
 
@@ -151,7 +151,7 @@ class SystemClock:
         return offset
 
     def monotonic_of(self, realtime_ns: int, t_seen_ns: int) -> int:
-        """The monotonic instant (ns) of a frame that the kernel stamped, seen at `t_seen_ns`.
+        """Monotonic instant (ns) of a frame with a kernel stamp, seen at `t_seen_ns`.
 
         After a step, frames stamped before it are still queued: of the two readings that one is
         right which is the younger without lying in the future. Counter: `kernel_stamp_remapped`.
@@ -166,11 +166,11 @@ class SystemClock:
         return chosen
 
     def state(self) -> dict[str, int | None]:
-        """All that it knows, for `restore`."""
+        """State for `restore`."""
         return {name: getattr(self, name) for name in _KNOWN}
 
     def restore(self, state: Mapping[str, int | None]) -> None:
-        """Go on as the one did whose state this is. KeyError where something is missing."""
+        """Restore a state. Raises KeyError for an incomplete one."""
         for name in _KNOWN:
             setattr(self, name, state[name])
 

@@ -1,4 +1,4 @@
-"""Monotonic time out of a recorder's stamps, whose clock may be set while it records.
+"""Monotonic time from a recorder's stamps, whose clock may be set while it records.
 
 A recorder stamps frames by a clock that somebody sets: NTP, a receiver, an operator, once the
 computer is up. Between two frames the stamps then advance by what passed and by what it was set:
@@ -28,25 +28,25 @@ from typing import Literal, NamedTuple
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
 AHEAD_NS = SECOND_NS
-"""A stamp that is later than those that follow by more is damaged: a recorder writes as frames
-come, and two controllers' clocks agree better."""
+"""Lead over the following stamps from which a stamp is damaged: a recorder writes frames on
+arrival, and two controllers' clocks agree better."""
 LEAP_NS = 200 * MILLISECOND_NS
-"""A receiver's reports of UTC are at most so late on a healthy line (fusiond.clock.utc_envelope):
-of a smaller step they say nothing, and the envelope follows it."""
+"""Least step that reports of UTC can show: the largest delay of a receiver on a healthy line
+(fusiond.clock.utc_from_arrivals). The envelope follows a smaller step."""
 ASKED_AGAIN_NS = 20 * SECOND_NS
-"""Time for which a bus whose controllers disagree is not asked once more whether its clock was
-set."""
+"""Interval between checks for a set clock on a bus whose controllers disagree."""
 ORDINARY = 3
-"""Pause, in multiples of the longest lately, that a sparse bus may have."""
+"""Longest normal pause of a sparse bus, in multiples of its longest recent one."""
 FOLLOWING = 8
-"""Frames by which damage is told from a clock that was set: most must agree."""
+"""Frames that distinguish damage from a set clock: most must agree."""
 _LATELY = 64
 _OWN_PERIOD = 512
-"""Frames among which the last two of the same identifier are looked for."""
+"""Frames searched for the last two with the same identifier."""
 REPORTS = 5
 """Reports of UTC before and after a jump whose medians are compared."""
 ENOUGH_REPORTS = 3
-"""As many as UTC itself is followed by (`utc_envelope`): two may be one queue's."""
+"""Fewest reports that prove a step, as for UTC itself (`utc_envelope`): two may come from one
+queue."""
 
 Verdict = Literal["taken", "time_backwards", "time_ahead"]
 SetOff = Callable[[], int | None]
@@ -55,15 +55,15 @@ Of = tuple[Hashable, int]
 
 
 class Step(NamedTuple):
-    """The recorder's clock was set by `set_ns` when its stamp was `stamp_ns`."""
+    """Step: the recorder's clock was set by `set_ns` when its stamp was `stamp_ns`."""
 
     stamp_ns: int
     set_ns: int
 
 
 class Slew(NamedTuple):
-    """The recorder's clock, without its steps, gains `rate` seconds a second from `begin_ns` to
-    `end_ns` of its time."""
+    """Slew: the clock, without its steps, gains `rate` s/s from `begin_ns` to `end_ns` of its
+    time."""
 
     begin_ns: int
     end_ns: int
@@ -88,15 +88,15 @@ class RecorderClock:
         self._spacings: deque[int] = deque(maxlen=_LATELY)
         self._frames: deque[tuple[Of, int]] = deque(maxlen=_OWN_PERIOD)
         self._of_channel: dict[Hashable, int] = {}
-        """Its last stamp."""
+        """Last stamp of each channel."""
 
     @property
     def ahead_ns(self) -> int:
-        """All steps and slews together: the last stamps less monotonic time."""
+        """Sum of all steps and slews: the last stamps minus monotonic time."""
         return sum(step.set_ns for step in self.steps) + self.slewed_ns
 
     def is_odd(self, stamp_ns: int, of: Of) -> bool:
-        """True if `take` has to look at what follows."""
+        """True if `take` needs the following frames."""
         change = stamp_ns - self.stamp_ns
         if not self._started:
             return True
@@ -106,7 +106,7 @@ class RecorderClock:
         return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
     def jumps(self, change_ns: int) -> bool:
-        """True if stamps that advance by so much say that the clock was set, or paused."""
+        """True if such an advance of stamps shows a set clock, or a pause."""
         spacing_ns = max(self._spacings, default=0)
         return change_ns < -AHEAD_NS or change_ns >= max(LEAP_NS, ORDINARY * spacing_ns)
 
@@ -117,7 +117,7 @@ class RecorderClock:
         self._of_channel[of[0]] = stamp_ns
 
     def take(self, stamp_ns: int, of: Of, following: Sequence[int], set_by_utc: SetOff) -> Verdict:
-        """The stamp of a frame before those that follow (`FOLLOWING`).
+        """Monotonic instant of a frame, given the stamps that follow it (`FOLLOWING`).
 
         `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
         say nothing. It is asked where a step is possible.
@@ -152,7 +152,8 @@ class RecorderClock:
         return "taken"
 
     def _little_back(self, stamp_ns: int, of: Of, set_by_utc: SetOff) -> Verdict:
-        """By so little that controllers of one channel may disagree: UTC must say more."""
+        """True for a small step back, within the disagreement of controllers: only UTC can prove
+        it."""
         change = stamp_ns - self.stamp_ns
         denied = self._denied_ns is not None and stamp_ns - self._denied_ns < ASKED_AGAIN_NS
         set_ns = None if denied or change > -LEAP_NS else set_by_utc()
@@ -174,7 +175,7 @@ class RecorderClock:
         self._frames.append((of, self.t_ns))
 
     def _gained(self, passed_ns: int) -> int:
-        """By slews, while so much passed by the stamps."""
+        """Gain by slews in `passed_ns` of the stamps."""
         begin_ns = self.t_ns + self.slewed_ns
         end_ns, gained_ns = begin_ns + passed_ns, 0
         while self._slews and self._slews[0].begin_ns < end_ns:
@@ -199,7 +200,7 @@ class RecorderClock:
         self._on(stamp_ns, passed, of)
 
     def _due_ns(self, of: Of) -> int:
-        """Time from the last frame until the next of this channel and identifier is due."""
+        """Time from the last frame to the next expected one of this channel and identifier."""
         times = [t_ns for each, t_ns in self._frames if each == of][-2:]
         spacing = median_low(self._spacings) if self._spacings else 0
         if len(times) < 2:
@@ -214,14 +215,14 @@ class RecorderClock:
         return 2 * len(on) <= len(following)
 
     def _is_ahead(self, stamp_ns: int, following: Sequence[int]) -> bool:
-        """Of a stamp that leapt: whether most of what follows has not."""
+        """True if most of the following stamps have not jumped with this one."""
         behind = [f for f in following if self.stamp_ns - AHEAD_NS < f < stamp_ns - AHEAD_NS]
         return 2 * len(behind) > len(following)
 
 
 def own_share(total_ns: int, own_ns: int, others_ns: int) -> int | None:
-    """Of several leaps that together were set by `total_ns`: by how much the first, of `own_ns`,
-    was. All of them were set, or the first alone, or none but the others; else None."""
+    """Share of the first of several jumps in a step of `total_ns`. Either all jumped, or the first
+    alone, or only the others; None if none of these fits."""
     for expected_ns, share_ns in (
         (own_ns + others_ns, own_ns),
         (own_ns, own_ns),
@@ -234,7 +235,7 @@ def own_share(total_ns: int, own_ns: int, others_ns: int) -> int | None:
 
 
 def set_by(before: Sequence[int], after: Sequence[int]) -> int | None:
-    """By how much a clock was set, from stamp less reported UTC before and after (ns).
+    """Step of the clock, from stamp minus reported UTC before and after (ns).
 
     None where there are too few reports, or where their scatter would hide it.
     """

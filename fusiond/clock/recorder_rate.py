@@ -11,8 +11,8 @@ reports: as long as one line passes all reports of a stretch within their own sc
 changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
 
 A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
-explains: the envelope of UTC (fusiond.clock.utc_envelope) follows all else. That of the first and
-of the last reports is held before and behind them, for as long as it was seen.
+explains: the envelope of UTC (fusiond.clock.utc_from_arrivals) follows all else. That of the first
+and of the last reports is held before and behind them, for as long as it was seen.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ tells whole seconds alone tells each at its beginning."""
 FLOOR_NS = 2 * MILLISECOND_NS
 """Scatter of reports at the least: a CAN controller's queue."""
 SCATTERS = 4.0
-"""Sigmas that a sound report may be off its line: one of 16,000 is further."""
+"""Largest deviation of a sound report from its line, in sigmas: one in 16,000 is larger."""
 DAMAGED = 2
 """Reports off a line that may be damage: three are a change."""
 FASTEST = 0.5
-"""Gain or loss beyond which nothing is a clock's rate: adjtimex(2) allows 0.1, and reports that
-halt or come at once are a receiver's."""
+"""Largest rate of a clock: adjtimex(2) allows 0.1. Reports that stop or come at once show a fault
+of the receiver."""
 
 
 class _Line(NamedTuple):
-    """Of reports `first` to `last`: lead of the recorder's time at `middle_s`, and its slope."""
+    """Line through reports `first` to `last`: the recorder's lead at `middle_s`, and its slope."""
 
     first: int
     last: int
@@ -70,10 +70,10 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
     before, after = (float(s[line.last] - s[line.first]) for line in (lines[0], lines[-1]))
     inner = (_edge(*pair, s) for pair in pairwise(lines))
     edges = [s[lines[0].first] - before, *inner, s[lines[-1].last] + after]
-    late = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
+    delayed = {line for pair in pairwise(lines) if not _meet(*pair, s) for line in pair}
     found, gained_s = [], 0.0
     for line, begin, end in zip(lines, edges, edges[1:], strict=False):
-        if line in late:
+        if line in delayed:
             continue
         first, last = float(s[line.first]), float(s[line.last])
         rate = line.slope / (1.0 - line.slope)  # a second of UTC for one of the recorder's
@@ -89,7 +89,7 @@ def slews(reports: Sequence[tuple[int, int]], drift_ppm: float) -> tuple[Slew, .
 
 
 def _thinned(reports: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Reports that go on by `SPACING_NS` at least, of which none is told again."""
+    """Reports at least `SPACING_NS` apart, without repetitions."""
     kept: list[tuple[int, int]] = []
     for t_ns, utc_ns in reports:
         if not kept or (utc_ns - kept[-1][1] >= SPACING_NS and t_ns > kept[-1][0]):
@@ -98,7 +98,7 @@ def _thinned(reports: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _scatter_s(s: np.ndarray, lead: np.ndarray) -> float:
-    """One sigma of a report, by how far each is off the line between its neighbours."""
+    """Sigma of a report, from its distance to the line between its neighbours."""
     share = (s[1:-1] - s[:-2]) / (s[2:] - s[:-2])
     off = lead[1:-1] - lead[:-2] - share * (lead[2:] - lead[:-2])
     sigma = float(np.median(np.abs(off))) / 0.6745 / 1.5**0.5  # of three independent ones
@@ -106,8 +106,8 @@ def _scatter_s(s: np.ndarray, lead: np.ndarray) -> float:
 
 
 def _stretches(s: np.ndarray, lead: np.ndarray, within: float) -> list[tuple[int, int]]:
-    """First and last report of each stretch that one line passes; a report alone that none of its
-    neighbours agrees with is damage, and no stretch."""
+    """First and last report of each stretch that one line fits. A single report that no neighbour
+    agrees with is damage, not a stretch."""
     found, first = [], 0
     while first < len(s) - 1:
         least, most, last = -np.inf, np.inf, first
@@ -123,7 +123,7 @@ def _stretches(s: np.ndarray, lead: np.ndarray, within: float) -> list[tuple[int
 
 
 def _line(s: np.ndarray, lead: np.ndarray, first: int, last: int) -> _Line:
-    """Through the reports of a stretch, whatever a few of them say (Theil and Sen, by halves)."""
+    """Robust line through the reports of a stretch (Theil and Sen, by halves)."""
     at, y = s[first : last + 1], lead[first : last + 1]
     half = (len(at) + 1) // 2
     slope = median((y[half:] - y[: len(y) - half]) / (at[half:] - at[: len(at) - half]))
@@ -147,8 +147,8 @@ def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) 
 
 
 def _meet(one: _Line, other: _Line, s: np.ndarray) -> bool:
-    """True if a clock can go from one line on to the next: it does not leap, reports that queue
-    somewhere do as the queue builds up or is over."""
+    """True if a clock can continue from one line to the next without a jump. Delayed reports of a
+    queue jump when the queue builds up or ends."""
     last, first = float(s[one.last]), float(s[other.first])
     middle = (last + first) / 2.0
     ends = (line.lead_s + line.slope * (middle - line.middle_s) for line in (one, other))
@@ -157,7 +157,7 @@ def _meet(one: _Line, other: _Line, s: np.ndarray) -> bool:
 
 
 def _edge(one: _Line, other: _Line, s: np.ndarray) -> float:
-    """Time at which a line gives way to the next: where they meet, if between their middles."""
+    """Time at which a line gives way to the next: their intersection, if between their middles."""
     between = float(s[one.last] + s[other.first]) / 2.0
     turn = one.slope - other.slope
     if not turn:

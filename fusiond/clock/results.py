@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Instant(NamedTuple):
-    """Instant of validity (monotonic ns), one sigma of that (s), and the rule used."""
+    """Instant of validity (monotonic ns), its sigma (s) and the rule."""
 
     t_valid_ns: int
     sd_s: float
@@ -15,7 +15,7 @@ class Instant(NamedTuple):
 
 
 class TimeSample(NamedTuple):
-    """Reading of CLOCK_REALTIME when a report of the reference came in, and true UTC then (ns)."""
+    """Reading of CLOCK_REALTIME at a report of the reference, and true UTC then (ns)."""
 
     system_ns: int
     utc_ns: int

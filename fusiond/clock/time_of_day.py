@@ -1,4 +1,4 @@
-"""The full UTC instant of a time of day that comes without a date and perhaps without a zone.
+"""Full UTC of a time of day without a date and perhaps without a zone.
 
     candidate(z, d) = midnight(r) + d days + T - z,   z in the possible zones, d in {-1, 0, +1}
 
@@ -23,17 +23,17 @@ DAY_NS = 24 * HOUR_NS
 _BEFORE_REQUEST_NS = SECOND_NS // 2
 """The printed field may be rounded, and the request stamped late: rule of the sheet."""
 _UNASKED_NS = 10 * SECOND_NS
-"""Longest delay of a reply nobody asked for: rule of the sheet."""
+"""Longest delay of an unsolicited reply: rule of the sheet."""
 _LOCK_AFTER = 3
 _LEARN_FROM = 5
 _CLOCK_ERROR_NS = 5 * SECOND_NS
-"""Beyond this error of the daemon's clock the rule cannot hold."""
+"""Error of the daemon's clock beyond which the rule fails."""
 FALLBACK_SD_S = 0.5
-"""One sigma of an instant that rests on an assumed latency: rule of the sheet."""
+"""Sigma of an instant by an assumed latency: rule of the sheet."""
 
 
 class Dated(NamedTuple):
-    """A UTC instant (ns), its one sigma (s) and the name of the rule that gave it."""
+    """UTC instant (ns), its sigma (s) and the name of the rule."""
 
     utc_ns: int
     sd_s: float
@@ -54,7 +54,7 @@ def candidates(
 
 
 def nearest(time_of_day_s: float, zones_h: tuple[int, ...], r_ns: int) -> int:
-    """The reading nearest to `r_ns`, for a receiver whose fixes are at most seconds old."""
+    """Reading nearest to `r_ns`, for a receiver whose fixes are at most seconds old."""
     return min(
         (c for _, c in candidates(time_of_day_s, zones_h, r_ns)), key=lambda c: abs(c - r_ns)
     )
@@ -96,7 +96,7 @@ class RdssTimeOfDay:
         r_ns: int,
         q_ns: int | None,
     ) -> Dated:
-        """UTC of a fix seen at `r_ns` and requested at `q_ns` (None: not asked for)."""
+        """UTC of a fix seen at `r_ns` and requested at `q_ns` (None: not requested)."""
         zones = zones_h if self._zone_h is None else (self._zone_h,)
         all_readings = list(candidates(time_of_day_s, zones, r_ns))
         unsure_ns = round(uncertainty_s * SECOND_NS)

@@ -57,7 +57,7 @@ COMMANDS = (
 
 
 def command_line(commands: Iterable[Callable[..., None]]) -> typer.Typer:
-    """With these commands."""
+    """Command-line application with these commands."""
     made = typer.Typer(
         help="Inertial navigation aided by BeiDou RDSS and GNSS.",
         no_args_is_help=True,
@@ -103,9 +103,9 @@ def main() -> None:
 
 
 def _leave(code: int | str | None) -> NoReturn:
-    """End the process in the interpreter's order, but let go of its memory as a whole: to free what
-    was imported object by object takes a twentieth of the processor time of a start. Other threads,
-    or who traces or profiles, have it end the ordinary way."""
+    """End the process without freeing its memory object by object. Freeing every import takes a
+    twentieth of the processor time of a start. With other threads, a tracer or a profiler the
+    process ends the ordinary way."""
     alone = threading.active_count() == 1 and not (sys.gettrace() or sys.getprofile())
     if alone and not isinstance(code, str):
         atexit._run_exitfuncs()

@@ -1,4 +1,4 @@
-"""Command batch, and the workers that it shares with study."""
+"""Command `batch`, and the workers that it shares with `study`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -38,7 +38,7 @@ Timeout = Annotated[
 def runner_of(
     workers: int | None, cluster: str | None, timeout_s: float | None
 ) -> Iterator[Runner]:
-    """Processes here, or those of a cluster; exit 69 where there are none to be had."""
+    """Runner on local processes or on a cluster; exit 69 where none is available."""
     from fusiond.workers.cluster import Cluster, ClusterError  # noqa: PLC0415
     from fusiond.workers.pool import Pool, PoolError, processors  # noqa: PLC0415
 
@@ -58,7 +58,7 @@ def runner_of(
 
 @contextmanager
 def row_errors() -> Iterator[None]:
-    """As `data_errors`; exit 69 where the package for rows is missing."""
+    """Handle errors as `data_errors`; exit 69 where the package for rows is missing."""
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     try:

@@ -136,8 +136,8 @@ def init(
 def _measured_axes(
     imu: Device | None, forward: str | None = None
 ) -> tuple[tuple[str, str, str], str]:
-    """Axes with down as gravity shows it, and what is known of them in words. Without `forward`,
-    which a drive shows, it is assumed to be the first axis that is level."""
+    """Sensor axes with down by gravity, and a sentence on their origin. Without `forward`, which a
+    drive shows, the first level axis is assumed."""
     from fusiond.doctor.forward_axis import axes_of  # noqa: PLC0415
 
     if imu is None or imu.down is None:
@@ -215,7 +215,8 @@ def _bus(text: str) -> tuple[Interface, str]:
 
 
 def _sources(devices: list[Device]) -> list[DraftSource]:
-    """Named after what they are, with a number where there are more; the first IMU alone."""
+    """Sections of the sources, named after their kind, numbered where there are several; only the
+    first IMU."""
     from fusiond.configuration.draft import DraftSource  # noqa: PLC0415
 
     sources: dict[str, DraftSource] = {}
@@ -237,7 +238,7 @@ def _sources(devices: list[Device]) -> list[DraftSource]:
 
 
 def _write(draft: Draft, out: Path) -> None:
-    """The file, after it has been found good."""
+    """Write the configuration file after validating it."""
     from tempfile import TemporaryDirectory  # noqa: PLC0415
 
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_UNAVAILABLE,
     ConfigPath,
@@ -47,7 +47,7 @@ def run(config: ConfigPath, record: RecordPath = None) -> None:
 
 
 def recorded(config: Config, folder: Path | None) -> Config:
-    """The configuration, with all recorded into `folder` if there is one."""
+    """Configuration that records everything into `folder`, if there is one."""
     if folder is None:
         return config
     update = {"directory": folder.absolute(), "when": "always"}

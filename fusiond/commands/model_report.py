@@ -9,7 +9,7 @@ from rich.console import Console
 
 from fusiond.commands.tables import print_table
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, DEG_PER_HOUR, MILLI_G
+from fusiond.configuration.si_units import DEG, DEG_PER_HOUR, MILLI_G
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 
@@ -52,7 +52,7 @@ def model_report(name: str, config: Config | None) -> dict[str, Any]:
 
 
 def print_model(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print a model in the units of data sheets, to standard output or the given console."""
+    """Print a model in the units of data sheets, to `console` or standard output."""
     console = console or Console()
     held = ", height held" if report["hold_height"] else ""
     console.print(f"{report['model']}: {report['size']} states{held}", highlight=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fusiond.offline.calibrate import Pass
     from fusiond.offline.outages import Outage
 
-AID_KINDS = (
+MEASUREMENT_KINDS = (
     *("gnss", "rdss", "attitude", "bearing", "wheel", "barometer"),
     *("nmea", "ubx", "bestpos", "sbf", "raw"),
 )
@@ -49,9 +49,9 @@ CanLog = Annotated[
     Path | None,
     typer.Option("--can", metavar="LOG", help="Recorded CAN bus: .log, .asc, .blf, .trc, .mf4."),
 ]
-AidFiles = Annotated[
+MeasurementFiles = Annotated[
     list[str] | None,
-    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
+    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(MEASUREMENT_KINDS)}."),
 ]
 
 
@@ -59,7 +59,7 @@ def process(
     config: ConfigPath,
     imu: ImuFile = None,
     can: CanLog = None,
-    aid: AidFiles = None,
+    aid: MeasurementFiles = None,
     outage: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,7 +81,7 @@ def process(
     json_path: JsonPath = None,
 ) -> None:
     """Navigate through recorded files with the daemon's own navigator."""
-    aids = [_aid_argument(text) for text in aid or []]
+    measurements = [_measurement_argument(text) for text in aid or []]
     outages = [_outage_argument(text) for text in outage or []]
     if out is not None and str(out) == "-" == json_path:
         raise typer.BadParameter("--out and --json cannot both be standard output")
@@ -96,7 +96,7 @@ def process(
 
         raw_receivers(settings.aiding)  # what they compile comes with the rest
     wanted = _systems_argument(systems)
-    given = (settings, imu, aids, outages, out, wanted, can)
+    given = (settings, imu, measurements, outages, out, wanted, can)
     with _missing_packages(), config_errors(), data_errors(), progress_bar("processing") as bar:
         result = run_process(*given, smooth=smooth, progress=bar or (lambda done, total: None))
     _print_summary(result, err="-" in (json_path, str(out)))
@@ -108,7 +108,7 @@ def process(
 
 @contextmanager
 def _missing_packages() -> Iterator[None]:
-    """Exit with the reason where a package for a file's format is not installed."""
+    """Exit with the reason where the package of a file format is missing."""
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     try:
@@ -121,7 +121,7 @@ def _missing_packages() -> Iterator[None]:
 def _recording(logs: list[Path]) -> Pass:
     """A pass through the daemon's recording."""
     from fusiond.recording.reader import Log  # noqa: PLC0415
-    from fusiond.replay.watched import watched  # noqa: PLC0415
+    from fusiond.replay.calibration_replay import watched  # noqa: PLC0415
 
     # Its events are those of the drive, which has been: the report shows them.
     logging.getLogger("fusiond").addHandler(logging.NullHandler())
@@ -135,16 +135,16 @@ def calibrate(
     ] = None,
     imu: ImuFile = None,
     can: CanLog = None,
-    aid: AidFiles = None,
+    aid: MeasurementFiles = None,
     out: Annotated[
         Path | None, typer.Option(metavar="F.toml", help="Write the lines of TOML there too.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML: of files, or
-    of the daemon's own recording."""
-    aids = [_aid_argument(text) for text in aid or []]
-    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
+    """Estimate mounting, lever arms, offsets and scales from one recorded drive, as TOML; input:
+    files or a recording of the daemon."""
+    measurements = [_measurement_argument(text) for text in aid or []]
+    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and measurements):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
     settings = load(config)
     from fusiond.commands.recordings import log_errors  # noqa: PLC0415
@@ -154,7 +154,7 @@ def calibrate(
         from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
         from fusiond.offline.calibrate import files  # noqa: PLC0415
 
-        navigate = _recording(logs) if logs else files(imu, aids, can)
+        navigate = _recording(logs) if logs else files(imu, measurements, can)
         raw_receivers(settings.aiding)  # what they compile comes with the rest
     with (
         _missing_packages(),
@@ -240,7 +240,7 @@ def compare(
     ] = 0.0,
     json_path: JsonPath = None,
 ) -> None:
-    """Errors of a solution, and how they sit with its stated sigma."""
+    """Compare a solution with a truth: errors, and their ratio to the stated sigma."""
     from fusiond.commands.compare_report import print_report  # noqa: PLC0415
     from fusiond.files.csv_tables import file_report  # noqa: PLC0415
     from fusiond.files.tables import read_solution, read_truth  # noqa: PLC0415
@@ -262,16 +262,16 @@ def compare(
     write_json(report, json_path)
 
 
-def _aid_argument(text: str) -> tuple[str, Path]:
-    """KIND=FILE."""
+def _measurement_argument(text: str) -> tuple[str, Path]:
+    """Parse KIND=FILE."""
     kind, equals, path = text.partition("=")
-    if not equals or not path or kind not in AID_KINDS:
-        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
+    if not equals or not path or kind not in MEASUREMENT_KINDS:
+        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(MEASUREMENT_KINDS)}")
     return kind, Path(path)
 
 
 def _outage_argument(text: str) -> Outage:
-    """START:LENGTH[:SOURCE,...]."""
+    """Parse START:LENGTH[:SOURCE,...]."""
     start, _, rest = text.partition(":")
     length, colon, sources = rest.partition(":")
     try:
@@ -287,7 +287,7 @@ def _outage_argument(text: str) -> Outage:
 
 
 def _systems_argument(text: str | None) -> tuple[System, ...] | None:
-    """C,G,E."""
+    """Parse satellite systems such as C,G,E."""
     if text is None:
         return None
     from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
@@ -299,7 +299,7 @@ def _systems_argument(text: str | None) -> tuple[System, ...] | None:
 
 
 def _print_summary(result: dict[str, Any], err: bool) -> None:
-    """`files`: what was read; `sources`: each aid's measurements by outcome; the solution."""
+    """Print what `files` were read, each source's measurements by outcome, and the solution."""
     for name, report in result["files"].items():
         _print_file(name, report, err)
     for name, outcomes in result["sources"].items():
@@ -327,7 +327,7 @@ def _print_summary(result: dict[str, Any], err: bool) -> None:
 
 
 def _print_file(name: str, report: dict[str, Any], err: bool) -> None:
-    """One file as `csv_tables.file_report` describes it."""
+    """Print the report of one file, made by `csv_tables.file_report`."""
     rejected = sum(report["rejected"].values())
     typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
     for row in report["first_rejected"]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -35,7 +35,7 @@ log = typer.Typer(help="Recordings: look into, cut, join, mend, hand on.", no_ar
 
 @contextmanager
 def log_errors() -> Iterator[None]:
-    """Exit 65 for what is no log, 74 for what cannot be read."""
+    """Exit 65 for a file that is not a log, 74 for one that cannot be read."""
     from fusiond.recording.reader import LogError  # noqa: PLC0415
 
     try:
@@ -159,7 +159,7 @@ def merge(logs: LogPaths, out: OutPath) -> None:
 def recover(
     damaged: Annotated[Path, typer.Argument(metavar="LOG", help="One file.")], out: OutPath
 ) -> None:
-    """Write what can be read of a file that was cut off or damaged."""
+    """Copy all readable messages of a damaged or truncated log."""
     from fusiond.recording.edit import recover as mend  # noqa: PLC0415
 
     with log_errors(), spinner("reading"):
@@ -182,8 +182,8 @@ def export(
     ] = 0.0,
 ) -> None:
     """Hand a log on: the track, the measurements as CSV tables, or a bag for ROS."""
-    from fusiond.recording.export import export as write_track  # noqa: PLC0415
     from fusiond.recording.reader import Log  # noqa: PLC0415
+    from fusiond.recording.track_export import export as write_track  # noqa: PLC0415
 
     with log_errors(), config_errors(), spinner("writing"), TemporaryDirectory() as folder:
         recording = Log(logs)
@@ -199,9 +199,9 @@ def export(
 
 def _export_measurements(recording: Log, folder: Path, out: Path, to: str) -> dict[str, int]:
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+    from fusiond.replay.csv_export import write_tables  # noqa: PLC0415
     from fusiond.replay.replay_config import config_of  # noqa: PLC0415
-    from fusiond.replay.rosbag import write_rosbag  # noqa: PLC0415
-    from fusiond.replay.tables import write_tables  # noqa: PLC0415
+    from fusiond.replay.rosbag_export import write_rosbag  # noqa: PLC0415
 
     config = config_of(recording.about, folder)
     if to == "csv":

@@ -34,7 +34,7 @@ def report(
         typer.Option(metavar="F.html", help="The page; here, by the first file's name, if none."),
     ] = None,
 ) -> None:
-    """Write what happened on a drive, or on many, as one HTML file, which needs no network."""
+    """Write a report of one drive, or of many, as one HTML file that needs no network."""
     if (batch is None) == (not run) or (batch is not None and (truth or beside)):
         raise typer.BadParameter("a log or a solution, or --batch with rows and nothing else")
     if out is None:
@@ -43,7 +43,7 @@ def report(
     if batch is None:
         _of_drive(run or [], out, truth, beside or [])
     else:
-        from fusiond.report.drives import report_drives  # noqa: PLC0415
+        from fusiond.report.drives_page import report_drives  # noqa: PLC0415
 
         with row_errors(), spinner("writing the report"):
             drives = report_drives(batch, out)

@@ -1,4 +1,4 @@
-"""Commands that say what the numbers stand on: schema, study, model, bench."""
+"""Commands on models and studies: schema, study, model, bench."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fusiond.commands.batch import (
     row_errors,
     runner_of,
 )
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from fusiond.studies.stored_runs import KeptRuns
 
 FEWEST_RUNS = 8
-"""A worker loads its kernels for some two seconds, in which a study makes several runs."""
+"""Fewest runs for workers: loading a worker's kernels takes two seconds, as long as several
+runs."""
 
 
 def schema(
@@ -166,7 +167,7 @@ def model(
 
 
 def _studies_installed() -> None:
-    """Exit 69, and say what would do, where the extra `[studies]` is not there."""
+    """Exit 69 where the extra `[studies]` is missing, with the command that installs it."""
     from importlib.util import find_spec  # noqa: PLC0415
 
     missing = [name for name in ("scipy", "pywt", "matplotlib") if find_spec(name) is None]

@@ -64,7 +64,7 @@ def load(path: Path) -> Config:
 
 @contextmanager
 def data_errors() -> Iterator[None]:
-    """Exit 65 for a table that cannot be used, 74 for a file that cannot be read or written."""
+    """Exit 65 for a table that cannot be used, 74 for one that cannot be read or written."""
     from fusiond.files.csv_tables import TableError  # noqa: PLC0415
 
     try:
@@ -80,19 +80,18 @@ def data_errors() -> Iterator[None]:
 
 
 def freeze_imports() -> None:
-    """The code of a command is there, and lives as long as the process: no collection looks through
-    it any more, and from now on there are some."""
+    """Exempt the imported code of a command from garbage collection, and enable collection."""
     gc.freeze()
     gc.set_threshold(COLLECT_AFTER)
 
 
 def draws(stream: TextIO) -> bool:
-    """True if it is a terminal that can be drawn on."""
+    """True if `stream` is a terminal that supports drawing."""
     return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def spinner(text: str) -> AbstractContextManager[object]:
-    """A moving sign on a terminal, nothing in a pipe."""
+    """Show a spinner on a terminal, nothing in a pipe."""
     if not draws(sys.stderr):
         return nullcontext()
     from rich.console import Console  # noqa: PLC0415
@@ -115,7 +114,7 @@ def progress_bar(text: str) -> Iterator[Callable[[int, int], None] | None]:
 
 
 def plain(value: object) -> object:
-    """The same value in what JSON knows: nan and inf become null, paths text."""
+    """Convert a value to JSON types: nan and inf become null, paths text."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -128,7 +127,7 @@ def plain(value: object) -> object:
 
 
 def write_json(value: object, path: str | None) -> None:
-    """To a file, to standard output for "-", nowhere for None."""
+    """Write JSON to a file, to standard output for "-", nowhere for None."""
     if path is None:
         return
     text = json.dumps(plain(value), indent=2, allow_nan=False)

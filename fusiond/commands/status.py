@@ -30,8 +30,7 @@ EXIT_NO_SOLUTION = 1
 USABLE = ("navigating", "coasting")
 _CONNECT_S = 5.0
 _SETTLE_S = 0.3
-"""For the broker to hand over what it keeps of every vehicle, before the answer of one is taken
-for all that there is."""
+"""Time (s) in which the broker sends every vehicle's retained messages."""
 _LOOK_EVERY_S = 0.05
 _MOST_BYTES = 65_536
 """`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
@@ -41,7 +40,7 @@ _ASKED = ("status", "nav", "health")
 
 @dataclass(slots=True)
 class VehicleMessages:
-    """One vehicle's last message of each topic; `live` if any of it was said just now."""
+    """Last messages of one vehicle by topic; `live` if one was published just now."""
 
     topics: dict[str, Any] = field(default_factory=dict)
     online: str | None = None
@@ -57,7 +56,7 @@ class VehicleMessages:
 
 
 class UnansweredError(Exception):
-    """Nobody has answered; `state` says in a word why, the text what would do."""
+    """Error: no vehicle has answered. `state` is a keyword; the text says what to do."""
 
     def __init__(self, state: str, text: str) -> None:
         super().__init__(text)
@@ -115,7 +114,7 @@ def status(
 async def ask(
     host: str, port: int, access: Mqtt | None, vehicle: str | None, wait_s: float
 ) -> dict[str, VehicleMessages]:
-    """Retained messages of each vehicle, or of `vehicle` alone, after `wait_s` at most.
+    """Retained messages of each vehicle, or of `vehicle`, after at most `wait_s`.
 
     `access`: user, password and TLS. Raises `UnansweredError` where no broker lets us in.
     """
@@ -123,7 +122,7 @@ async def ask(
 
     import aiomqtt  # noqa: PLC0415
 
-    from fusiond.outputs import packet_limit  # noqa: PLC0415
+    from fusiond.outputs import oversized_packets  # noqa: PLC0415
 
     vehicles: dict[str, VehicleMessages] = {}
     loop = asyncio.get_running_loop()
@@ -152,7 +151,7 @@ async def ask(
         }
     try:
         asking = aiomqtt.Client(host, port, timeout=_CONNECT_S, **credentials)
-        packet_limit.limit(asking, _MOST_BYTES)
+        oversized_packets.limit(asking, _MOST_BYTES)
         async with asking as client:
             listening = asyncio.create_task(listen(client))
             await asyncio.wait({listening}, timeout=min(_SETTLE_S, wait_s))
@@ -183,7 +182,7 @@ def _receive(messages: VehicleMessages, topic: str, payload: bytes, retained: bo
 def chosen(
     vehicles: dict[str, VehicleMessages], vehicle: str | None, wait_s: float
 ) -> tuple[str, VehicleMessages]:
-    """The vehicle that is meant, if it answers. Raises `UnansweredError`."""
+    """Select the requested vehicle, if it answers. Raises `UnansweredError`."""
     there = {
         name: messages for name, messages in vehicles.items() if messages.online or messages.live
     }

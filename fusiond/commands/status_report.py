@@ -123,7 +123,7 @@ def _process(health: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _sources(
     sources: dict[str, dict[str, Any]], consistency: dict[str, Any] | None
 ) -> Iterator[str]:
-    """A row a source, and below it why it is not fused as usual: together within 80 columns."""
+    """Table of sources; below each the reason why it is not fused, within 80 columns."""
     verdicts = {} if consistency is None else consistency["sources"]
     rows = [("source", "state", "fused", "refused", "age", "latency", "verdict")]
     for name, source in sources.items():
@@ -157,7 +157,7 @@ def _state(source: dict[str, Any]) -> str:
 
 
 def _fault(source: dict[str, Any]) -> str:
-    """Fault of a device or of its measurements in words; empty without one."""
+    """Describe the fault of a device or of its measurements; empty without one."""
     if source["state"] != "running":
         return str(source["detail"])
     fault = source["diagnosis"]
@@ -183,7 +183,7 @@ def _time(seconds: float | None) -> str:
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    """Cells one below the other."""
+    """Align rows of cells into columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))

@@ -23,10 +23,10 @@ Place = tuple[
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 UNKNOWN_BIAS_SD_M = 1.0
-"""Error shared by fixes of which nothing is said: half of a data sheet's 1.5 to 2 m is noise."""
+"""Error shared by fixes where neither receiver nor configuration states it: half of a data sheet's
+1.5 to 2 m is noise."""
 UNKNOWN_LEVER_SD_M = 1.0
-"""One sigma, each axis, of where the antenna of a car or a van is, of which nothing is said: some
-0.5 to 3 m from the IMU."""
+"""Sigma of an unknown antenna position on each axis, for a car or van: 0.5 to 3 m from the IMU."""
 
 
 class Section(BaseModel):
@@ -64,7 +64,7 @@ class GnssAiding(Aiding):
     range_error_m: PositiveFloat = 3.0
     """Range error; times DOP it is the sigma of a fix without GST. See `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
-    """Value where the receiver states none."""
+    """Sigma where the receiver states none."""
     min_position_sd_m: PositiveFloat | None = None
     """Least sigma of a position. Default by the fix's quality: 0.3 m by code (0.5 m of height),
     0.05 m RTK float, 0.02 m RTK fixed."""
@@ -81,19 +81,19 @@ class GnssAiding(Aiding):
     """One sigma of the error of `lever_arm_m` on each axis; the filter estimates that error. 0:
     exact. Default: 1 m for the only receiver if its `lever_arm_m` is not set, else 0."""
     bias_sd_m: NonNegativeFloat | None = None
-    """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east, beside
-    what they state; fixes by carrier phase have half of what they state. Unless it is given, what
-    the receiver shows by its velocities counts, and 1 m of one without any: data sheets state 1.5
-    to 2 m for half of all fixes, noise included. 0: none is estimated, nor one that lasts for
+    """One sigma, north and east, of an error that fixes share for minutes (orbits, ionosphere),
+    beside the stated sigma; carrier-phase fixes have half of what they state. Default: as the
+    receiver's velocities show, or 1 m without velocities, since data sheets state 1.5 to 2 m for
+    half of all fixes, noise included. 0: no shared error is estimated, nor one that lasts for
     seconds, and sigma shrinks as if errors were white."""
     bias_down_sd_m: PositiveFloat = 3.0
-    """The same downwards, where most of the ionosphere goes."""
+    """Down component of the shared error, which has most of the ionosphere."""
     bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that error."""
 
     @property
     def shared_sd_m(self) -> float:
-        """`bias_sd_m`, or what it is where it is not given."""
+        """Value of `bias_sd_m`, or its default."""
         return UNKNOWN_BIAS_SD_M if self.bias_sd_m is None else self.bias_sd_m
 
 
@@ -108,25 +108,26 @@ class RawAiding(Aiding):
     cno_mask_db_hz: NonNegativeFloat = 28.0
     """Weaker signals are not used."""
     best_four: bool = False
-    """Use the four satellites of smallest GDOP alone (paper 002), not all in view."""
+    """Use only the four satellites of smallest GDOP (paper 002), not all in view."""
     bias_sd_m: NonNegativeFloat = 0.5
-    """Displacement that the ranges share for minutes (orbits, multipath), one sigma north and
-    east with eight satellites, less with more; 0: none is estimated, and sigma shrinks as if
+    """One sigma, north and east, of a displacement that the ranges share for minutes (orbits,
+    multipath), with eight satellites; less with more. 0: not estimated, and sigma shrinks as if
     errors were white."""
     bias_down_sd_m: PositiveFloat = 1.0
-    """The same downwards. What models of ionosphere and troposphere leave is beside it."""
+    """Down component of the shared displacement, beside the residual of ionosphere and troposphere
+    models."""
     bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that displacement."""
     clock_phase_m_sqrt_s: PositiveFloat = 0.1
     """Random walk of the receiver clock's offset; a temperature-compensated crystal's."""
     clock_drift_m_s_sqrt_s: PositiveFloat = 0.2
-    """Random walk of its drift; likewise."""
+    """Random walk of the clock's drift; likewise."""
     clock_drift_tau_s: PositiveFloat | None = None
     """Correlation time of the drift as a first-order Markov process about zero (paper 003), of the
-    same density for as long as that; without it the drift walks. Not for a crystal that is off
-    by a constant."""
+    same density over shorter times; without it the drift is a random walk. Unsuitable for a crystal
+    with a constant offset."""
     start_velocity_sd_m_s: PositiveFloat = 0.2
-    """One sigma of the velocity from one epoch's rates, which alignment starts with."""
+    """One sigma of the velocity from one epoch's rates, for alignment."""
 
 
 class RdssAiding(Aiding):
@@ -144,14 +145,14 @@ class RdssAiding(Aiding):
     """One sigma of a slant range after differential correction: 8 m satellite drift and 13 m
     ranging."""
     height_sd_m: PositiveFloat = 10.0
-    """One sigma of the height that the centre solves with. If the request gave the solution's
-    height, that height's sigma is used."""
+    """One sigma of the height in the centre's solution. If the request gave the solution's height,
+    that height's sigma is used."""
     fix_height_sd_m: PositiveFloat | None = 30.0
-    """One sigma of the fix's height. A height that the request gave is not used: it is the
+    """One sigma of the fix's height. A height from the request is not used, since it is the
     solution's own. Without any height measurement an inertial height diverges."""
     bias_sd_m: NonNegativeFloat = 15.0
-    """Error that successive fixes share (height model, satellite positions), one sigma an axis. 0:
-    not estimated; `docs/rdss-strategies.md` says why that is too sure."""
+    """One sigma on each axis of an error that successive fixes share (height model, satellite
+    positions). 0: not estimated; `docs/rdss-strategies.md` shows that sigma is then too small."""
     bias_correlation_s: PositiveFloat = 600.0
     """Correlation time of that error."""
 
@@ -161,8 +162,7 @@ class AttitudeAiding(Aiding):
 
 
 class Misaligned(Aiding):
-    """A measurement whose sensor is mounted a little askew: three small angles that the filter
-    estimates.
+    """Measurement by a misaligned sensor: three small angles that the filter estimates.
 
     The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
     device.
@@ -230,7 +230,7 @@ class BarometerAiding(Aiding):
 
     kind: Literal["barometer"] = "barometer"
     sd_m: PositiveFloat = 5.0
-    """Value where the device states none: gusts of 0.5 m that last for 5 s, told ten times a
+    """Sigma where the device states none: gusts of 0.5 m that last for 5 s, at ten measurements a
     second."""
     weather_sd_m: PositiveFloat = 100.0
     """One sigma of the offset at first: 10 hPa of weather (80 m) and the geoid (30 m)."""
@@ -247,14 +247,14 @@ class WheelAiding(Aiding):
 
     kind: Literal["wheel"] = "wheel"
     sd_m_s: PositiveFloat = 0.1
-    """Value where the device states none."""
+    """Sigma where the device states none."""
     scale: PositiveFloat = 1.0
     """Ratio of the device's speed to the true speed; `fusiond calibrate` finds it."""
     latency_s: float = 0.0
     """Latency of a speed."""
     drift_sd_m_s: NonNegativeFloat = 0.1
-    """One sigma of errors that last (slip, wheel load, rounding at a steady speed), a state; 0:
-    none."""
+    """One sigma of lasting errors (slip, wheel load, rounding at a steady speed), a state; 0: none.
+    """
     drift_s: PositiveFloat = 1.0
     """Correlation time of that error."""
     scale_sd: NonNegativeFloat = 0.02
@@ -284,9 +284,9 @@ AIDING_KINDS = tuple(
 
 
 def lever_sd_m(section: GnssAiding, aiding: Mapping[str, Aiding]) -> float:
-    """One sigma (m) of what a receiver's lever arm is wrong by, each axis, of the sections `aiding`
-    by source; 0 where it is not estimated. Two receivers' levers, which share one place, would be
-    more states than the kernels hold."""
+    """One sigma (m) on each axis of a receiver's lever arm error, for the sections `aiding` by
+    source; 0: not estimated. Two receivers' lever arms share one reference point and would exceed
+    the kernels' states."""
     if section.lever_arm_sd_m is not None:
         return section.lever_arm_sd_m
     receivers = sum(isinstance(each, GnssAiding) for each in aiding.values())

@@ -29,13 +29,13 @@ class Alignment(Section):
     ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course", "positions")
     """Allowed sources of the first heading, in order of preference."""
     heading_deg: float | None = None
-    """For `config`: true heading at the start."""
+    """True heading at the start, for `config`."""
     heading_sd_deg: PositiveFloat = 5.0
-    """One sigma of it."""
+    """One sigma of `heading_deg`."""
     position_deg_m: Vector | None = None
     """Latitude, longitude, height of the start, if no device gives a position."""
     position_sd_m: PositiveFloat = 100.0
-    """One sigma of it."""
+    """One sigma of the position."""
     levelling_s: PositiveFloat = 2.0
     """Rest needed to level by gravity."""
     course_speed_m_s: PositiveFloat = 3.0

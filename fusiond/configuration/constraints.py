@@ -17,7 +17,7 @@ class ZeroVelocity(Section):
     """Rest needs a smaller standard deviation on every axis; set twice the value with the engine
     on."""
     accel_sd_m_s2: PositiveFloat = 0.15
-    """The same for specific force."""
+    """Threshold of specific force, like that of rates."""
     max_rate_deg_s: PositiveFloat = 2.0
     """Rest needs a smaller mean rate, three sigma of the gyro's bias allowed."""
     max_speed_m_s: PositiveFloat = 0.5

@@ -1,4 +1,4 @@
-"""Doubts: valid configuration that cannot work, or is hardly meant.
+"""Doubts: a valid configuration that cannot work, or is probably unintended.
 
 `fusiond check` prints these; the daemon runs all the same, since a part that is missing today may
 be there tomorrow. Mistakes, which keep it from running, are found by `load`.
@@ -25,11 +25,11 @@ LONGEST_M: dict[VehicleClass, float] = {
     "marine": 400.0,
     "aircraft": 85.0,
 }
-"""Longest rigid body of a class, which no lever arm leaves: an articulated bus (18.75 m, directive
+"""Longest rigid body of a class, which bounds lever arms: an articulated bus (18.75 m, directive
 96/53/EC), a railway coach (27.5 m, UIC 567), a container ship (400 m), the An-225 (84 m)."""
 
 DEEPEST_M = 0.5
-"""Height of an antenna below the IMU (m) that a road vehicle may have.
+"""Largest depth (m) of a road vehicle's antenna below the IMU.
 
 An IMU in a box on the roof and an antenna on the bonnet are half a metre apart on a car."""
 _ANTENNAS = (GnssAiding, RawAiding, RdssAiding)
@@ -55,7 +55,7 @@ known."""
 
 
 def doubts(config: Config) -> list[str]:
-    """One line for each, which names the key and what would do."""
+    """One line for each doubt, with the key and the remedy."""
     return [
         *_imu(config),
         *_ports(config),
@@ -104,7 +104,8 @@ def _imu(config: Config) -> Iterator[str]:
 
 
 def _ports(config: Config) -> Iterator[str]:
-    """A serial line read by two gives each of them a part of the bytes; a UDP port, all to one."""
+    """Ports with two readers. A serial line gives each reader only a part of the bytes; a UDP port
+    gives one reader all."""
     users = defaultdict(list)
     for name, source in config.sources.items():
         port = source.options.get("port")
@@ -178,7 +179,7 @@ def _lever_arms(config: Config) -> Iterator[str]:
 
 
 def _files(config: Config) -> Iterator[str]:
-    """Files that the daemon reads at start, as far as this user can see it."""
+    """Files that the daemon reads at start, as far as this user can read them."""
     m = config.mqtt
     if not m.enabled:
         return

@@ -23,7 +23,7 @@ class DraftSource:
     options: Mapping[str, Any]
     found: str = ""
     aiding: str | None = None
-    """The kind of its `[aiding]`, where the driver alone does not say it."""
+    """Kind of its `[aiding]` section, where the driver does not determine it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Draft:
     sensor_class: SensorClass = "mems"
     axes: Axes = ("+x", "+y", "+z")
     axes_known: str = ""
-    """In words, how it is known which axis points where."""
+    """Sentence on the origin of the axes."""
     rate_hz: float = 100.0
     lever_arms_m: Mapping[str, Vector] = field(default_factory=dict)
     axle_m: Vector | None = None
@@ -140,5 +140,5 @@ def _source(d: Draft, source: DraftSource) -> Iterator[str]:
 
 
 def _value(value: Any) -> str:
-    """As TOML writes it: text, numbers, truth values and lists look as in JSON."""
+    """Format a value for TOML: text, numbers, truth values and lists are as in JSON."""
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)

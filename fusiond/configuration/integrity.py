@@ -7,19 +7,19 @@ from pydantic import Field, PositiveFloat
 from fusiond.configuration.aiding import Probability, Section
 
 DEVICE_FAULT = 1e-3
-"""Of a position device in an hour. From space come 1e-4 (ten GPS satellites of 1e-5 each: GPS SPS
-Performance Standard, 5th ed., 2020, section 3.5.1; a constellation: 1e-4, Working Group C ARAIM,
-Milestone 3, 2016); ten times that for the receiver and where it stands, which nobody has measured.
-A factor of ten moves a level by about a tenth."""
+"""Rate of faults of a position device, an hour. Satellites contribute 1e-4 (ten GPS satellites of
+1e-5 each: GPS SPS Performance Standard, 5th ed., 2020, section 3.5.1; a constellation: 1e-4,
+Working Group C ARAIM, Milestone 3, 2016). Ten times that is assumed for the receiver and its
+surroundings, for which no measurement exists. A factor of ten moves a level by about a tenth."""
 
 
 class Integrity(Section):
     """Protection levels, computed where an alert limit is set; see `docs/integrity.md`."""
 
     horizontal_alert_limit_m: PositiveFloat | None = None
-    """A horizontal protection level beyond it is an alarm."""
+    """Horizontal protection level beyond which an alarm is raised."""
     vertical_alert_limit_m: PositiveFloat | None = None
-    """The same for the vertical one."""
+    """Vertical protection level beyond which an alarm is raised."""
     integrity_risk_per_hour: Probability = 1e-5
     """Probability of an error beyond a protection level within an hour."""
     false_alarm_per_hour: Probability = 1e-4
@@ -34,5 +34,5 @@ class Integrity(Section):
 
     @property
     def watched(self) -> bool:
-        """True if there is a limit, and so a use for levels."""
+        """True if a limit is set, and protection levels are needed."""
         return self.horizontal_alert_limit_m is not None or self.vertical_alert_limit_m is not None

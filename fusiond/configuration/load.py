@@ -1,4 +1,4 @@
-"""Read a vehicle's configuration; a mistake names file, key, value and what would do.
+"""Reader of a vehicle's configuration; errors name file, key, value and remedy.
 
 Every mistake in the file is listed, not the first alone; `fusiond.configuration.mistakes` words
 them.
@@ -95,7 +95,7 @@ def load_config(path: Path | str) -> Config:
 
 
 def _default_aiding(source: Source) -> AnyAiding:
-    """The section of a source that has none of its own."""
+    """Section `[aiding]` of a source without one."""
     o = source.options
     if source.driver == "can_height" and ("pressure" in o or o.get("barometric")):
         return BarometerAiding()
@@ -103,8 +103,8 @@ def _default_aiding(source: Source) -> AnyAiding:
 
 
 def dumped(config: Config) -> dict[str, Any]:
-    """The configuration as JSON has it, whole, but for keys whose absence says something: a
-    lever arm that is not given is estimated."""
+    """Configuration as JSON, complete but for keys whose absence has a meaning: a lever arm that is
+    not given is estimated."""
     data = config.model_dump(mode="json")
     for name, section in config.aiding.items():
         if isinstance(section, GnssAiding) and "lever_arm_m" not in section.model_fields_set:

@@ -21,13 +21,13 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 _SECRET = re.compile("passw|secret|token", re.IGNORECASE)
-"""In the name of a key whose value is not for a log. No key of ours is one."""
+"""Keys whose values must not be logged; none of fusiond's own matches."""
 Location = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
 
 
 def validate(model: type[M], data: dict[str, Any], at: Location = ()) -> tuple[M | None, list[str]]:
-    """The validated model and no lines, or None and one line for each mistake.
+    """Validate data: the model, or None and one line for each mistake.
 
     `at` is where `data` stands in the file, to name its keys.
     """
@@ -44,12 +44,12 @@ def validate(model: type[M], data: dict[str, Any], at: Location = ()) -> tuple[M
 
 
 def mistake(location: Location, value: object, what: str) -> str:
-    """One line: key, value and what would do."""
+    """One line with key, value and remedy."""
     return f"{_key(location)}{_equals(value)}: {what}"
 
 
 def did_you_mean(given: object, allowed: Iterable[str]) -> str:
-    """A list of what is allowed, led by the nearest to what was given."""
+    """List of the allowed values, the nearest to `given` first."""
     known = sorted(allowed)
     near = get_close_matches(str(given), known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
@@ -151,7 +151,7 @@ def _is_model(annotation: Any) -> bool:
 
 
 def _unpacked(annotation: Any) -> tuple[Any, list[Any]]:
-    """A type without `Annotated`, and its constraints."""
+    """Type without `Annotated`, and its constraints."""
     constraints: list[Any] = []
     while get_origin(annotation) is Annotated:
         annotation, *metadata = get_args(annotation)
@@ -161,7 +161,7 @@ def _unpacked(annotation: Any) -> tuple[Any, list[Any]]:
 
 
 def _arms(annotation: Any) -> list[Any]:
-    """The types that a value may have, without None."""
+    """Types that a value may have, without None."""
     base, _ = _unpacked(annotation)
     if get_origin(base) in (Union, UnionType):
         return [arm for part in get_args(base) for arm in _arms(part)]
@@ -221,7 +221,7 @@ def _holds(data: Any, key: str | int) -> bool:
 
 
 def _in_data(detail: ErrorDetails, data: Any) -> Location:
-    """Pydantic's location without the names of union members, which no file holds."""
+    """Location in the file: pydantic's without the names of union members."""
     at: list[str | int] = []
     for part in detail["loc"]:
         if _holds(data, part):
@@ -233,7 +233,7 @@ def _in_data(detail: ErrorDetails, data: Any) -> Location:
 
 
 def _converted(model: type[BaseModel], data: Any, at: Location) -> Iterator[tuple[Location, str]]:
-    """Values that pydantic would take and convert, and numbers that are none."""
+    """Values that pydantic would convert without a message, and numbers that are not finite."""
 
     def walk(annotation: Any, value: Any, at: Location) -> Iterator[tuple[Location, str]]:
         if isinstance(value, dict):
@@ -252,7 +252,7 @@ def _converted(model: type[BaseModel], data: Any, at: Location) -> Iterator[tupl
 
 
 def _is_converted(annotation: Any, value: Any) -> bool:
-    """True if pydantic would turn a value of one basic type into another without a word."""
+    """True if pydantic would silently convert a value of one basic type into another."""
     arms = _arms(annotation)
     if any(value in get_args(arm) for arm in arms if get_origin(arm) is Literal):
         return False

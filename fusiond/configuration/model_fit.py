@@ -22,26 +22,25 @@ import math
 from collections.abc import Iterator
 
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, MILLI_G, imu_noise
+from fusiond.configuration.si_units import DEG, MILLI_G, imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR
 
 MINUTE_S = 60.0
 MATTERS = 2.0
-"""Beside twice as much the lesser of two errors makes their sum an eighth larger, which nobody
-sees."""
+"""Ratio of errors from which the lesser one matters: at half the other's size it raises their sum
+by an eighth."""
 
 
 def after_a_minute(force_noise: float, rate_noise: float) -> float:
-    """Metres, one sigma, that white noise of force (m/s^2/sqrt(Hz)) and rate makes in a minute."""
+    """Position sigma (m) after a minute, from white noise of force (m/s^2/sqrt(Hz)) and rate."""
     t, g = MINUTE_S, STANDARD_GRAVITY_M_S2
     return math.sqrt(force_noise**2 * t**3 / 3.0 + (g * rate_noise) ** 2 * t**5 / 20.0)
 
 
 def model_doubts(config: Config) -> Iterator[str]:
-    """A sentence where the model takes the accelerometer's bias for noise, and one where it takes
-    scale factors for it."""
+    """Sentences on a model that treats the accelerometer's bias, or scale factors, as noise."""
     name, noise = config.estimator.model, imu_noise(config.imu)
     model = make_model(name, noise)
     velocity = math.sqrt(next(b.white for b in model.blocks if b.name == "velocity"))

@@ -1,4 +1,4 @@
-"""Sections `[outputs.NAME]`: what leaves besides MQTT. A section that stands there is served."""
+"""Sections `[outputs.NAME]`: outputs beside MQTT. A section that is present is enabled."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Gpsd(Served):
     """gpsd's JSON protocol, in the place of gpsd."""
 
     port: Port = 2947
-    """As registered for gpsd."""
+    """Registered port of gpsd."""
 
 
 class NmeaServed(Served):
     """NMEA 0183 over TCP; what a receiver's sentences come in by is `[sources.NAME]`."""
 
     port: Port = 10110
-    """As registered for NMEA 0183."""
+    """Registered port of NMEA 0183."""
     sentences: tuple[Literal["RMC", "GGA", "VTG", "GST", "THS", "HDT", "PASHR"], ...] = (
         "RMC",
         "GGA",
@@ -63,7 +63,7 @@ class Foxglove(Served):
     """Foxglove's WebSocket protocol; needs the extra `foxglove`."""
 
     port: Port = 8765
-    """As Foxglove proposes it."""
+    """Default port of Foxglove."""
     rate_hz: Rate = 10.0
     """Rate of position and attitude."""
     origins: tuple[Annotated[str, Field(pattern=r"^https?://[^/\s]+$")], ...] = ()
@@ -91,7 +91,8 @@ class Chrony(Section):
     """Time for chrony's reference clock `SOCK`."""
 
     socket: Path = Path("/run/chrony.fusiond.sock")
-    """As in chrony.conf; Debian's AppArmor profile lets chronyd make `/run/chrony.*.sock`."""
+    """Socket path as in chrony.conf; Debian's AppArmor profile lets chronyd make
+    `/run/chrony.*.sock`."""
 
 
 class Outputs(Section):
@@ -110,11 +111,11 @@ class Outputs(Section):
 
     @property
     def served(self) -> dict[str, Section]:
-        """The sections that stand there, by name."""
+        """Configured sections by name."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: value for name, value in values.items() if isinstance(value, Section)}
 
     @property
     def through_the_broker(self) -> tuple[str, ...]:
-        """Those that are configured and go out by MQTT."""
+        """Configured outputs that publish through the broker."""
         return tuple(name for name in ("home_assistant", "owntracks") if name in self.served)

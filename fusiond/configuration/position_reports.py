@@ -1,4 +1,4 @@
-"""`[position_reports]`: where the vehicle says by RDSS short message where it is."""
+"""`[position_reports]`: position reports by RDSS short message."""
 
 from __future__ import annotations
 

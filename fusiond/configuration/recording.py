@@ -1,4 +1,4 @@
-"""`[recording]`: what is kept of a drive, and where (docs/recording.md)."""
+"""`[recording]`: contents and place of logs (docs/recording.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fusiond.configuration.aiding import Section
 
 
 class Recording(Section):
-    """Logs of all that came in and what came of it, for `fusiond replay` and other tools."""
+    """Logs of all inputs and results, for `fusiond replay` and other tools."""
 
     directory: Path | None = None
     """Directory of the logs; without it only `fusiond run --record DIR` records."""

@@ -1,7 +1,7 @@
 """The configuration of a vehicle: one TOML file, in the units that data sheets print.
 
 Every section is a frozen pydantic model that refuses unknown keys. Units stand in the names;
-nothing else in the project converts them: `fusiond.configuration.settings` turns this into SI once.
+nothing else in the project converts them: `fusiond.configuration.si_units` turns this into SI once.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Imu(Section):
     gyro_range_deg_s: PositiveFloat | None = None
     """Full scale of the data sheet: a rate that reaches it is rejected as `saturated`."""
     accel_range_g: PositiveFloat | None = None
-    """The same for specific force."""
+    """Full scale of specific force."""
     gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
     """Angle random walk."""
     accel_noise_m_s_sqrt_h: PositiveFloat = 0.1

@@ -1,4 +1,4 @@
-"""Noise and bias of a sensor class, before anybody reads its data sheet.
+"""Noise and bias of a sensor class, as defaults until the data sheet is entered.
 
 Switch-on bias and scale are one sigma without a calibration by the owner, instability that of some
 minutes in a vehicle that warms up. Noise is the chip's: what the vehicle shakes into it is seen in

@@ -15,7 +15,7 @@ Said = Mapping[str, Any]
 
 
 class Advice(NamedTuple):
-    """One step; `about` names the source or part that it concerns."""
+    """One step; `about` names the source or part concerned."""
 
     level: Weight
     about: str

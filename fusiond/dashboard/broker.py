@@ -10,17 +10,17 @@ from dataclasses import dataclass
 
 import aiomqtt
 
-from fusiond.dashboard.hub import LARGEST_BYTES, Hub
 from fusiond.dashboard.schemas import topics
-from fusiond.outputs.packet_limit import SOCKET_OPTIONS, limit
+from fusiond.dashboard.vehicles import LARGEST_BYTES, Hub
+from fusiond.outputs.oversized_packets import SOCKET_OPTIONS, limit
 
 BASE = "fusiond"
 RETRY_S = 1.0
 """Between attempts: a person is waiting, and the broker is on this computer or near."""
 KEEPALIVE_S = 5
-"""A broker that has stopped answering is noticed after one and a half of it."""
+"""MQTT keepalive; a silent broker is noticed after one and a half of it."""
 MOST_WAITING = 1000
-"""Messages in the client's queue, of which it discards more: ten seconds at 100 Hz."""
+"""Most messages in the client's queue: ten seconds at 100 Hz; the client discards more."""
 COMMANDS_WAITING = 8
 _LOG = logging.getLogger("fusiond.dashboard.mqtt")
 _LOG.setLevel(logging.ERROR)
@@ -47,7 +47,7 @@ class Broker:
         self._commands: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(COMMANDS_WAITING)
 
     def send_command(self, vehicle: str, name: str, request_id: str) -> None:
-        """Put a command on its way to a vehicle."""
+        """Queue a command for a vehicle."""
         if self._commands.full():
             self._commands.get_nowait()
         payload = json.dumps({"id": request_id}).encode()
@@ -84,7 +84,7 @@ class Broker:
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> None:
-        """Until the connection fails; both tasks end with it."""
+        """Run both tasks until the connection fails."""
         tasks = [asyncio.create_task(self._listen(client)), asyncio.create_task(self._ask(client))]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

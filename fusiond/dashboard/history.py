@@ -57,7 +57,7 @@ def _set(column: MutableSequence[T], slot: int, value: T) -> None:
 
 
 def _figure(value: float | None) -> float:
-    """As an array holds it: NaN for None, and for an integer beyond all floats."""
+    """Convert to a float of an array: NaN for None and for an integer beyond all floats."""
     try:
         return math.nan if value is None else float(value)
     except OverflowError:
@@ -76,12 +76,12 @@ class Ring(_Columns):
         return len(self._numbers)
 
     def add(self, number: int, row: Sequence[Any]) -> None:
-        """A row, for which the oldest goes where there are too many."""
+        """Add a row; the oldest one is dropped when the table is full."""
         self._put(self._added % self._most, number, row)
         self._added += 1
 
     def newer(self, count: int) -> list[list[Any]]:
-        """The rows whose number is greater than `count`, as they came."""
+        """Rows with a number greater than `count`, in order of arrival."""
         places = range(self._added - 1, self._added - 1 - len(self), -1)
         return self._newer(count, (place % self._most for place in places))
 
@@ -100,7 +100,7 @@ class Keyed(_Columns):
         return None if slot is None else self._row(slot)
 
     def put(self, key: Hashable, number: int, row: Sequence[Any]) -> None:
-        """The newest row of all, and the only one of its key."""
+        """Replace the row of this key."""
         slot = self._slots.pop(key, None)
         if slot is None:
             full = len(self._slots) == self._most
@@ -109,5 +109,5 @@ class Keyed(_Columns):
         self._slots[key] = slot
 
     def newer(self, count: int) -> list[list[Any]]:
-        """The rows whose number is greater than `count`, as they came."""
+        """Rows with a number greater than `count`, in order of arrival."""
         return self._newer(count, reversed(self._slots.values()))

@@ -1,4 +1,4 @@
-"""Plays a log's messages at their own pace, or a multiple of it."""
+"""Player of a log's messages, at their own pace or a multiple of it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.recording.reader import Log
 
 TOPICS = (
@@ -39,7 +39,7 @@ class Player:
         return (time.monotonic() - self._began) * self.speed
 
     async def play(self, hub: Hub) -> None:
-        """Play to the end, then stand there until cancelled."""
+        """Play to the end, then wait until cancelled."""
         first_ns: int | None = None
         hub.linked("up")
         for count, message in enumerate(self._log.messages(*TOPICS)):

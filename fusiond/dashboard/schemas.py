@@ -1,4 +1,4 @@
-"""Messages by the published schemas: what is shown is what `fusiond schema` says a topic carries.
+"""Parser of messages by the published schemas of `fusiond schema`.
 
 `topics.json` holds the schemas of the topics that are shown, made of the daemon's own models by
 `python -m tools.topic_schemas`: the models themselves bring 250 MB of numerics along. A message is
@@ -40,14 +40,14 @@ _WORDS = {"enum", "const", "minimum", "maximum", "maxItems", "items", "prefixIte
 
 
 class RefusedError(ValueError):
-    """A message that is not what its topic carries: `why`, and at which of its fields."""
+    """Error: a message that does not fit its topic. `why` is the reason, with the field."""
 
     def __init__(self, why: str, where: str = "") -> None:
         super().__init__(f"{where}: {why}" if where else why)
         self.why, self.where = why, where
 
     def below(self, name: str) -> RefusedError:
-        """The same, as the message sees it that has the field `name`."""
+        """Refusal with `name` prefixed to the path of its field."""
         rest = f".{self.where}" if self.where else ""
         return RefusedError(self.why, name[:_SHOWN] + rest)
 
@@ -63,7 +63,7 @@ def topics() -> dict[str, Read]:
 
 
 def _later(shared: Mapping[str, Read], name: str) -> Read:
-    """A schema that another names before it is made."""
+    """Placeholder for a schema that another one names before it is built."""
 
     def later(said: Any) -> Any:
         return shared[name](said)
@@ -72,7 +72,8 @@ def _later(shared: Mapping[str, Read], name: str) -> Read:
 
 
 def _message(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
-    """A message has a field of its topic at least: all of them may be absent, but not at once."""
+    """Reader of an object. It requires at least one field of its topic, since each may be
+    absent."""
     read = reader(schema, shared)
 
     def message(said: Any) -> Any:
@@ -125,7 +126,7 @@ def _scalar(kind: str, schema: Mapping[str, Any]) -> Read:
 
 
 def _any_of(readers: list[Read], schemas: list[Mapping[str, Any]]) -> Read:
-    """The first that reads it; the reason of the last, which for ours is never that of `null`."""
+    """Reader of alternatives: the first that accepts; otherwise the last reason."""
     ordered = sorted(
         zip(readers, schemas, strict=True), key=lambda pair: pair[1].get("type") != "null"
     )
@@ -179,7 +180,7 @@ def _object(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
 
 
 def _inside(name: str, read: Read | None, said: Any) -> Any:
-    """Read a part, whose name stands before the reason where it is refused."""
+    """Parse a part; a refusal names the part before the reason."""
     if read is None:
         raise RefusedError("one too many", name)
     try:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.dashboard.broker import Access, Broker
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.files.extras import install
 
 PMTILES = b"PMTiles\x03"
@@ -99,7 +99,7 @@ def _run(
 
 
 def check_map(path: Path) -> None:
-    """Raises `DashboardError` for a file that is no map of ours."""
+    """Check a map file. Raises `DashboardError` for an unsupported one."""
     try:
         with path.open("rb") as file:
             head = file.read(len(PMTILES))
@@ -110,7 +110,7 @@ def check_map(path: Path) -> None:
 
 
 def listening(page_address: PageAddress) -> socket.socket:
-    """A socket that listens there. Raises `DashboardError` where none can."""
+    """Open a listening socket. Raises `DashboardError` where that fails."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
             page_address.host, page_address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -133,10 +133,10 @@ async def serve(
     listener: socket.socket,
     stop: asyncio.Event,
 ) -> None:
-    """Serve at `listener` what `source` feeds into the hub, until `stop` or a failed source."""
+    """Serve `source` at `listener` until `stop` or until the source fails."""
     import uvicorn  # noqa: PLC0415 - an extra
 
-    from fusiond.dashboard.connections import BoundedConnection  # noqa: PLC0415 - the same
+    from fusiond.dashboard.connection_limits import BoundedConnection  # noqa: PLC0415 - the same
     from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
 
     config = uvicorn.Config(

@@ -14,25 +14,25 @@ from statistics import median
 from typing import Any
 
 from fusiond.dashboard.advice import advice
+from fusiond.dashboard.counter_window import Recent
 from fusiond.dashboard.history import Keyed, Ring
-from fusiond.dashboard.recent import Recent
 
 Said = Mapping[str, Any]
 
 LIMITS_S = {"nav": 1.0, "status": 3.0, "health": 3.0, "consistency": 3.0, "calibration": 90.0}
-"""Age from which a figure is old, if its topic comes at least so often: three messages missed of
-those that come every second (`status`, and `health` by default) or every 30 s (`calibration`); a
-second for `nav`, of which ten come by default. Docs/mqtt.md has the rates."""
+"""Age from which a value is stale: three missed messages of a topic with an interval of a second
+(`status`, `health` by default) or 30 s (`calibration`); a second for `nav`, which has ten a second
+by default. docs/mqtt.md lists the rates."""
 MISSED = 3
-"""Messages missed until a topic that comes at a slower rate is old."""
+"""Missed messages from which a slower topic is stale."""
 INTERVALS = 8
-"""Intervals of a topic, by whose median its rate is known: one long silence does not change it."""
+"""Intervals whose median is a topic's rate; one long silence does not change it."""
 ROW_EVERY_S = 0.5
 """Spacing of the rows of a solution: ten minutes are 1200 points, about a plot's pixels."""
 MOST_ROWS = {"nav": 1200, "nis": 4800, "delay": 500, "event": 200, "message": 200}
-"""By kind. `nis`: eight sources for ten minutes at 1 Hz."""
+"""Most rows by kind; `nis`: eight sources for ten minutes at 1 Hz."""
 KINDS = {"nav": "ddo" + 10 * "d", "nis": "doddd", "delay": "dod", "event": "do", "message": "do"}
-"""By column, as `history` has them: those of `nav` are `nav_row`'s."""
+"""Kinds of rows by column, as in `history`; those of `nav` come from `nav_row`."""
 MOST_INNOVATIONS = 12000
 """20 a second for ten minutes: position and velocity of a receiver at 10 Hz."""
 MOST_CARDS = 256
@@ -51,13 +51,13 @@ class LatestMessage:
 
 
 class Vehicle:
-    """Takes messages in, in the order of their arrival (`at_s`, seconds of one clock)."""
+    """Messages of one vehicle, added in order of arrival (`at_s`, seconds of one clock)."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.count = 0
         self.received_s = float("-inf")
-        """Instant of its last message; what the broker had kept is no sign of it."""
+        """Instant of its last message; a retained message does not count."""
         self._latest: dict[str, LatestMessage] = {}
         self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
         self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
@@ -94,7 +94,7 @@ class Vehicle:
     # ------------------------------------------------------------------ what is asked
 
     def since(self, count: int) -> dict[str, Any]:
-        """All that is newer than `count`: `messages` by topic, `rows` by kind."""
+        """Changes after `count`: `messages` by topic, `rows` by kind."""
         messages = {
             topic: {"at": latest.at_s, "limit": self.limit_s(topic), "said": latest.said}
             for topic, latest in self._latest.items()
@@ -105,7 +105,7 @@ class Vehicle:
         return {"messages": messages, "rows": {kind: rows for kind, rows in newer.items() if rows}}
 
     def limit_s(self, topic: str) -> float | None:
-        """Age (s) from which a message of `topic` is stale; None for one that never is."""
+        """Age (s) from which a message of `topic` is stale; None for a topic without a limit."""
         least = LIMITS_S.get(topic)
         if least is None:
             return None
@@ -141,7 +141,7 @@ class Vehicle:
         self._rows[kind].add(self.count, row)
 
     def _earlier_events(self, events: object, kept: bool) -> None:
-        """Earlier events, which the broker has retained."""
+        """Add earlier events from a retained message."""
         if kept and isinstance(events, list) and not self._rows["event"]:
             for one in events:
                 if isinstance(one, Mapping):
@@ -178,7 +178,7 @@ class Vehicle:
             self._received[source] = received if isinstance(received, int) else 0
 
     def _bundle(self, said: Said, at_s: float) -> None:
-        """`innovations`: each at the instant of its validity."""
+        """Split `innovations` into rows, each at its instant of validity."""
         innovations, now_ms = said.get("innovations"), number(said, "t_ms")
         for place, one in enumerate(innovations if isinstance(innovations, list) else ()):
             if not isinstance(one, Mapping):
@@ -216,7 +216,7 @@ def nav_row(said: Said, at_s: float) -> list[Any]:
 
 
 def number(said: Said, name: str) -> float | None:
-    """A field that is a number, else None."""
+    """Numeric field of a message, else None."""
     value = said.get(name)
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 

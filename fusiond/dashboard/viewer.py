@@ -1,4 +1,4 @@
-"""One browser at the WebSocket: ten frames a second at most, each what is new since the last.
+"""WebSocket connection of one browser: at most ten frames a second, each with all changes.
 
 A frame that the browser does not take holds up this viewer alone; what comes meanwhile takes the
 place of what was there, so that the next frame is the newest and nothing piles up.
@@ -17,23 +17,22 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 
 FRAME_S = 0.1
 BEAT_S = 1.0
-"""A frame goes out so often even if nothing is new: a page that hears none knows that we are
-gone."""
+"""Longest time without a frame; after it a page knows that the connection is lost."""
 SEND_TIMEOUT_S = 20.0
-"""A browser that takes nothing for so long is disconnected; it comes back when it can."""
+"""Time after which a browser that accepts nothing is disconnected; it reconnects by itself."""
 MOST_VIEWERS = 16
 LARGEST_REQUEST = 4096
 COMMANDS = ("request_fix", "start_recording", "stop_recording", "reset_filter")
-"""Those that need nothing but an id. The daemon takes only what its configuration lists."""
+"""Commands that need only an id. The daemon accepts only those in its configuration."""
 
 
 class Viewer:
-    """Serves one browser until it leaves."""
+    """Server of one browser until it leaves."""
 
     def __init__(self, hub: Hub, socket: WebSocket, token: str | None) -> None:
         self._hub = hub
@@ -60,7 +59,7 @@ class Viewer:
                 raise error
 
     async def _give_up(self) -> None:
-        """Take leave of a browser that may not hear it."""
+        """Close the connection to a browser that may not receive it."""
         with contextlib.suppress(TimeoutError, WebSocketDisconnect):
             async with asyncio.timeout(FRAME_S):
                 await self._socket.close(1013, "too slow")
@@ -142,7 +141,8 @@ class Viewer:
             self._vehicle, self._count = name, 0
 
     def _command(self, name: object, token: object) -> None:
-        """Refused unless commands are on, the token is right and the command is one of ours."""
+        """Forward a command; refused unless commands are on, the token is right and the command is
+        known."""
         send = self._hub.send_command
         if self._token is None or send is None:
             self._answer(False, "this dashboard sends no commands: start it with --commands")
@@ -159,5 +159,5 @@ class Viewer:
 
 
 def _same(given: str, token: str) -> bool:
-    """Compared in a time that does not tell how much of it is right."""
+    """Compare tokens in constant time."""
     return hmac.compare_digest(given.encode(), token.encode())

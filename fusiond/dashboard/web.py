@@ -1,4 +1,4 @@
-"""The page and its WebSocket over HTTP: our own files, and nothing that any other host sends.
+"""HTTP server of the page and its WebSocket; every file is local.
 
 A page of another site must not read where the vehicle is: its browser names the site in `Origin`,
 and a name that was made to point here (DNS rebinding) stands in `Host`. Both are refused.
@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.dashboard.viewer import MOST_VIEWERS, Viewer
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -79,7 +79,7 @@ def application(
 
 
 def is_same_origin(headers: Mapping[str, str]) -> bool:
-    """True if no browser asks, or one that shows our own page."""
+    """True if the request's origin is this page, or absent."""
     origin = headers.get("origin")
     return origin is None or urlsplit(origin).netloc == headers.get("host")
 
@@ -93,7 +93,7 @@ def host_name(host: str) -> str | None:
 
 
 class _HostCheck:
-    """Refuses names that are not ours, and puts the headers on every answer."""
+    """Middleware that refuses unknown host names and adds security headers."""
 
     def __init__(self, app: ASGIApp, loopback: bool) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""The demo's own MQTT broker, in a process of its own so that it takes no time from the ticks.
+"""MQTT broker of the demo, in its own process so that ticks keep their time.
 
     with DemoBroker() as broker: broker.port
 
@@ -20,12 +20,12 @@ from types import TracebackType
 from fusiond.files.extras import install
 
 _ATTEMPTS = 5
-"""A port that was free may be taken before the broker has it; not five times in a row."""
+"""Attempts to find a free port; another process may take one before the broker does."""
 _END_S = 5.0
 
 
 class DemoError(Exception):
-    """The demo cannot run on this installation; the text says what to install."""
+    """Error: the demo cannot run on this installation; the text says what to install."""
 
 
 class DemoBroker:

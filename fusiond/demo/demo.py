@@ -29,11 +29,11 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.demo.broker import DemoBroker
+from fusiond.demo.dashboard_process import DemoPage
 from fusiond.demo.outage_report import outage_report
-from fusiond.demo.page import DemoPage
 from fusiond.demo.papers import paper_setup
-from fusiond.demo.setup import DemoSetup, Unplugged
-from fusiond.demo.view import HeadlessView, Live, LiveView
+from fusiond.demo.scenario import DemoSetup, Unplugged
+from fusiond.demo.terminal_view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
@@ -49,9 +49,10 @@ CONFIG = shipped("vehicle.toml")
 VEHICLE = "demo"
 OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S = 18.0, 12.0, 60.0
 SERVICE_FREQUENCY_S = 5
-"""Of the simulated RDSS card: several fixes in an outage (a civil card has 60 s)."""
+"""Service interval of the simulated RDSS card: several fixes in an outage (a civil card has 60 s).
+"""
 REPORTS_S = 30.0
-"""Position reports to the other vehicle of the convoy: one of the card's turns in six."""
+"""Interval of position reports to the convoy's other vehicle: every sixth turn of the card."""
 _SCORE_NS = 100_000_000
 """Spacing of the solutions that the summary compares with the truth."""
 
@@ -88,7 +89,7 @@ def demo(
 
 
 def demo_setup() -> DemoSetup:
-    """The shipped car in town streets, its receiver unplugged for a while of every minute."""
+    """Demo of the shipped car in town streets; its receiver is unplugged once a minute."""
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
     config = load_config(CONFIG).model_copy(
         update={"vehicle": VEHICLE, "position_reports": reports}
@@ -100,7 +101,7 @@ def demo_setup() -> DemoSetup:
 
 
 class View(Protocol):
-    """Shows what has come out of the broker."""
+    """Display of messages that arrive from the broker."""
 
     async def show(self, live: Live) -> None:
         """Show until cancelled."""
@@ -179,7 +180,7 @@ class _Run:
                         self._compare()
 
     def _compare(self) -> None:
-        """The true error of the last `nav`, at the UTC instant that it states."""
+        """Compute the true error of the last `nav`, at the UTC instant that it states."""
         nav = self._live.nav
         if nav.get("t_ms") is None or nav.get("lat_deg") is None:
             return
@@ -198,7 +199,7 @@ class _Run:
         ]
 
     async def _outages(self) -> None:
-        """Pull a device's plug, and put it back."""
+        """Unplug a device, and plug it in again."""
         loop = asyncio.get_running_loop()
         started = loop.time()
         pulled = self._play.pulled
@@ -245,14 +246,14 @@ class _Run:
 
 
 class Score:
-    """Solutions of the running daemon, ten a second, to compare with the truth at the end."""
+    """Solutions of the running daemon at 10 Hz, compared with the truth at the end."""
 
     def __init__(self) -> None:
         self._last = 0
         self._rows: list[tuple[float, ...]] = []
 
     def add(self, s: Solution, covariance: Array) -> None:
-        """Add a solution with P (n, n), whose position north, east is at 6 and 7."""
+        """Add a solution with P (n, n); slots 6 and 7 are north and east."""
         if s.mode not in (Mode.NAVIGATING, Mode.COASTING) or s.t_ns // _SCORE_NS == self._last:
             return
         self._last = s.t_ns // _SCORE_NS
@@ -261,7 +262,7 @@ class Score:
         self._rows.append((s.t_ns, s.lat_rad, s.lon_rad, s.height_m, s.rpy_rad[2], *cov))
 
     def horizontal(self, vehicle: SimulatedVehicle) -> tuple[Array, Array, Array]:
-        """Instants on the vehicle's clock (s), true horizontal errors and one sigma (m), (n,)."""
+        """Instants (vehicle's clock, s), true horizontal errors and one sigma (m), each (n,)."""
         rows = np.array([r[1:] for r in self._rows]).reshape(-1, 7)
         t_s = np.array([r[0] - vehicle.start_ns for r in self._rows]) * 1e-9
         if not len(t_s):
@@ -291,7 +292,7 @@ class Score:
 
 
 def ned_error(position: Array, truth: Array) -> Array:
-    """Position minus truth, (n, 3) rad, rad, m each, in m north, east, down."""
+    """Position error north, east, down in m; positions are (n, 3) in rad, rad, m."""
     error = np.empty_like(position)
     for row, (p, t) in enumerate(zip(position, truth, strict=True)):
         lat, height = float(t[0]), float(t[2])
@@ -310,7 +311,7 @@ def wrapped(angle: Array) -> Array:
 
 @contextlib.contextmanager
 def _log_kept_out(headless: bool) -> Iterator[None]:
-    """Keep the log off the terminal, which shows events itself; errors only if headless."""
+    """Keep the log off the terminal, which shows events itself; headless, print errors only."""
     log = logging.getLogger("fusiond")
     handler = logging.StreamHandler(sys.stderr) if headless else logging.NullHandler()
     handler.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""Story of the demo's drive: what was lost without GNSS, and its share in sigma."""
+"""Summary of the demo's GNSS outages: error growth, and its ratio to sigma."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 def outage_report(
     t_s: Array, error_m: Array, sigma_m: Array, outages: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
-    """One sentence for each outage that the solution bridged.
+    """Describe each outage that the solution bridged, in one sentence.
 
     `t_s`, `error_m` and `sigma_m` (n,): instants, true horizontal errors, and their stated one
     sigma (root of the sum of both variances). `outages` begin and end on the same clock.

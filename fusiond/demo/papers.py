@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fusiond.demo.setup import DemoSetup, Unplugged
+from fusiond.demo.scenario import DemoSetup, Unplugged
 from fusiond.simulation.papers import PAPERS, configured
 
 

@@ -21,9 +21,9 @@ SERIAL_PATTERNS = (
     "/dev/ttyTHS*",
 )
 HINDRANCES = ("no_card", "no_beam", "low_battery", "suppressed", "silence")
-"""Counters of an RDSS terminal that keep it from positioning; findings have the same names."""
+"""Counters of an RDSS terminal that prevent positioning; findings have the same names."""
 _CAN_TYPE = "280"
-"""ARPHRD_CAN of linux/if_arp.h, as /sys/class/net/*/type prints it."""
+"""ARPHRD_CAN of linux/if_arp.h, as printed by /sys/class/net/*/type."""
 
 
 def device_name(options: Any) -> str:
@@ -35,7 +35,7 @@ def device_name(options: Any) -> str:
 
 
 def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> list[str]:
-    """Findings on a driver that is not `running`, or that runs and complains."""
+    """Findings on a driver that is not `running`, or reports a problem."""
     state, detail = driver.status.state, driver.status.detail
     port = getattr(options, "port", None)
     if state == "failed":
@@ -101,12 +101,12 @@ def absent_interface(name: str, options: Any, detail: str) -> str:
 
 
 def similar_ports() -> list[str]:
-    """Serial ports of this machine, those with a lasting name first."""
+    """Serial ports of this computer, persistent names first."""
     return [path for pattern in SERIAL_PATTERNS for path in sorted(glob.glob(pattern))]
 
 
 def can_interfaces(root: Path = Path("/sys/class/net")) -> list[str]:
-    """CAN interfaces of this machine."""
+    """CAN interfaces of this computer."""
     found = []
     for kind in sorted(root.glob("*/type")):
         try:

@@ -1,4 +1,4 @@
-"""Devices on ports and buses of this computer: `fusiond config init`.
+"""Discovery of devices on ports and buses, for `fusiond config init`.
 
 Listening only, but that an RDSS terminal says nothing unless it is asked who it is; the question
 does not make it transmit, and is put only where that is wanted. On a bus every device that is known
@@ -29,26 +29,27 @@ from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_senten
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.sbf.framing import BlockSplitter
 from drivers.serial_line import SerialLine
-from fusiond.doctor.known_devices import KNOWN_DEVICES
+from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
 BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_800)
-"""In the order of how often receivers are found at them."""
+"""Baud rates to try, the most common ones first."""
 LISTEN_S = 2.2
-"""At each baud rate: receivers speak once a second, so two epochs and the end of a third."""
+"""Listening time at each baud rate: two epochs of a 1 Hz receiver and the end of a third."""
 SOUND_ITEMS = 3
 """Correct checksums that identify a protocol: one in 256 random lines has a correct one."""
 TERMINAL_S = 25.0
 """Two families at three baud rates, 3 s each, and a reply."""
 EPOCH_S = 1.2
-"""After a line has been understood: what a receiver sends once a second has come by then."""
+"""Listening time after the first valid line: one epoch of a 1 Hz receiver."""
 BUS_S = 3.0
 LEAST_SAMPLES = 5
 MOST_TILT_DEG = 30.0
-"""Between one axis down (0) and two as much as each other (45): a slope of 20 % is 11 deg, and a
-unit is mounted parallel to a vehicle's axes or is not."""
+"""Largest tilt of the down axis. 0 is exactly down, 45 lies between two axes; a slope of 20 % has
+11 deg, and units are mounted parallel to the vehicle's axes."""
 GRAVITY_TOLERANCE = 0.1
-"""Of gravity: a consumer unit's bias and scale are 0.1 g at most, a unit's mistake is a factor."""
+"""Tolerance of measured gravity: bias and scale of a consumer unit reach 0.1 g, a wrong unit a
+factor."""
 RATES_HZ = (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 80, 100, 125, 160, 200, 250, 400, 500, 800, 1000)
 RATE_TOLERANCE = 0.08
 """Devices offer steps of a quarter and more; what is counted in 3 s is off by a frame or two."""
@@ -70,12 +71,12 @@ _BINARY = {
     "rtcm": "RTCM frames",
 }
 _SOLUTIONS = {"ubx_nav": "ubx", "bestpos": "bestpos", "sbf": "sbf"}
-"""Drivers of those that have a position, where no sentence has."""
+"""Drivers for positions in a receiver's own logs, where NMEA has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """Something that was heard: a source's driver and options, and what was heard in words."""
+    """Device found: driver and options of its source, and a description."""
 
     driver: str
     options: dict[str, Any]
@@ -84,12 +85,12 @@ class Device:
     aiding: str | None = None
     """The kind of `[aiding]`, of a driver that may give several."""
     down: str | None = None
-    """The sensor axis of an IMU that points down, where gravity showed it."""
+    """Sensor axis that points down, if gravity showed it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SilentPort:
-    """A port at which nothing was found, and why, in words."""
+    """Port without a recognised device, and the reason."""
 
     text: str
 
@@ -115,8 +116,8 @@ class _Line:
 
     @property
     def known(self) -> bool:
-        """True if more would not change what it is: a receiver of two antennas tells its heading
-        and its position in one epoch, a compass never any position."""
+        """True if further input would not change the result. A two-antenna receiver sends heading
+        and position in one epoch, a compass never sends a position."""
         return self.sound and ("position" in self.kinds or not self.kinds & _HEADINGS)
 
 
@@ -136,7 +137,7 @@ def _kind(item: Sentence | Frame) -> str:
 async def device_on_port(
     port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S
 ) -> Device | SilentPort:
-    """Device on a serial port, or a note that none is recognised.
+    """Device on a serial port, or the reason why none is recognised.
 
     `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
     """
@@ -195,7 +196,7 @@ def _description(port: str, baud: int, received: list[str]) -> str:
 
 
 async def _terminal(port: str) -> Device | None:
-    """The RDSS terminal that answers, and is not asked for more than who it is."""
+    """Ask an RDSS terminal for its identity, and nothing else."""
     options = RdssOptions(port=port, transmit=False)
     driver = RdssDriver("rdss", options, lambda _: None, monotonic_ns)
     async with _running(driver.run()):
@@ -208,7 +209,7 @@ async def _terminal(port: str) -> Device | None:
 async def device_on_bus(
     interface: Interface, channel: str, listen_s: float = BUS_S
 ) -> list[Device]:
-    """The devices on a CAN bus whose DBC file is shipped: IMU and receiver that fit best."""
+    """Devices with a shipped DBC file on a CAN bus: the IMU and the receiver that fit best."""
     decoders: list[tuple[int, CanDecoder[Any]]] = []
     for number, known in enumerate(KNOWN_DEVICES):
         kind = _DRIVERS[known.driver]

@@ -21,10 +21,10 @@ from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import NavigationMessage
 from drivers.rdss.mail import Mail
 from drivers.rdss.messages import BeamPower
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise, quiet_limits, sensor_to_body
+from fusiond.configuration.si_units import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.findings import finding
 from fusiond.doctor.measurement_statistics import KEPT, Values
@@ -38,13 +38,13 @@ MAX_TILT_DEG = 30.0
 GRAVITY_TOLERANCE = 0.05
 """Share of g: 50 mg is the turn-on bias of the coarsest automotive accelerometers."""
 RATE_TOLERANCE = 0.2
-"""Share of the configured IMU rate beyond which buffer and noise are those of another setting."""
+"""Tolerated deviation from the configured IMU rate; beyond it buffer size and noise are wrong."""
 DAMAGED_SHARE = 0.001
 """A sound line damages less than one item in a thousand."""
 SYSTEM_CLOCK_S = 1.0
 """System clock against GNSS: beyond it logs and file dates mislead."""
 ROLLOVER_S = 1024 * 604_800.0
-"""Of the GPS week's ten bits."""
+"""Period of the GPS week's ten bits."""
 DAY_S = 86_400.0
 OLD_FIX_S = 1.0
 """Receivers send within 0.3 s of the epoch; older means a line too slow for its sentences."""
@@ -72,7 +72,7 @@ class Kind:
 
 
 class ObservedSource:
-    """One source while it is listened to."""
+    """One source under observation."""
 
     def __init__(self, name: str, driver_name: str, options: Any, clock: Clock) -> None:
         self.name = name
@@ -204,7 +204,7 @@ def _kind_line(name: str, kind: Kind) -> str:
 
 
 def _beams_line(beams: BeamPower) -> str:
-    """The power of an RDSS terminal's beams, and which of them serve."""
+    """Describe the power of an RDSS terminal's beams, and which are usable."""
     levels = " ".join(map(str, beams.levels))
     serving = beams.serving
     if serving is None:
@@ -214,8 +214,7 @@ def _beams_line(beams: BeamPower) -> str:
 
 
 def _damage(counters: Counter[str], said: list[str]) -> list[str]:
-    """Findings of damaged or missing data, where it is more than a sound line has and has not been
-    `said`."""
+    """Findings on damaged or missing data beyond the normal rate, without those already `said`."""
     findings = []
     lost, samples = counters["lost_samples"], counters["samples"]
     if lost > DAMAGED_SHARE * max(1, samples):
@@ -290,7 +289,8 @@ def _clock(clock: Clock, config: Config) -> Report:
 
 
 async def _broker(config: Config) -> Report:
-    """Connect as the daemon would, under another name, so that a running one is not thrown off."""
+    """Connect to the broker as the daemon would, under another client name so that the daemon stays
+    connected."""
     m = config.mqtt
     if not m.enabled:
         return Report("mqtt: not enabled")

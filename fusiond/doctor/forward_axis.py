@@ -1,4 +1,4 @@
-"""The sensor axis of an IMU that points forward, from a short drive: stand, then straight ahead.
+"""Detection of an IMU's forward axis by a short drive: stand, then drive straight ahead.
 
     v = sum (f - f_0) dt        over the two level axes, from the first motion on
 
@@ -29,17 +29,18 @@ standing with the engine on shows."""
 SAME_FORCE_M_S2 = 0.3
 """A mean farther from `f_0` is motion: a gentle start has half a m/s^2, a bias drifts by 0.01."""
 LEAST_SPEED_M_S = 4.0
-"""A slope that changes by 3 deg while it speeds up adds 1.5 m/s in 3 s: 21 deg of direction."""
+"""Least speed change (m/s); a slope that changes by 3 deg adds 1.5 m/s in 3 s, a direction error of
+21 deg."""
 MOST_S = 8.0
 """Longest time from standstill to that speed; in a slower start slopes outweigh the engine."""
 MOST_TURN_RAD = np.radians(15.0)
 MOST_ASIDE_RAD = np.radians(30.0)
-"""From the nearest axis: beyond it the unit is not mounted parallel to the vehicle."""
+"""Largest angle to the nearest axis; beyond it the unit is not parallel to the vehicle."""
 _REST_SPEED_M_S = 0.5
 """Somebody got in: shaken, and no faster than this when it is quiet again."""
 
 DRIVE_S = 90.0
-"""For somebody to get in, start the engine and drive off."""
+"""Time to get in, start the engine and drive off."""
 
 Phase = Literal["unquiet", "standing", "moving", "found", "failed"]
 
@@ -62,7 +63,7 @@ class ForwardAxis:
         self._turn_rad = self._moving_s = 0.0
 
     def add(self, sample: Array, dt_s: float) -> None:
-        """One sample (6,): rates in rad/s and specific forces in m/s^2 over `dt_s`."""
+        """Add one sample (6,): rates in rad/s and specific forces in m/s^2 over `dt_s`."""
         if self.phase in ("found", "failed"):
             return
         self._window.append(np.append(sample, dt_s))
@@ -129,8 +130,8 @@ def _unit(axis: str) -> Array:
 async def watch_departure(
     options: CanImuOptions, down: str, seconds: float, on_phase: Callable[[Phase], None]
 ) -> ForwardAxis:
-    """Listen to the unit on its bus until its forward axis is known or cannot be, for `seconds` at
-    most. `on_phase` is called with each new phase."""
+    """Listen to the unit until its forward axis is found, or cannot be, for at most `seconds`.
+    `on_phase` is called with each new phase."""
     decoder, found = CanImuDecoder("imu", options), ForwardAxis(down)
     done = asyncio.Event()
     last_ns: int | None = None

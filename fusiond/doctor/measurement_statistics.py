@@ -40,7 +40,7 @@ class Quantity(NamedTuple):
     unit: str
     digits: int
     of: Callable[[Any], tuple[float, ...] | None]
-    """Its values; None where this measurement has none."""
+    """Function for the values of a measurement; None where it has none."""
 
 
 def _velocity(m: PositionFix) -> tuple[float, ...] | None:
@@ -112,7 +112,7 @@ class Values:
                 self._kept[quantity.name].append(values)
 
     def lines(self) -> Iterator[str]:
-        """One a quantity: mean and standard deviation of each part."""
+        """Mean and standard deviation of each quantity, one line each."""
         for quantity in self._quantities:
             kept = self._kept[quantity.name]
             if not kept:

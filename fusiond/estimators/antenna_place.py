@@ -1,4 +1,4 @@
-r"""Position of an antenna, when an update turns a vehicle whose lever arm nobody has measured.
+r"""Antenna position of an unmeasured lever arm, preserved when an update rotates the vehicle.
 
 A fix tells the place of the antenna, and nothing of the lever arm that leads there:
 
@@ -40,7 +40,7 @@ Indices = NDArray[np.int64]
 
 
 def antenna_slots(model: Model) -> tuple[Indices, Indices]:
-    """Slots of a lever arm's remainder (3,) and of its fixes' time offset (0 or 1,).
+    """Slots of a lever arm's error (3,) and of its fixes' time offset (0 or 1,).
 
     None where the model estimates no lever arm, or several: what is known of one place is then
     known by two ways."""

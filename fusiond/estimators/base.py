@@ -1,4 +1,4 @@
-r"""Estimators: what an error-state filter in a closed loop has to do, and what all have in common.
+r"""Estimators: the interface of a closed-loop error-state filter, and its common part.
 
 One navigation state is propagated through the IMU's samples. Beside it run the statistics of its
 error: one covariance and one error estimate for each filter that the estimator keeps (`covs`,
@@ -87,8 +87,8 @@ class Outcome(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """All that a later restore needs, `kept` and `held` as `Memory` has them; `extra` is the
-    estimator's own."""
+    """State for a later restore, `kept` and `held` as in `Memory`; `extra` is the estimator's
+    own."""
 
     t_ns: int
     sample: int
@@ -99,8 +99,8 @@ class Snapshot(NamedTuple):
 
 
 class Estimator:
-    """Interface of an estimator to timeline, navigator and studies, and what all have in common:
-    the state, its propagation, feedback and snapshots.
+    """Interface of an estimator for timeline, navigator and studies, with the common part: state,
+    propagation, feedback and snapshots.
 
     State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute).
     `shares` (k,): filter i gets its process noise and its initial covariance divided by shares[i].
@@ -120,8 +120,7 @@ class Estimator:
         self.t_ns = 0
         self.sample = 0
         self.passing = False
-        """True if it was brought where it is in passing: before a measurement is folded in it has
-        to be propagated there otherwise."""
+        """True after a propagation in passing, which must be repeated before an update."""
         self.published = Published(model.time_slot)
         """Axes and clock of publication: at first the clock of the model's receiver."""
         m = memory(model, round(gap_s * 1e9), shares, self.carries_transition, faults)
@@ -139,12 +138,11 @@ class Estimator:
         m.published[:] = self.published
         own = m.bank, faults, model, (m.nav, m.xi, m.step, m.published), m.wider
         self.hypotheses = Hypotheses(*own) if faults.groups else None
-        """The bank of hypotheses beside it; None where it has none."""
+        """Bank of fault hypotheses; None without one."""
         self._holding = False
         self._carrying = False
         self.turned = 0.0
-        """By how much (rad) the last update that was fused turned the axes in which P has the
-        tilt."""
+        """Rotation (rad) by the last fused update of the axes in which P has the tilt."""
         self.kernel_options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(model.width)
 
@@ -160,7 +158,7 @@ class Estimator:
 
     @property
     def isolates(self) -> bool:
-        """True if it detects and leaves out faulty sources by itself."""
+        """True if it detects and excludes faulty sources itself."""
         return False
 
     @property
@@ -174,12 +172,12 @@ class Estimator:
         return {}
 
     def publish_by(self, published: Published) -> None:
-        """From the next start on."""
+        """Publish so from the next start on."""
         self.published = published
         self._memory.published[:] = published
 
     def axes_known(self, sd_rad: float) -> None:
-        """From now on the axes of the unit in use are known to that."""
+        """Set the sigma of the axes of the unit in use."""
         self.published = self.published._replace(axes_sd_rad=sd_rad)
         self._memory.published[:] = self.published
 
@@ -202,9 +200,8 @@ class Estimator:
     def propagate(
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
     ) -> None:
-        """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
-        `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
-        be had nobody asked."""
+        """Propagate to `target_ns`, or to the last earlier sample in the buffer. In `passing`, no
+        update may follow there, and later results are bit for bit as without the call."""
         if self.hypotheses is not None:
             self.hypotheses.conclude()
         options = self.kernel_options
@@ -225,11 +222,11 @@ class Estimator:
         raise NotImplementedError
 
     def hold(self) -> None:
-        """From now on estimate without feedback: errors are carried along with the state."""
+        """Estimate without feedback from now on; errors propagate beside the state."""
         raise NotImplementedError
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         raise NotImplementedError
 
     @property
@@ -255,8 +252,8 @@ class Estimator:
         return out
 
     def surely_moves(self, published: bool) -> bool:
-        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
-        `published`, or P's alone."""
+        """True if the horizontal velocity proves motion by its sigma: the `published` one, or P's
+        alone."""
         of = self._cov, self.nav, self.step, self._memory.published
         if not surely_moves(*of, _NO_WIDER):
             return False
@@ -266,7 +263,8 @@ class Estimator:
         return bool(surely_moves(*of, self.wider))
 
     def _feed_back(self, dx: Array) -> None:
-        """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
+        """Subtract the error estimate (n,) from the navigation state and add its parameters to
+        `xi`."""
         if self.hypotheses is not None:
             self.hypotheses.keep_fed_back(dx)
         feed_back(self.nav, self.xi, dx)
@@ -309,7 +307,7 @@ class Estimator:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _renew(self, renewal: Renewal) -> None:
-        """Errors that measurements share become what they are from a measurement's instant on."""
+        """Renew shared errors of measurements from an instant on."""
         others = [self.xi, *self._dxs]
         if self.hypotheses is not None:
             self.hypotheses.conclude()
@@ -319,7 +317,8 @@ class Estimator:
             self.xi[self.model.slots_of_all(renewal.blocks)] = renewal.estimate
 
     def _leave(self, measurement: Linearised, codes: tuple[int, ...]) -> None:
-        """Clone what a screened measurement, of whose rows `codes` tell, leaves to the next."""
+        """Clone the state for the next measurement; `codes` are the outcomes of the screened
+        rows."""
         if measurement.screened:
             renewal = measurement.leaves(self._view, codes)
             if renewal is not None:
@@ -333,7 +332,7 @@ class Estimator:
     def _weighed(
         self, measurement: Linearised, rows: Innovation | NotApplicable
     ) -> Innovation | NotApplicable:
-        """The rows as a robust measurement wants them; others as they are."""
+        """Rows with the weights of a robust measurement; others unchanged."""
         if not measurement.robust or isinstance(rows, NotApplicable):
             return rows
         return reweighted(rows, self.model, self.covariance, self._dxs[0])
@@ -362,4 +361,4 @@ class Estimator:
         return None
 
     def _own_restore(self, extra: object) -> None:
-        """Back to what `_own_snapshot` gave."""
+        """Restore the state of `_own_snapshot`."""

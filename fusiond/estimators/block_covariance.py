@@ -1,4 +1,4 @@
-r"""Compiled kernel: covariances over several samples at once, to which a filter has added up.
+r"""Compiled kernel: propagation of covariances over several accumulated samples at once.
 
 A sample's transition is that of a step of strapdown navigation: C_nb, the force in navigation axes,
 rate and force in body axes (fusiond.navigation.error_model). All of it enters linearly, so that the
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 GRID_NS = 20_000_000
-"""A vehicle that turns by 1 rad/s turns by 3 deg within it."""
+"""Length of a block: a vehicle that turns by 1 rad/s turns by 3 deg in it."""
 
 SPAN, STEPS, DENSITIES = 0, 1, 1 + STEP_SMOOTH_N
 SUMS = DENSITIES + 6
@@ -55,7 +55,7 @@ GAP_FORCE_M_S2 = 1.0
 
 @compiled("void(f8[::1], f8[::1], f8, f8[::1], i8)", forceinline=True)
 def add_up(sums: Array, step: Array, h: float, densities: Array, row: int) -> None:
-    """One step (28,) more of h seconds, with noise of a row of `densities` (6 m,)."""
+    """Add a step (28,) of h seconds, with noise of a row of `densities` (6 m,)."""
     sums[SPAN] += h
     share = h / sums[SPAN]
     if share == 1.0:  # the first
@@ -74,8 +74,8 @@ def add_up(sums: Array, step: Array, h: float, densities: Array, row: int) -> No
 def widen_for_gap(
     cov: Array, width: int, active: NDArray[np.bool_], nav: Array, whole: float, h: float
 ) -> None:
-    """Add to `cov`, flat and of `width` rows, what h seconds of an IMU silence of `whole` seconds
-    leave unknown.
+    """Add to `cov`, flat and of `width` rows, the uncertainty of h seconds in an IMU silence of
+    `whole` seconds.
 
     A vehicle that turns goes where it heads: its velocity turns with it, dv = v x dphi, and its
     place by half of that a second. Told apart from each other, a constraint to go straight on would
@@ -118,8 +118,8 @@ def shake(
     row: int,
     h: float,
 ) -> None:
-    """Add to `cov`, flat and of `width` rows, what h seconds of noise of a row of `densities`
-    (6 m,), body axes, leave: C diag(n) C^T h."""
+    """Add to `cov`, flat and of `width` rows, C diag(n) C^T h: noise of a row of `densities` (6
+    m,), body axes, over h seconds."""
     for first in (0, 3):
         at = 6 * row + first
         if densities[at] + densities[at + 1] + densities[at + 2] == 0.0:
@@ -164,8 +164,8 @@ def cross_for(width: int) -> Callable[..., None]:
         noise: Array,
         work: Array,
     ) -> None:
-        """Advance the first `used` of the covariances, `covs` flat, over what `sums` (25,) hold,
-        to `nav` (10,); write the coefficients `c` (58,) of that.
+        """Propagate the first `used` of the covariances, `covs` flat, over the interval of `sums`
+        (25,) to `nav` (10,); write its coefficients `c` (58,).
 
         They are `held` where they are `ahead`, and afterwards where they are to be kept; the sums
         begin anew where they are not. `silence` (s) of the IMU, of which the sums are a part, or 0;

@@ -1,4 +1,4 @@
-r"""Compiled kernels: sigmas of the samples that a covariance crosses at once.
+r"""Compiled kernels: sigmas at the samples inside a block of the covariance's propagation.
 
 Where a solution is recorded at each sample, its sigmas are wanted at each, of a covariance that is
 brought from one crossing to the next (fusiond.estimators.block_covariance). What they are made of
@@ -40,15 +40,15 @@ _SENSORS, _CLOCK, _BEHIND, _AHEAD, _WAY = 0, 36, 48, 51, 54
 _TAKEN = 57
 WAITING = 3 * ENTRIES + _TAKEN + 30
 SIZE = WAITING + ROWS * ROW
-"""Doubles of what waits: p(0), p(H), L(H), what of P(0) that takes, room for it; of each sample L,
-its motion and s."""
+"""Doubles of the waiting state: p(0), p(H), L(H), the part of P(0) that it needs, work space; for
+each sample L, its motion and s."""
 
 
 @compiled("void(f8[::1], i8, i8[::1], i8, f8, f8[::1])", forceinline=True)
 def begin(
     cov: Array, width: int, sensor_terms: Indices, time_slot: int, clock_sd_s: float, between: Array
 ) -> None:
-    """Write to `between` (SIZE,) what is known of P(0) = `cov`, flat and of `width` rows."""
+    """Write the entries of P(0) = `cov`, flat and of `width` rows, to `between` (SIZE,)."""
     entries(cov, width, time_slot, clock_sd_s, between[:ENTRIES])
     taken = between[3 * ENTRIES :]
     for a in range(12):
@@ -73,8 +73,8 @@ def first_order(
     time_slot: int,
     out: Array,
 ) -> None:
-    """Write L (22,) of `sums` (25,) since `begin`, with a factor q of all noise; `noise` (3 n,) and
-    `sensor_terms` as of the model."""
+    """Write L (22,) of `sums` (25,) since `begin`, with all noise scaled by q; `noise` (3 n,) and
+    `sensor_terms` are the model's."""
     s, n = sums[SPAN], noise.shape[0] // 3
     mean, shaken = sums[STEPS:DENSITIES], sums[DENSITIES:]
     first, taken = between[:ENTRIES], between[3 * ENTRIES :]

@@ -28,7 +28,8 @@ def sensor_estimates(
 
 @compiled("void(f8[::1], i8, f8[::1], f8[::1], f8[::1])")
 def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Array) -> None:
-    """Write `rate` and `force` (3,) of sample i of `samples` (6 m,), `estimate` (12,) taken out."""
+    """Write `rate` and `force` (3,) of sample i of `samples` (6 m,), corrected by `estimate`
+    (12,)."""
     at = 6 * i
     for j in range(3):
         rate[j] = (samples[at + j] - estimate[j]) / (1.0 + estimate[6 + j])
@@ -39,7 +40,7 @@ def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Arra
 def slopes(
     times: Indices, samples: Array, i: int, gap_ns: int, rate_slope: Array, force_slope: Array
 ) -> bool:
-    """Write the slopes (3,), a second, of rate and force over sample i of `samples` (6 m,); whether
+    """Write the slopes (3,), a second, of rate and force over sample i of `samples` (6 m,); True if
     a gap precedes it.
 
     Zero where the sample before holds over another length of time: beside a gap, at the start.

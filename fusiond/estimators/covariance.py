@@ -36,8 +36,7 @@ KEPT = 4
 
 
 def work_size(width: int) -> int:
-    """Doubles of work space that the kernels of a row width need, zero at first; `decays` at its
-    end."""
+    """Doubles of the kernels' work space for a row width, zero at first; `decays` at its end."""
     return (6 + 9) * width + (9 + 6 + 9) * CORE_STRIDE + 12 + KEPT + 2 * width
 
 
@@ -132,7 +131,7 @@ def _columns_for(width: int) -> Callable[[Array, Indices, Array, int, Array], No
 
 @compiled("void(f8[::1], i8, b1[::1])", forceinline=True)
 def _keep_active(rows: Array, width: int, active: NDArray[np.bool_]) -> None:
-    """Of nine rows of `width` doubles those that are not `active` become zero."""
+    """Zero the rows, of nine of `width` doubles, that are not `active`."""
     for i in range(CORE_SIZE):
         if not active[i]:
             for j in range(width):
@@ -160,8 +159,8 @@ def covariance_for(width: int) -> Callable[..., None]:
         q: float,
         work: Array,
     ) -> None:
-        """Advance the covariance (width, width), `flat` (width^2,), in place by h seconds with
-        transition coefficients `c`; neither read nor written is P21, which `mirror` makes.
+        """Propagate the covariance (width, width), `flat` (width^2,), in place by h seconds with
+        transition coefficients `c`. P21 is neither read nor written; `mirror` makes it.
 
         The model's arrays are flat; rows and columns from n on are zero and stay so. `work` has
         work_size(width) doubles.
@@ -223,7 +222,7 @@ def covariance_for(width: int) -> Callable[..., None]:
 
 @compiled("void(f8[::1], i8, i8)")
 def mirror(flat: Array, width: int, n: int) -> None:
-    """Make P21 of a covariance (width, width) of n states, `flat`, of its P12."""
+    """Copy P12 of a covariance (width, width) of n states, `flat`, to P21."""
     unsigned, wide = np.uint64, np.uint64(width)
     for row in range(CORE_SIZE, n):
         j = unsigned(row)
@@ -302,8 +301,8 @@ def propagate_error(
     kept: Array,
     work: Array,
 ) -> None:
-    """dx (n,) <- Phi dx over h seconds, which `decays` has `kept`: an estimate that is not fed back
-    yet (paper 000, 1.1)."""
+    """Propagate an error estimate dx (n,) <- Phi dx over h seconds, with the decays in `kept`: an
+    estimate before its feedback (paper 000, 1.1)."""
     sensor = work[: 6 * CORE_STRIDE]
     rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
     out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]

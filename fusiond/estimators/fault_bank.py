@@ -78,14 +78,14 @@ that can be at fault."""
 # whether it is in its device's positions and in its velocities.
 SIGNATURE, DEVICE, SIZE, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 6, 7, 8
 ANY = -3
-"""In the place of a device: all that send positions or velocities."""
+"""Device index for all devices with positions or velocities."""
 KIND_INTS = 9
 # And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean,
 # whether its size is known to be of that prior (1 or 0).
 PRIOR, LOG_RATE, LAG, MEAN, BOUNDED = 0, 3, 4, 5, 6
 KIND_NUMBERS = 7
 LOG_PRIOR = 7
-"""Behind them in a table: logs of the prior sigmas (3)."""
+"""Offset of the logs of the prior sigmas (3) in a table."""
 
 # The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns) in
 # single precision: what a fault of 64 s has done is known to 1e-6 of it, its prior to a digit. The
@@ -118,21 +118,21 @@ E_ROWS = np.array([E_AT, E1, E2])
 # does not depend on what has come, with the prior's density and without.
 P_AT, MEAN_AT, ODDS_AT, RATE_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5, LANES * 6
 TINY = 1e-9
-"""A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
+"""Weight of the prior in L, so that directions without evidence stay regular."""
 UNEXPLAINED_SIGMAS = 4.0
-"""One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
+"""Sigmas of chi-square, by its mean and variance (2 N), beyond which a hypothesis does not fit: one
+in 30,000."""
 DECIDED = 7.0
 """Log odds beyond which a hypothesis is likely: a thousand to one."""
 LEAST_WEIGHT = 1e-7
-"""Probability below which a hypothesis counts for nothing: a third of a metre of a kilometre."""
+"""Probability below which a hypothesis is ignored: a third of a metre of a kilometre."""
 LASTS_S = 1.0
-"""For so long it must have been: a receiver's errors of a second are one error."""
+"""Least duration (s) of a likely hypothesis; a receiver's errors of a second are correlated."""
 
 
 class FaultTable(NamedTuple):
-    """Kinds of faults as the kernels read them, those of three numbers first: `ints` (k, 9) and
-    `numbers` (k, 10), `lanes` with the constants of their groups, and the devices whose numbers
-    they name."""
+    """Kinds of faults for the kernels, those of three numbers first: `ints` (k, 9) and `numbers`
+    (k, 10), `lanes` with the constants of their groups, and the devices that they index."""
 
     ints: Indices
     numbers: Array
@@ -151,8 +151,8 @@ class FaultTable(NamedTuple):
 
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
-    """The table of these kinds, `numbers` (k, 7); ValueError where one has another number than
-    three or one, a mean of three, or those of three do not come first."""
+    """Table of these kinds, `numbers` (k, 7). ValueError where a kind has neither three numbers nor
+    one, a mean of three, or those of three do not come first."""
     sizes = ints[:, SIZE]
     if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
         raise ValueError("kinds have three numbers or one, those of three first")
@@ -200,7 +200,7 @@ def columns_of(table: FaultTable) -> int:
 
 
 def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
-    """Write what of a new bank never changes."""
+    """Write the constant part of a new bank."""
     if bank.size:
         bank[SENSITIVITIES] = bank.size - n * columns_of(table) // 2
         bank[PHI] = bank[SENSITIVITIES] - width * width
@@ -244,8 +244,8 @@ def wake(bank: Array, kind: int) -> None:
 
 @compiled("UniTuple(i8, 2)(f8[::1], b1)", forceinline=True)
 def awake(bank: Array, three: bool) -> tuple[int, int]:
-    """First column of groups with three numbers, or of those with one, and behind the last of which
-    V may be other than zero."""
+    """First group with three numbers, or of those with one, and the end of those whose V may be
+    nonzero."""
     if three:
         return 0, 3 * LANES * int(bank[THREES_AWAKE])
     first = 3 * LANES * ((int(bank[THREES]) + LANES - 1) // LANES)
@@ -254,7 +254,8 @@ def awake(bank: Array, three: bool) -> tuple[int, int]:
 
 @compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)
 def explained_by_three(bank: Array, lanes: Array, j: np.uint64, c: np.uint64) -> float:
-    """e^T L^-1 e of the group of three numbers at `j`, whose constants are at `c`."""
+    """Explained chi-square e^T L^-1 e of the group of three numbers at `j`, with constants at
+    `c`."""
     unsigned = np.uint64
     d_0 = bank[j + unsigned(L_AT)] + TINY * lanes[c + unsigned(P_AT)]
     a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]

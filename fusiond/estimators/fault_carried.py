@@ -53,7 +53,8 @@ def carry_for(width: int) -> Callable[..., None]:
         noise: Array,
         work: Array,
     ) -> None:
-        """Carry path and transition of a bank over what `sums` hold, `span` seconds until `now`."""
+        """Propagate path and transition of a bank over the interval of `sums`, `span` seconds until
+        `now`."""
         walk_path(bank, nav, now * 1e-9, span)
         phi = bank[int(bank[PHI]) : int(bank[PHI]) + square]
         propagate_transition(
@@ -68,7 +69,7 @@ def carry_for(width: int) -> Callable[..., None]:
 
 @compiled("void(f8[::1], i8, i8)")
 def begin_transition(bank: Array, n: int, width: int) -> None:
-    """Nothing lies between the last measurement and now."""
+    """Reset the transition to the identity."""
     phi = bank[int(bank[PHI]) :]
     for i in range(width):
         for j in range(width):
@@ -78,7 +79,7 @@ def begin_transition(bank: Array, n: int, width: int) -> None:
 
 @compiled("void(f8[::1], i8, i8[::1])", allocates=True)
 def _multiply(bank: Array, n: int, rows: Indices) -> None:
-    """V <- Phi V, of which `rows` (k,) are not those of the identity; afterwards they are."""
+    """Multiply V <- Phi V, where only `rows` (k,) differ from the identity; then reset Phi."""
     width, count = int(bank[WIDTH]), rows.shape[0]
     phi, v = bank[int(bank[PHI]) :], bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
@@ -124,7 +125,7 @@ def _multiply(bank: Array, n: int, rows: Indices) -> None:
 
 @compiled("void(f8[::1], i8)", allocates=True)
 def settle(bank: Array, n: int) -> None:
-    """V <- Phi V of all that has been carried since the last measurement."""
+    """Apply V <- Phi V for the transition since the last measurement."""
     if bank[WAITS] == 0.0:
         return
     width, phi = int(bank[WIDTH]), bank[int(bank[PHI]) :]
@@ -142,7 +143,8 @@ def settle(bank: Array, n: int) -> None:
 
 @compiled("void(f8[::1], i8, i8[::1], f8[:, ::1])", allocates=True)
 def mix(bank: Array, n: int, slots: Indices, t: Array) -> None:
-    """V <- T V, where T is that of the identity but for rows and columns `slots` (k,): t (k, k)."""
+    """Multiply V <- T V, where T is the identity but for rows and columns `slots` (k,): t (k,
+    k)."""
     settle(bank, n)
     width, phi = int(bank[WIDTH]), bank[int(bank[PHI]) :]
     for a in range(slots.shape[0]):

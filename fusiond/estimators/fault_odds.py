@@ -1,4 +1,4 @@
-r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
+r"""Odds of a bank's hypotheses, and the uncertainty that they add to the published solution.
 
     log odds            log(rate T) + l / 2 - max(p log(N) / 2, log det(I + S L) / 2)
                         of a kind that is known to be of a size
@@ -85,19 +85,18 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MISSED, ALIKE_S = 0.1, 0.25
-"""Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
-drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
-missed is as near as half the youngest period."""
+"""Loss of explained chi-square for an onset between two restarts: a drift whose onset is off by a
+seventh of its age loses a twentieth. A matched onset is within half the youngest period."""
 BY_CHANCE = 2.05
-"""Sigmas of chi-square that chance exceeds once in fifty, as `APART` has it: what is lost is left
-unexplained, but for so much."""
+"""Sigmas of chi-square that chance exceeds once in fifty, as in `APART`: the tolerated unexplained
+part."""
 MOST_OFF = 3.0
-"""Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
+"""Largest deviation of a size from the mean of its kind, in prior sigmas."""
 MOST_OF_UNIT = 10.0
-"""Sigmas of its prior beyond which no unit's fault is: 10 deg/s, half a g, more than a right angle.
-A velocity that is reversed is no force of four g."""
+"""Largest size of a unit's fault in prior sigmas: 10 deg/s, half a g, more than a right angle. A
+reversed velocity is no force of four g."""
 _NOTHING = -40.0
-"""Log of what counts nothing beside one: a sum of doubles does not show it."""
+"""Log of a negligible weight, which a sum of doubles cannot show."""
 APART = 4.0
 """Log odds between two classes: fifty to one."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, by how
@@ -107,9 +106,11 @@ BEST, BEST_ODDS, AHEAD, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 
 @compiled("f8(f8[::1], i8, i8, f8[::1], f8, f8[::1])", allocates=True)
 def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
-    """M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,), with the mean
-    of its kind's `numbers` (7,) where `share` is 1; by Gauss and Jordan with a positive matrix.
-    Returns e^T b: without a mean what it explains, l."""
+    """Write M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,).
+
+    With the mean of its kind's `numbers` (7,) where `share` is 1; by Gauss-Jordan elimination of a
+    positive definite matrix. Returns e^T b: without a mean the explained chi-square l.
+    """
     a = np.empty((3, 6))
     mean = numbers[MEAN] if share == 1.0 else 0.0
     for i in range(size):
@@ -141,9 +142,8 @@ def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Arra
 
 @compiled("void(f8[::1], f8[::1])")
 def _gains(bank: Array, lanes: Array) -> None:
-    """Write, of all groups, what they explain and what is left unexplained, and for the weight the
-    determinant of L + S^-1; of those of one number also what the log odds gain by it with the
-    prior, for log odds."""
+    """Write each group's explained and unexplained chi-square, and the determinant of L + S^-1 for
+    its weight; for groups of one number also the gain of log odds by the prior."""
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
@@ -186,8 +186,8 @@ def _gains(bank: Array, lanes: Array) -> None:
 
 @compiled("f8(f8[::1], f8[::1], i8, i8, b1, f8[::1])", forceinline=True)
 def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
-    """Log of the factor by which a likely fault is larger than it is expected to be; what no unit's
-    fault can be it does not explain."""
+    """Log of the ratio of a fault's size to its expectation; a size that no unit's fault has
+    explains nothing."""
     share = MOST_OF_UNIT**-2 if unit else TINY
     gained = solve(bank, at, size, numbers, share, m)
     bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
@@ -238,7 +238,7 @@ def _odds(
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
-    """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
+    """Lead of a group over those of other kinds; infinite where no decision is needed."""
     own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
@@ -267,9 +267,9 @@ def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
 def judge(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, epoch_s: float, found: Array
 ) -> None:
-    """Write log odds, weight and what is left unexplained of each group, and `found` (4,), at an
-    epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
-    been likely, and has explained all, for `LASTS_S`.
+    """Write log odds, weight and unexplained chi-square of each group, and `found` (4,), at an
+    epoch of a measurement. A single measurement accuses the nearest hypothesis; one is found after
+    it has been likely and has explained all for `LASTS_S`.
 
     It is ahead of another by odds. Between a step of states, which changes what is published, and a
     fault of a source that is likelier than nothing wrong it counts how well each fits, if that is
@@ -328,7 +328,8 @@ def identified(found: Array) -> bool:
 
 @compiled("void(f8[::1], f8[:, ::1], i8, f8[:, ::1])", allocates=True)
 def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
-    """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
+    """Write the covariance that the weighted hypotheses add to the first rows of the error state
+    (q, q)."""
     q = opened.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
@@ -364,7 +365,7 @@ def estimate(
     size_and_variance: Array,
     effect: Array,
 ) -> None:
-    """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
+    """Write b (3,) and M (9,) of a group, and its effect V b and V M V^T: `effect` (1 + n, n)."""
     at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n

@@ -1,4 +1,4 @@
-r"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
+r"""Compiled kernels: onset of each hypothesis of a bank, and its initial step of states.
 
 As fusiond.estimators.fault_bank says. One of them is that a source's fault is over, which the
 filter has followed: its error is then what those faults f have done to it, as they are weighed,
@@ -62,14 +62,14 @@ Indices = NDArray[np.int64]
 
 
 UNLIKELY = 1e-12
-"""Of what is followed by no fault that counts."""
+"""Probability of a followed fault that is ignored."""
 COUNTS = 1e-3
-"""Weight of a fault below which what it has done is not looked at."""
+"""Weight of a fault below which its effect is not computed."""
 
 
 @compiled("void(f8[::1], i8)")
 def _fall_asleep(bank: Array, n: int) -> None:
-    """Leave the last eights of groups out whose V is zero."""
+    """Skip the last groups of eight whose V is zero."""
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     for three in (True, False):
@@ -86,7 +86,7 @@ def _fall_asleep(bank: Array, n: int) -> None:
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
 def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Array) -> None:
-    """Write what faults of sources have done to the filter (n,), and behind it their weight."""
+    """Write the effect of sources' faults on the filter (n,), and their total weight."""
     followed[:] = 0.0
     if not bank[ANY_FAULT] > COUNTS:
         return
@@ -121,8 +121,8 @@ def _begin_group(
     step: Array,
     followed: Array,
 ) -> None:
-    """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`;
-    `followed` (n + 1,) as `_followed` leaves it."""
+    """Restart one hypothesis of a kind with its onset now, at a state nav (10,) after `step`;
+    `followed` (n + 1,) from `_followed`."""
     number, size = RESTARTS * kind + restart, ints[kind, SIZE]
     at = group_at(bank, number)
     for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
@@ -169,7 +169,7 @@ def _begin_group(
 def begin_all(
     bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
 ) -> None:
-    """Begin all hypotheses anew; what the path was remains."""
+    """Restart all hypotheses; the path is kept."""
     begin_transition(bank, n, width)
     bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED], bank[UNWEIGHED] = 0.0, 0.0, np.inf, np.inf
     bank[THREES_AWAKE], bank[ONES_AWAKE] = 0.0, 0.0
@@ -183,7 +183,7 @@ def begin_all(
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
 def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
-    """Replace the less likely onset of the level above, if that is much less likely.
+    """Replace the less likely onset of the level above, if much less likely.
 
     By the one whose turn to restart has come."""
     level = LEVEL_OF[restart] + 1
@@ -222,7 +222,7 @@ def begin_again(
     nav: Array,
     step: Array,
 ) -> None:
-    """Begin those hypotheses anew that are of rows which return to service."""
+    """Restart the hypotheses on series that return to service."""
     followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         if concerns(ints, kind, measures, device):
@@ -234,8 +234,8 @@ def begin_again(
 def restart_due(
     bank: Array, ints: Indices, numbers: Array, n: int, t_ns: int, nav: Array, step: Array
 ) -> None:
-    """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
-    one that has just been handed on is not the next to begin."""
+    """Restart the hypotheses that are due at `t_ns`, longest period first, so that a promoted one
+    is not the next to restart."""
     followed = np.zeros(0)
     for back in range(len(PERIODS_NS)):
         level = len(PERIODS_NS) - 1 - back

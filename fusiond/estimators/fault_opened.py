@@ -1,4 +1,4 @@
-r"""Sizes of a bank's hypotheses, and their share of the published covariance.
+r"""Sizes of a bank's hypotheses, and the covariance that they add to the published one.
 
 Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
 the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
@@ -57,7 +57,8 @@ Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 COUNTS = 1e-3
-"""Probability of any fault below which what is open is not computed between two measurements."""
+"""Probability of any fault below which the added covariance is not computed between measurements.
+"""
 RARE = 10.83
 """Chi-square of one that chance exceeds in one vehicle of a thousand."""
 
@@ -120,7 +121,7 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
 def _published_rows(
     kept: Single, columns: int, first: int, count: int, motion: Array, time_slot: int, out: Array
 ) -> None:
-    """Write v (9, count) of as many columns of V, of a vehicle that is `moving` (12,)."""
+    """Write v (9, count) of so many columns of V, for a vehicle that is `moving` (12,)."""
     for i in range(CORE_SIZE):
         row, to = kept[i * columns + first :], out[i * count : (i + 1) * count]
         for j in range(to.shape[0]):
@@ -256,8 +257,9 @@ def judge_and_widen(
     wider: Array,
     found: Array,
 ) -> None:
-    """`judge`, if what has come was `measured` and is `used`, and `wider` (9,), unless a hypothesis
-    is identified: at each measurement, and between two while a fault is likely enough to count.
+    """Judge (`judge`) if the measurement was `measured` and is `used`, and write `wider` (9,),
+    unless a hypothesis is identified: at each measurement, and between two while a fault is likely
+    enough.
 
     `published` (3,) as of fusiond.estimators.published_state. `mounting` (2, 2): slots of the
     mounting's pitch and yaw in xi (n,), or -1, and what of their squares is chance.

@@ -1,5 +1,4 @@
-"""Compiled kernels: what the hypotheses of a bank say of a measurement's rows, and what these say
-of them.
+"""Compiled kernels: measurement rows under each hypothesis of a bank, and the update by them.
 
 As fusiond.estimators.fault_bank says, with the path by dead reckoning that a delay needs.
 """
@@ -79,7 +78,7 @@ Indices = NDArray[np.int64]
 
 @compiled("void(f8[::1], f8[::1], f8, f8)")
 def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
-    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is.
+    """Extend the path by `step_s` at the velocity of `nav` (10,) and store its point.
 
     With the velocity before all that has been fed back.
     """
@@ -108,7 +107,7 @@ def keep_fed_back(bank: Array, dx: Array) -> None:
 
 @compiled("i8(f8[::1], f8)")
 def _past(bank: Array, t_s: float) -> int:
-    """Points back to the path's last before `t_s`, or at it; -1 where it is not kept."""
+    """Number of points back to the path's last one up to `t_s`; -1 beyond the stored ones."""
     entries = int(bank[ENTRIES])
     first, end = 1, min(entries, RING)  # of two points the first is looked for
     while first < end:
@@ -122,8 +121,8 @@ def _past(bank: Array, t_s: float) -> int:
 
 @compiled("f8(f8[::1], i8, f8, i8)")
 def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
-    """Component (place 0 to 2, velocity 3 to 5) of the path at `t_s`, linear from the point so many
-    ago to the next."""
+    """Component (position 0 to 2, velocity 3 to 5) of the path at `t_s`, interpolated from the
+    point `back` steps ago to the next."""
     entries = int(bank[ENTRIES])
     at = HEAD + (entries - back) % RING * POINT
     before = HEAD + (entries - 1 - back) % RING * POINT
@@ -135,7 +134,8 @@ def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """True if a kind is one of rows, of a device, or of any and this one locates or moves."""
+    """True if a kind concerns these rows: of its device, or of any and this one locates or
+    moves."""
     if ints[kind, SIGNATURE] <= FOLLOWED:
         return False
     if measures == PLACES and not ints[kind, LOCATES]:
@@ -160,8 +160,8 @@ def _of_row(
     back: int,
     row: int,
 ) -> tuple[float, float]:
-    """D of a row for the component of a kind that is in it: an offset, and a slope over the time
-    since its onset. `back`: where the path was when the delay began, as `_past` says."""
+    """Row of D for a component of a kind: an offset, and a slope over the time since its onset.
+    `back`: index of the path at the start of the delay, from `_past`."""
     of, offset, slope = ints[kind, SIGNATURE], 0.0, 0.0
     if of == DELAY:
         if measures <= MOVES and back >= 0:
@@ -205,8 +205,8 @@ def _sign(
     columns: int,
     work: Single,
 ) -> None:
-    """Add D of the m rows of a measurement that a kind concerns: of each restart an offset, and
-    what has grown with a slope since its onset."""
+    """Add D of the m rows of a measurement that a kind concerns: for each restart an offset, and
+    the growth since its onset for a slope."""
     of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
     back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
     for a in range(m if size == 1 else min(m, size)):
@@ -242,7 +242,7 @@ def rows_of_fault(
     b: Array,
     out: Array,
 ) -> None:
-    """Write D b (3,) of a fault of a kind that is so old, of size b (p,)."""
+    """Write D b (3,) of a fault of a kind, of age `age_s` and size b (p,)."""
     out[:] = 0.0
     if not concerns(ints, kind, measures, device):
         return
@@ -297,8 +297,8 @@ def sensitivity_rows(
     g: Array,
     work: Single,
 ) -> int:
-    """Write L^-1 (H V + D) of a measurement's rows at `t_ns` to `work`, a row of columns each; how
-    many columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav
+    """Write L^-1 (H V + D) of a measurement's rows at `t_ns` to `work`, one row for each column of
+    V; their number. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav
     (10,)."""
     m, kinds = h.shape[0], ints.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
@@ -336,7 +336,7 @@ def sensitivity_rows(
 
 @compiled("void(f4[::1], i8, f8[:, ::1], i8, i8, i8, f4[::1])")
 def _fold_in(v: Single, n: int, g: Array, columns: int, first: int, end: int, work: Single) -> None:
-    """V <- V - g^T s of columns from `first` to `end`, three rows in one pass, or one."""
+    """Update V <- V - g^T s for columns from `first` to `end`, three rows in one pass, or one."""
     at, m = 0, g.shape[0]
     while at < m:
         s_0 = work[at * columns + first : at * columns + end]
@@ -364,8 +364,8 @@ def _fold_in(v: Single, n: int, g: Array, columns: int, first: int, end: int, wo
 
 @compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f4[::1])")
 def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) -> None:
-    """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
-    `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
+    """Update the bank from `work` of `sensitivity_rows` and the whitened innovation y (m,); `fused`
+    where the filter uses the rows, with g (m, w) as `whiten` leaves it."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n

@@ -1,4 +1,4 @@
-"""Compiled kernel: whether a hypothesis may be likely, at a fraction of what odds of all cost.
+"""Compiled kernel: cheap test for a likely hypothesis, before all odds are computed.
 
 With the prior's density taken for its largest, log odds are at most
 
@@ -78,7 +78,7 @@ def any_likely(bank: Array, lanes: Array) -> bool:
 def judge_what_waits(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, found: Array
 ) -> None:
-    """Odds of an epoch that nobody has read until now."""
+    """Compute the odds of a deferred epoch."""
     if bank[UNWEIGHED] < np.inf:
         epoch_s = bank[UNWEIGHED]
         bank[UNWEIGHED] = np.inf

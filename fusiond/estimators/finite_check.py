@@ -12,7 +12,8 @@ Array = NDArray[np.float64]
 
 @compiled("i8(f8[::1], f8[::1], f8[:, :])")
 def first_not_finite(nav: Array, xi: Array, p: Array) -> int:
-    """0 for nav (10,), 1 for xi (n,), 2 for the diagonal of P (n, n); -1 where all are finite."""
+    """Index of the first part that is not finite: 0 nav (10,), 1 xi (n,), 2 the diagonal of P (n,
+    n); -1 for none."""
     for i in range(nav.shape[0]):
         if not np.isfinite(nav[i]):
             return 0

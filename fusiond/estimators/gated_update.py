@@ -1,4 +1,4 @@
-"""A compiled kernel: gate, update, feedback, and what the bank of hypotheses makes of the rows."""
+"""Compiled kernel: gate, update, feedback, and the update of the fault bank."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ def fold_and_account(
     work: Single,
     found: Array,
 ) -> float:
-    """As `fusiond.estimators.update.fuse` without holding, with the bank beside it, if it has any
-    room; `measures` and `device` as of `sensitivity_rows`.
+    """Gate and fold as `fusiond.estimators.update.fuse` without holding, and update the bank if
+    present; `measures` and `device` as in `sensitivity_rows`.
 
     A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
     would never be found else. Where such a fault, as likely as it is, explains it, it is folded in;
@@ -154,8 +154,8 @@ def account_for(
     work: Single,
     found: Array,
 ) -> None:
-    """Update the bank by rows that were `fused` or not, as `whiten` has left y (m,) and g (m, w):
-    of a filter that keeps its estimate."""
+    """Update the bank by rows, `fused` or not, with y (m,) and g (m, w) from `whiten`, for a filter
+    that keeps its estimate."""
     n = h.shape[1]
     if restarts(bank, t_ns):
         judge_what_waits(bank, ints, numbers, lanes, found)

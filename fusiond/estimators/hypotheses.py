@@ -1,5 +1,6 @@
-"""The bank of one filter as the rest of the code sees it: kernels of fusiond.estimators.fault_bank
-and fusiond.estimators.fault_odds on its part of the filter's memory."""
+"""Interface of one filter's fault bank to the rest of the code: kernels of
+fusiond.estimators.fault_bank and fusiond.estimators.fault_odds on its part of the filter's memory.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ Array = NDArray[np.float64]
 
 
 class Estimated(NamedTuple):
-    """A hypothesis as it stands: number of its kind, onset (s), log odds against nothing wrong, log
+    """Hypothesis with its estimate: number of its kind, onset (s), log odds against no fault, log
     of the largest likelihood ratio, size b (p,), M (p, p), and its effect on the error state: V b
     (n,), V M V^T (n, n)."""
 
@@ -83,7 +84,7 @@ class Hypotheses:
         self.found = np.full(FOUND, -np.inf)
         """Result of the last `judge`, as of fusiond.estimators.fault_odds."""
         self.mounting = np.full((2, 2), -1.0)
-        """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
+        """Slots of pitch and yaw of the mounting, and the random part of their squares."""
         for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
             self.mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
         self.columns = columns_of(table)
@@ -100,8 +101,8 @@ class Hypotheses:
         self.of_source: dict[str, tuple[int, int]] = {}
 
     def of(self, measurement: Linearised) -> tuple[int, int]:
-        """Kinds of a measurement's rows, as of fusiond.estimators.fault_bank, and the number of its
-        device; -1 where no kind is of it."""
+        """Measures of a measurement's rows, as in fusiond.estimators.fault_bank, and its device
+        number; -1 without a kind for it."""
         known = self.of_source.get(measurement.source)
         if known is None:
             devices = self.table.devices
@@ -111,13 +112,15 @@ class Hypotheses:
 
     @property
     def waits(self) -> bool:
-        """True if V is still that of the last measurement, as it is after a look in passing."""
+        """True if V is still that of the last measurement, as after a propagation in passing."""
         return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
-        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step: one
-        that starts, or one of whose error state a fault's `mean` (n,) has been taken. Of the
-        mounting that is a turn."""
+        """Restart all hypotheses at `t_ns` with the filter's state (10,) and last step.
+
+        At a start, or after removal of a fault's `mean` (n,) from the error state; a change of the
+        mounting in it is a turn.
+        """
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
@@ -148,10 +151,9 @@ class Hypotheses:
         return self.found
 
     def take(self, t_ns: int, measured: bool, used: bool, fused: bool) -> Array | None:
-        """After rows of a measurement: what is `found` of all if they were `measured` and `used`,
-        and, unless one is identified, what the weighed hypotheses leave open of what is published
-        goes to `wider`. None where all that can wait, of rows that were `fused`, until
-        `conclude`."""
+        """Update after rows of a measurement: the result `found` if they were `measured` and
+        `used`; unless a hypothesis is identified, the covariance that the weighted hypotheses add
+        is written to `wider`. None if `fused` rows allow deferring all to `conclude`."""
         if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
             self.bank[UNJUDGED] = t_ns * 1e-9
             return None
@@ -159,7 +161,7 @@ class Hypotheses:
         return self.found
 
     def conclude(self) -> None:
-        """Judge what waits for it."""
+        """Compute the deferred odds."""
         if self.bank.item(UNWEIGHED) < math.inf:
             judge_what_waits(self.bank, *self.table[:3], self.found)
         epoch_s = self.bank.item(UNJUDGED)
@@ -179,7 +181,7 @@ class Hypotheses:
         return self._nine
 
     def opened_of_all(self) -> Array:
-        """The same of all states (n, n)."""
+        """Added covariance of all states (n, n)."""
         self.conclude()
         out = np.zeros((self.n, self.n))
         mixture(self.bank, self.table.numbers, self.n, out)
@@ -204,7 +206,7 @@ class Hypotheses:
         )
 
     def each(self, which: int) -> Array:
-        """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""
+        """One number of all groups (k, restarts), as in fusiond.estimators.fault_bank."""
         found: Array = self.bank[self._at + which]
         return found
 

@@ -1,4 +1,4 @@
-r"""The error-state filter in coordinates that a wrong heading does not spoil.
+r"""Error-state filter in invariant coordinates, consistent under a large heading error.
 
 A heading error turns all that was felt since the heading was last of no matter: a vehicle that has
 driven off in an unknown direction is somewhere on an arc. In dx that is a bent distribution; here
@@ -139,7 +139,7 @@ class Sought(NamedTuple):
 
 
 class InvariantFilter(TiltAxesFilter):
-    """The centralised filter, whose updates run in xi while it `turns`.
+    """Centralised filter whose updates run in xi while it `turns`.
 
     One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
     when it was known and is no better than to `LARGE_SD_RAD`: a fault that was taken out has left
@@ -157,8 +157,8 @@ class InvariantFilter(TiltAxesFilter):
         self._bent = False
         """True if the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
-        """Of the innovation last looked at, but for a constant that is alike for all filters; one
-        that fails its gate counts as one at the gate: it may be the measurement's fault."""
+        """Log likelihood of the last innovation, without a constant common to all filters. A gated
+        one counts as at the gate, since the measurement may be wrong."""
 
     @property
     def _known(self) -> bool:
@@ -176,7 +176,7 @@ class InvariantFilter(TiltAxesFilter):
         return m
 
     def turning(self, nav: Array, p: Array) -> Turning:
-        """Of a state (10,) and P (n, n) whose attitude error is the vehicle's."""
+        """Turning part for a state (10,) and P (n, n) whose attitude error is the vehicle's."""
         variance = float(p[PHI + 2, PHI + 2])
         n, e, _, y, x, _ = p[DV : DR + 3, PHI + 2] / max(variance, 1e-12)
         place = np.array([-x, y, 0.0])
@@ -196,7 +196,7 @@ class InvariantFilter(TiltAxesFilter):
         return 2.0 * np.eye(self.model.size) - self.jacobian(nothing, turning)
 
     def vehicle(self, nav: Array, xi: Array) -> Array:
-        """C_nv (3, 3) of the vehicle, which goes the way it faces."""
+        """Attitude C_nv (3, 3) of the vehicle, which moves the way it faces."""
         axes = np.empty((3, 3))
         vehicle_axes(nav, xi, self._mounts, axes)
         return axes
@@ -208,13 +208,13 @@ class InvariantFilter(TiltAxesFilter):
         return nav, xi
 
     def _to_dx(self, nav: Array, xi: Array, error: Array, turning: Turning) -> Array:
-        """M J (n, n) at the state that an error (n,) leads to."""
+        """Matrix M J (n, n) at the state that an error (n,) leads to."""
         j = self.jacobian(error, turning)
         mount(j, nav, xi, self._mounts, self.model.active, 1.0)
         return j
 
     def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
-        """The error (n,) in xi of this filter's state, if another's were true."""
+        """Error (n,) in xi of this filter's state, if another's were true."""
         mine, true = self.vehicle(self.nav, self.xi), self.vehicle(nav, xi)
         error, turn = xi - self.xi, true @ mine.T
         psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
@@ -230,7 +230,7 @@ class InvariantFilter(TiltAxesFilter):
         return error
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
-        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
+        """Initialise at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
         self.turns = self._known = self._bent = False
 
@@ -248,7 +248,7 @@ class InvariantFilter(TiltAxesFilter):
         return super().update(measurement, noise)
 
     def _turn_in(self, measurement: Linearised) -> Outcome:
-        """Fold one measurement in, or name why not, by an update in xi."""
+        """Fold one measurement in by an update in xi, or return its refusal."""
         self.turned = 0.0
         # A way that turns with the heading leaves no clone behind where it was.
         self.xi[self._clone] = 0.0
@@ -305,8 +305,8 @@ class InvariantFilter(TiltAxesFilter):
     def _hypothesise(
         self, measurement: Linearised, rows: Innovation, found: Sought, prior: float
     ) -> None:
-        """Update the bank by an update, which is to first order that of dx while the heading's
-        variance before it is not wide; else its hypotheses begin anew afterwards."""
+        """Update the bank by an update that equals that of dx to first order while the prior
+        heading variance is small; otherwise restart its hypotheses afterwards."""
         bank = self.hypotheses
         if bank is None or prior > WIDE_SD_RAD**2:
             self._bent = True
@@ -320,8 +320,8 @@ class InvariantFilter(TiltAxesFilter):
             self._account_for(measurement, rows, kept, found.passed)
 
     def _unfelt(self, p: Array) -> None:
-        """Let a v_t that is no more than noise not turn in P (n, n): F counts what is felt at rest
-        as noise, and as a motion that turns, which would tell a parked vehicle its heading."""
+        """Remove the coupling of a velocity within its noise from P (n, n): F would treat noise at
+        rest as motion that turns, which reveals a heading to a parked vehicle."""
         turned = p[DV : DV + 2, PHI + 2] / p[PHI + 2, PHI + 2]
         own = p[DV : DV + 2, DV : DV + 2] - np.outer(turned, turned) * p[PHI + 2, PHI + 2]
         if float(turned @ turned) < SENSED_SIGMAS**2 * float(np.trace(own)):
@@ -337,8 +337,8 @@ class InvariantFilter(TiltAxesFilter):
         rows: Innovation | None,
         psi: float = 0.0,
     ) -> Sought | NotApplicable:
-        """Gauss-Newton with P_xi (n, n), from a heading that is off by `psi` (rad), or from `rows`
-        of this filter's own state."""
+        """Iterate by Gauss-Newton with P_xi (n, n), from a heading offset `psi` (rad), or from
+        `rows` at this filter's state."""
         error, nav, xi = np.zeros(self.model.size), self.nav, self.xi
         error[PHI + 2] = psi
         for _ in range(ITERATIONS):
@@ -360,7 +360,7 @@ class InvariantFilter(TiltAxesFilter):
         return sought
 
     def _solved(self, measurement: Linearised, rows: Innovation, p: Array) -> Sought:
-        """The update of xi = 0 with P_xi (n, n) by rows that are linear in it."""
+        """Solution of the update from xi = 0 with P_xi (n, n), for rows linear in it."""
         nothing = np.zeros(self.model.size)
         if measurement.robust:
             rows = reweighted(rows, self.model, p, nothing)
@@ -390,7 +390,7 @@ class InvariantFilter(TiltAxesFilter):
 
 
 def _way(a: Array, b: Array) -> Array:
-    """North, east, down (3,) in m from the place of one state (10,) to that of another."""
+    """Vector north, east, down (3,) in m from the position of one state (10,) to another's."""
     lat, height = float(b[LAT]), float(b[HEIGHT])
     east = math.remainder(float(b[LON] - a[LON]), 2.0 * math.pi)
     return np.array(

@@ -57,7 +57,7 @@ def turns_of(error: Array, level: Array, whole: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], i8[::1], f8[:, ::1])", allocates=True)
 def vehicle_axes(nav: Array, xi: Array, mounting: Indices, axes: Array) -> None:
-    """Write C_nv (3, 3) of the vehicle, which goes the way it faces."""
+    """Write C_nv (3, 3) of the vehicle, which moves the way it faces."""
     quaternion_to_dcm(nav[Q0:], axes)
     if mounting.size:
         dcm, turn = axes.copy(), np.empty((3, 3))
@@ -71,8 +71,8 @@ def vehicle_axes(nav: Array, xi: Array, mounting: Indices, axes: Array) -> None:
     allocates=True,
 )
 def mount(m: Array, nav: Array, xi: Array, mounting: Indices, active: Flags, sign: float) -> None:
-    """M (n, n), whose rows of the mounting are those of no error, to dx of the IMU from that of the
-    vehicle; with -1 the way back."""
+    """Apply M (n, n), with identity rows for the mounting, from the vehicle's dx to the IMU's; with
+    -1 the inverse."""
     if mounting.size:
         axes = np.empty((3, 3))
         vehicle_axes(nav, xi, mounting, axes)
@@ -86,7 +86,7 @@ def mount(m: Array, nav: Array, xi: Array, mounting: Indices, active: Flags, sig
 
 @compiled("void(f8[::1], f8[::1], f8[::1], b1, f8[:, ::1])", allocates=True)
 def write_jacobian(error: Array, velocity: Array, place: Array, speeds: bool, j: Array) -> None:
-    """Write J (n, n), dx of the vehicle by xi, at the state that an error (n,) leads to."""
+    """Write J (n, n), the vehicle's dx by xi, at the state that an error (n,) leads to."""
     level, whole, turning = np.empty((3, 3)), np.empty((3, 3)), velocity.copy()
     turns_of(error, level, whole)
     j[:] = 0.0
@@ -133,7 +133,7 @@ def take_out(
     mounting: Indices,
     active: Flags,
 ) -> None:
-    """Take an `error` (n,) in xi out of the state (10,) and the parameters (n,)."""
+    """Subtract an `error` (n,) in xi from the state (10,) and the parameters (n,)."""
     level, whole, d = np.empty((3, 3)), np.empty((3, 3)), error.copy()
     turns_of(error, level, whole)
     for first in (DV, DR):
@@ -159,7 +159,7 @@ def take_out(
 
 @compiled("void(f8[::1], f8)")
 def turn_step(step: Array, psi: float) -> None:
-    """The last step (28,) is that of a vehicle that is turned by psi (rad)."""
+    """Rotate the last step (28,) by psi (rad)."""
     c, s = math.cos(psi), math.sin(psi)
     for first in (STEP_FORCE_N, STEP_SMOOTH_N):
         north, east = step[first], step[first + 1]

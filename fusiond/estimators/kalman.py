@@ -47,13 +47,13 @@ class KalmanEstimator(Estimator):
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
         self.turns = False
-        """True if the heading may be far off, and updates are another kind's."""
+        """True while the heading may be far off, and updates have another form."""
         self._knows = np.zeros(KNOWS)
         self._runs = self._new_run(NO_AXES)
 
     def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Measurements in one call, with what updates carry over; None without a bank, of whose
-        fixes a second a call costs more than it spares, and of a filter whose updates differ."""
+        """Run of packed measurements with axes of its updates; None without a bank, whose one fix a
+        second costs less than a run, and for a filter with other updates."""
         bank = self.hypotheses
         if bank is None or not self.packs:
             return None
@@ -99,8 +99,8 @@ class KalmanEstimator(Estimator):
         return Outcome("gated", nis, degrees)
 
     def _of_bank(self, measurement: Linearised, rows: int) -> OfBank:
-        """Bank, its table, a measurement's instant and what its rows are to it, and work space; of
-        nothing where there is none, and for more rows than are lent."""
+        """Arguments for the bank: its table, the instant, the measures of the rows, and work space;
+        empty without a bank, and for more rows than provided."""
         bank = self.hypotheses
         if bank is None or rows > LENT_ROWS:
             return _NO_BANK
@@ -108,7 +108,7 @@ class KalmanEstimator(Estimator):
         return bank.bank, *bank.table[:3], measurement.t_ns, *of, bank.rows, bank.found
 
     def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
-        """Rows that pass are folded in, or none."""
+        """Update by all rows, or by none."""
         cov, dx = self._cov, self._dx
         s = self._screen(measurement, rows, cov, dx)
         codes = tuple(s.codes.tolist())
@@ -127,8 +127,7 @@ class KalmanEstimator(Estimator):
     def _account_for(
         self, measurement: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
     ) -> None:
-        """Update the bank by rows of a measurement that are about to be folded in, or have
-        failed."""
+        """Update the bank by rows of a measurement that will be fused, or have failed."""
         bank, count = self.hypotheses, int(kept.sum())
         assert bank is not None
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
@@ -139,11 +138,11 @@ class KalmanEstimator(Estimator):
             account_for(self.nav, self.step, h, r, y, g, fused, *of_row, space, bank.found)
 
     def hold(self) -> None:
-        """From now on estimate without feedback: errors are carried along with the state."""
+        """Estimate without feedback from now on; errors propagate beside the state."""
         self._holding = True
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._holding = False
         self._feed_back(self._dx)
         self._dx[:] = 0.0

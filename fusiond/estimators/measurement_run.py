@@ -1,4 +1,4 @@
-"""Measurements that one filter folds in by the row, in one call of a kernel."""
+"""Run of packed measurements through one filter, in one kernel call."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 
 class Ran(NamedTuple):
-    """Number of measurements that are done, `DONE` or why there are no more, and results (k,
-    RESULT)."""
+    """Result of a run: number of finished measurements, `DONE` or the reason of its end, results
+    (k, RESULT)."""
 
     done: int
     how: int
@@ -28,7 +28,7 @@ class Ran(NamedTuple):
 
 
 class Filter(Protocol):
-    """Part of a filter that a run moves on beside its memory."""
+    """Part of a filter that a run changes beside its memory."""
 
     t_ns: int
     sample: int
@@ -60,9 +60,9 @@ class MeasurementRun:
     def __call__(
         self, imu: ImuBuffer, rows: Array, series: Array, record: bool, kept: tuple[int, int]
     ) -> Ran:
-        """Fold in measurements, `rows` (k, SIZE), each at its instant, with the noise of their
-        `series` (s, .); `kept`: when (ns) the last checkpoint was, and after what time the next is
-        due."""
+        """Apply measurements `rows` (k, SIZE), each at its instant, with the noise of their
+        `series` (s, .); `kept`: instant (ns) of the last checkpoint, and the interval to the next.
+        """
         f, results = self._filter, np.empty((len(rows), RESULT))
         options = f.kernel_options | (RECORD if record else 0)
         f.sample, f.t_ns, done, how = self._kernel(

@@ -1,4 +1,4 @@
-"""All that a filter keeps of its state in one array, and what its model is for the kernels.
+"""State of a filter in one array, and the model's description for the kernels.
 
 A call of a compiled kernel costs 25 ns an argument, so `fusiond.estimators.propagation` takes this
 array and the IMU buffer's, and what differs from call to call.
@@ -42,8 +42,8 @@ WIDER_AT = PUBLISHED_AT + len(Published._fields)
 NAV_AT = line_after(WIDER_AT + WIDER)
 STEP_AT, SUMS_AT = NAV_AT + NAV_SIZE, NAV_AT + NAV_SIZE + STEP_SIZE
 XI_AT = SUMS_AT + SUMS
-"""Layout of the array behind it, in doubles; then come parameters and error estimates, and on the
-next line covariances and the bank, with which ends what a snapshot copies, from `WIDER_AT` on."""
+"""Layout of the following array, in doubles: then parameters and error estimates, and from the next
+cache line covariances and the bank. A snapshot copies all from `WIDER_AT` on."""
 
 
 def scratch_size(width: int) -> int:
@@ -53,13 +53,12 @@ def scratch_size(width: int) -> int:
 
 
 class Memory(NamedTuple):
-    """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
-    (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
-    `wider`, nav (10,), the last step (28,), the `sums` (25,) of
-    fusiond.estimators.block_covariance, `xi` (n,), `dxs` (k, n), `covs` (k, width, width), the
-    `bank` of fusiond.estimators.fault_bank; covariances before what has been added up, flat,
-    `held`; `phi` (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares`
-    (k,)."""
+    """State array with its parts for Python: `head` (8,) as above; variances (9,) by which the
+    published solution is `wider`, `Published` (3,); the part `kept` by a snapshot: `wider`, nav
+    (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.block_covariance, `xi` (n,),
+    `dxs` (k, n), `covs` (k, width, width), the `bank` of fusiond.estimators.fault_bank; covariances
+    before the accumulated interval, flat, `held`; `phi` (width, width) or (0, 0); `work` for
+    kernels that propagate a covariance; `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
@@ -82,9 +81,8 @@ class Memory(NamedTuple):
 def memory(
     model: Model, gap_ns: int, shares: tuple[float, ...], transition: bool, faults: FaultTable
 ) -> Memory:
-    """For filters of these shares of the noise, k of them; `phi` where a `transition` is asked
-    for. Rows of matrices begin lines where they are as long as some: they are then read and written
-    by whole ones."""
+    """Memory for filters with these k shares of the noise; `phi` if a `transition` is requested.
+    Long rows of matrices are aligned to cache lines."""
     n, width, k = model.size, model.width, len(shares)
     side = width if transition else 0
     square, scratch = k * width * width, scratch_size(width)

@@ -1,4 +1,4 @@
-r"""One noise scale a series: by how much its variance is more than it states, as it has shown.
+r"""Scale of a series' stated noise variance, estimated from its innovations.
 
 Whitened innovations y (d,) of a series are N(0, I) and white while filter and series are as
 modelled. Where the series states too little, or its errors last from one to the next, their
@@ -43,11 +43,12 @@ COUNT = 600.0
 PRIOR_COUNT = 60.0
 """Weight of the stated variance: the estimate scatters by half of itself then."""
 WAITS_NS = 15_000_000_000
-"""A drift of 0.1 m/s is found within twice this; longer ones hide nothing."""
+"""Delay of the estimate; a drift of 0.1 m/s is found within twice this, and a longer delay hides
+nothing."""
 MOST = 100.0
-"""Of a variance: ten times the sigma. What is beyond is no noise."""
+"""Largest scale of a variance: ten times the sigma. A larger one is not noise."""
 SURE = 2.0
-"""Sigmas of its own scatter by which a scale must be more than one to count at all."""
+"""Sigmas of its scatter by which a scale must exceed one to be used."""
 SCATTER = 2.0 + 4.0 * sum((1.0 - k / (LAGS + 1.0)) ** 2 for k in range(1, LAGS + 1))
 """Variance of s of one series of white innovations, times their number."""
 _ROWS = 3
@@ -63,7 +64,7 @@ SIZE = _RING + _ROWS * LAGS
 
 
 def unlearned() -> Array:
-    """A series of which nothing is known."""
+    """Series without any estimate."""
     packed = np.zeros(SIZE)
     packed[:_ROWS] = 1.0
     return packed
@@ -71,7 +72,7 @@ def unlearned() -> Array:
 
 @compiled("void(f8[::1])", forceinline=True)
 def _settle(packed: Array) -> None:
-    """Take in what has waited; what has come since waits from now on."""
+    """Apply the waiting sums; the present ones wait next."""
     n = packed[_WAITING]
     learned = packed[_LEARNED]
     keep = 1.0 if learned == 0.0 or learned + n <= COUNT else max(0.0, COUNT - n) / learned
@@ -95,7 +96,7 @@ def _settle(packed: Array) -> None:
 
 @compiled("void(f8[::1], f8, f8, f8, f8, i8)")
 def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int) -> None:
-    """Take in an innovation of so many rows at `t_s`, whitened with the scales as they are."""
+    """Add an innovation of so many rows at `t_s`, whitened with the present scales."""
     if packed[_NEW_COUNT] == 0.0:
         packed[_SINCE] = t_s
     elif t_s - packed[_SINCE] >= WAITS_NS * 1e-9:

@@ -1,4 +1,4 @@
-r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock or by its own.
+r"""Compiled kernels: the published state, by the receiver's clock or the filter's own.
 
 A receiver defines the time that others label a solution with. Where a filter estimates by how much
 tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it
@@ -57,7 +57,7 @@ Array = NDArray[np.float64]
 WIDER = 9
 """Variances of `widen`."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
-"""A vehicle moves whose speed is beyond both."""
+"""Thresholds of motion, both of which a speed must exceed."""
 ENTRIES, MOVING = 22, 12
 """Numbers of `entries` and of `moving`."""
 
@@ -140,7 +140,7 @@ def moving(nav: Array, step: Array, out: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], f8, f8[::1])", forceinline=True)
 def sigmas_of(p: Array, motion: Array, axes_sd_rad: float, out: Array) -> None:
-    """Write one sigma (9,) as `sigmas` does, of `entries` (22,) and of what is `moving` (12,)."""
+    """Write one sigma (9,) as `sigmas`, from `entries` (22,) and the motion `moving` (12,)."""
     tt = p[21]
     for i in range(3):
         v, a = motion[i], motion[3 + i]
@@ -198,8 +198,8 @@ def widen(wider: Array, out: Array) -> None:
 
 @compiled("f8(f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", allocates=True)
 def surely_moves(cov: Array, nav: Array, step: Array, published: Array, wider: Array) -> float:
-    """1 if the vehicle moves, by its horizontal velocity and the sigma of that, by `published` (3,)
-    and `wider` (9,); else 0."""
+    """Return 1 if the horizontal velocity proves motion by its sigma, from `published` (3,) and
+    `wider` (9,); else 0."""
     speed = math.hypot(nav[VN], nav[VN + 1])
     if step[STEP_RESTS_S] > 0.0 or speed <= MOVES_M_S:
         return 0.0
@@ -211,8 +211,8 @@ def surely_moves(cov: Array, nav: Array, step: Array, published: Array, wider: A
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
 def opened_variances(opened: Array, step: Array, out: Array) -> None:
-    """Write `out` (9,), as `sigmas` squared, of what is open of attitude, velocity and position (9,
-    9), with C_nb as `step` (28,) holds it."""
+    """Write `out` (9,), variances in the order of `sigmas`, from the added covariance of attitude,
+    velocity and position (9, 9), with C_nb from `step` (28,)."""
     for i in range(3):
         out[i], out[3 + i] = opened[6 + i, 6 + i], opened[3 + i, 3 + i]
     sp = -step[STEP_DCM + 6]

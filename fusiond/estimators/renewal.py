@@ -1,4 +1,4 @@
-r"""Errors that successive measurements share, where in part they become others.
+r"""Partial renewal of errors that successive measurements share.
 
     t <- R t + w       t in units of their initial sigmas
     t <- R t + G e + w,  and what the states are is given: a clone of the navigation errors e
@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 
 
 def transition(renewal: Renewal, model: Model) -> tuple[Array, Array, list[int]] | None:
-    """R (k, k) and its noise's covariance (k, k) in the states' units, and their slots; None where
-    the model has no such states."""
+    """Matrix R (k, k), its noise covariance (k, k) in the states' units, and their slots; None
+    without such states."""
     slots = model.slots_of_all(renewal.blocks).tolist()
     if len(slots) != len(renewal.kept):
         return None
@@ -35,7 +35,7 @@ def transition(renewal: Renewal, model: Model) -> tuple[Array, Array, list[int]]
 
 
 def renew(renewal: Renewal, model: Model, covs: Iterable[Array], others: Iterable[Array]) -> None:
-    """Carry P (.., w, w) of each of `covs` over, and the rows of `others` (n, ..)."""
+    """Apply the renewal to P (.., w, w) of each of `covs` and the rows of `others` (n, ..)."""
     found = transition(renewal, model)
     if found is None:
         return
@@ -55,7 +55,7 @@ def renew(renewal: Renewal, model: Model, covs: Iterable[Array], others: Iterabl
 
 
 def _carried(kept: Array, cloned: Array | None, rows: Array, slots: list[int]) -> Array:
-    """Rows (k, w) of the states in `slots` after it, of all `rows` (.., w) before it."""
+    """Renewed rows (k, w) of the states in `slots`, from all `rows` (.., w)."""
     found = product(kept, rows[slots])
     if cloned is not None:
         found += product(cloned, rows[:CORE_SIZE])
@@ -63,6 +63,6 @@ def _carried(kept: Array, cloned: Array | None, rows: Array, slots: list[int]) -
 
 
 def product(a: Array, b: Array) -> Array:
-    """A B of few rows, in one order of operations on all machines."""
+    """Product A B of few rows, in one order of operations on all machines."""
     found: Array = (a[:, :, None] * b[None, :, :]).sum(axis=1)
     return found

@@ -39,7 +39,7 @@ SETTLED, MOST_TURNS = 1e-6, 100
 
 
 def reweighted(rows: Innovation, model: Model, p: Array, dx: Array) -> Innovation:
-    """The rows with r / w for r, for P (n, n) and the error estimate `dx` (n,) before the update.
+    """Rows with r / w for r, for P (n, n) and the error estimate `dx` (n,) before the update.
 
     As they are where one has no finite innovation: the filter names that itself.
     """

@@ -72,7 +72,7 @@ Indices = NDArray[np.int64]
 Single = NDArray[np.float32]
 
 FUSED, GATED, NOT_FINITE = range(len(NAMES), len(NAMES) + 3)
-"""Results of a measurement beside those of `packed_rows`, which say why it does not apply."""
+"""Results of a measurement beside those of `packed_rows`, which are refusals."""
 ENDS = (*NAMES, "fused", "gated", "not_finite")
 """Names of all results."""
 BECAME, NIS, MOVES, DEGREES, WHITENED, INNOVATION, OF_STATE = 0, 1, 2, 3, 4, 7, 10
@@ -81,12 +81,12 @@ RESULT = OF_STATE + LENT_ROWS * 6
 that apply, innovation whitened and as it is (3 each), and what its rows have of velocity and
 position (3 x 6)."""
 DONE, KEEP, JUDGE, OTHERWISE = range(4)
-"""Ways in which a call ends: all is done; a checkpoint is due before the next measurement; the last
-one is to be judged; the next one is no row of this kernel."""
+"""Ends of a call: all done; a checkpoint is due before the next measurement; the last one needs a
+judgement; the next one is not a row for this kernel."""
 KNOWN, TURNED, SETTLES, UNDOUBTED, PLAIN, LARGE, KNOWS = range(7)
-"""State of a filter beside its memory: 1 if its heading has been known; by how much (rad) the
-last update turned the axes of a tilt; 1 if its updates may turn; 1 if gyros are undoubted; the
-heading's variances below and above which it is known, and is not."""
+"""State of a filter beside its memory: 1 if its heading has been known; rotation (rad) of the tilt
+axes by the last update; 1 if its updates may rotate them; 1 if gyros are undoubted; the heading
+variances below and above which it is known and unknown."""
 _Y, _Z, _R, _BEFORE, AT_H = 0, 3, 6, 9, 9 + ESTIMATE_SIZE
 """Layout of work space, g behind H."""
 
@@ -94,18 +94,19 @@ _Y, _Z, _R, _BEFORE, AT_H = 0, 3, 6, 9, 9 + ESTIMATE_SIZE
 StateParts = tuple[Array, Array, Array, Array, Array]
 """Navigation state (10,), parameters (n,), last step, P (w, w), error estimate (n,)."""
 BankParts = tuple[Array, Indices, Array, Array, Array, Single, Array]
-"""Bank, the three parts of its table, `found`, and work space for rows and for what is open."""
+"""Bank, the three parts of its table, `found`, and work space for rows and for the added
+covariance."""
 OpenedParts = tuple[Array, Array, Array]
-"""Axes and clock of publication (3,), mounting (2, 2), and what sigmas are wider by (9,)."""
+"""Axes and clock of publication (3,), mounting (2, 2), and variances added to the sigmas (9,)."""
 AxesParts = tuple[Indices, Indices, Indices, Indices]
 """Parts of `Axes`."""
 ModelParts = tuple[Indices, Array, bool]
-"""Columns of the states, their sigmas at the start (n,), whether height is held."""
+"""Columns of the states, their initial sigmas (n,), and 1 if height is held."""
 
 
 class Axes(NamedTuple):
-    """Slots of what an update carries over: force biases and their axes (2, k), gyros (0 or 3,),
-    lever arm (0 or 3,), offset in time (0 or 1,)."""
+    """Slots of an update's rotation: force biases and their axes (2, k), gyros (0 or 3,), lever arm
+    (0 or 3,), offset in time (0 or 1,)."""
 
     biases: Indices
     gyros: Indices
@@ -127,8 +128,8 @@ _AXES = "Tuple((i8[:, ::1], i8[::1], i8[::1], i8[::1]))"
 def conclude(
     later: bool, waits: bool, state: StateParts, of_bank: BankParts, opened: OpenedParts
 ) -> None:
-    """Judge what waits for it; what is open of what is published is said `later`, or now. It
-    `waits` where nobody reads odds before they are others."""
+    """Compute deferred odds; the added covariance follows `later`, or now. Odds `waits` if nothing
+    reads them before they change."""
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
     judge_what_waits(bank, ints, numbers, lanes, found)
@@ -148,7 +149,7 @@ def conclude(
 
 @compiled("b1(i8[:, ::1], i8, i8)")
 def _said_later(ints: Indices, first: int, until_ns: int) -> bool:
-    """True if one of the rows from `first` on is measured, applies in any state, and comes before
+    """True if a row from `first` on is measured, applies in any state, and comes before
     `until_ns`."""
     for i in range(first, ints.shape[0]):
         if ints[i, T_NS] >= until_ns:
@@ -167,8 +168,8 @@ def _judged(
     opened: OpenedParts,
     noise: Array,
 ) -> int:
-    """`JUDGE` of a fused measurement whose odds cannot wait; else `DONE`, its innovation y learned
-    from."""
+    """Result `JUDGE` for a fused measurement whose odds cannot be deferred; else `DONE`, after
+    learning from its innovation y."""
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
     m, t_s = of[ROWS], of[T_NS] * 1e-9
@@ -203,8 +204,8 @@ def fold_row(
     knows: Array,
     result: Array,
 ) -> int:
-    """Fold in the measurement of a row `x` at its instant, whose series has that `noise`; write
-    `result` (RESULT,). `DONE`, or `JUDGE`, or `OTHERWISE` with nothing done."""
+    """Apply the packed measurement `x` at its instant, whose series has that `noise`; write
+    `result` (RESULT,). Returns `DONE`, `JUDGE`, or `OTHERWISE` without a change."""
     nav, xi, step, cov, dx = state
     bank, ints, numbers, lanes, found, of_rows, _ = of_bank
     of = x.view(np.int64)

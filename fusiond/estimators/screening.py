@@ -41,7 +41,7 @@ FEWEST_JUMPING = 3
 def _grouped(
     h: Array, used: NDArray[np.bool_], begin: Codes, counts: Codes, columns: Codes, values: Array
 ) -> int:
-    """Find groups of successive rows of h (m, n) that measure about the same states; how many.
+    """Find groups of successive rows of h (m, n) with nearly the same states; their number.
 
     Group k has the rows from `begin[k]` to `begin[k + 1]` and measures `counts[k]` states, whose
     slots are `columns[k]` in their order; `values[p]` (m,) is what rows have for the p-th of their
@@ -103,7 +103,8 @@ def _residuals(
     residual: Array,
     variance: Array,
 ) -> None:
-    """Write z - h dx and r + h P h^T, r - h P h^T with a `sign` of -1, of every row (m,)."""
+    """Write residual and variance of every row (m,): z - h dx and r + h P h^T; r - h P h^T with a
+    `sign` of -1."""
     for k in range(groups):
         own, first, last = columns[k], begin[k], begin[k + 1]
         v, s, t = residual[first:last], variance[first:last], work[first:last]
@@ -158,8 +159,8 @@ def _fold_in(
     cov: Array,
     dx: Array,
 ) -> float:
-    """Fold the rows that are KEPT, one after another, into `cov` and `dx`, in place; y and what is
-    returned as of `screened_update`.
+    """Fold the rows that are KEPT, one after another, into `cov` and `dx`, in place; y and the
+    result as in `screened_update`.
 
     What a row takes off P goes to `g` (m + 1, w) behind a row of zeros; `taken` (n,) says how many
     of these are off each row of P: those that the group does not measure wait until one measures

@@ -63,8 +63,8 @@ class SeparatedEstimator(KalmanEstimator):
         self._device_of: dict[str, int | None] = {}
 
     def covariances(self) -> Array:
-        """P (1 + devices, 3, 3), m^2, of the position north, east, down: of all measurements, then
-        of the subsets."""
+        """Covariances P (1 + devices, 3, 3), m^2, of the position north, east, down: of all
+        measurements, then of the subsets."""
         return self._covs[:, POSITION, POSITION]
 
     def separations(self) -> Array:
@@ -90,10 +90,10 @@ class SeparatedEstimator(KalmanEstimator):
         return outcome
 
     def _renew(self, renewal: Renewal) -> None:
-        """Nothing more: `update` does it before it linearises, and behind the subsets."""
+        """Do nothing: `update` renews before its linearisation, and after the subsets."""
 
     def _leave_all(self, measurement: Linearised, codes: tuple[int, ...]) -> None:
-        """Clone what a measurement leaves to the next, in the subsets, too."""
+        """Clone the state for the next measurement, in the subsets as well."""
         if measurement.screened and (renewal := measurement.leaves(self.state, codes)) is not None:
             super()._renew(renewal)
 
@@ -109,15 +109,15 @@ class SeparatedEstimator(KalmanEstimator):
         return outcome
 
     def adopt(self, mean: Array, spread: Array) -> None:
-        """Take a fault's effect out of the state, which all share: its mean (n,), and P grows by
-        `spread` (n, n)."""
+        """Remove a fault's effect from the common state: its mean (n,), and P grows by `spread` (n,
+        n)."""
         super().adopt(mean, spread)
         n = self.model.size
         self._covs[1:, :n, :n] += spread
         self._dxs[1:] -= mean
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._holding = False
         self._take_out()
 
@@ -134,8 +134,8 @@ class SeparatedEstimator(KalmanEstimator):
         return self._device_of[measurement.source]
 
     def _fold_into_subsets(self, measurement: Linearised, i: Innovation) -> None:
-        """A measurement into each subset but its own device's, if the subset's gate lets it
-        pass."""
+        """Fold a measurement into each subset but its own device's, if the subset's gate passes
+        it."""
         own = self._device(measurement)
         for k in range(1, 1 + len(self.devices)):
             if k - 1 == own:

@@ -1,4 +1,4 @@
-r"""The axes in which a tilt is known, when a heading turns that nobody has seen turn.
+r"""Frame of the tilt covariance, when an update changes the heading without a real rotation.
 
 Straight on at one speed, tilt and accelerometer bias are known by their sum alone, which moves the
 vehicle: of a computed attitude C with a tilt t (rad, north and east) and a bias error b
@@ -131,7 +131,7 @@ class TiltAxesFilter(KalmanEstimator):
 
     @property
     def undoubted(self) -> bool:
-        """True if what gyros are wrong by is what they were wrong by when the filter started."""
+        """True if the gyro errors are still those of the filter's start."""
         return self._knows.item(UNDOUBTED) > 0.0
 
     @undoubted.setter
@@ -153,11 +153,11 @@ class TiltAxesFilter(KalmanEstimator):
         return outcome
 
     def _turn_in(self, measurement: Linearised) -> Outcome:
-        """The same while the heading may be far off."""
+        """Update while the heading may be far off."""
         raise NotImplementedError
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         before = self._estimate()
         carries = self._astray or may_part(self._covariance, self._slots)
         super().release()
@@ -165,7 +165,7 @@ class TiltAxesFilter(KalmanEstimator):
             self._carry_over(before)
 
     def _estimate(self) -> Array:
-        """As `remember_estimate` writes it."""
+        """Estimate in the form of `remember_estimate`."""
         before = np.empty(ESTIMATE_SIZE)
         remember_estimate(self.nav, self.xi, self._biases, self._gyros, self._lever, before)
         return before
@@ -177,7 +177,7 @@ class TiltAxesFilter(KalmanEstimator):
 
     @property
     def _keeps_turn(self) -> bool:
-        """At rest a turn of C^ is a known one, of which updates need tell P nothing."""
+        """True at rest, where a turn of C^ is known and P needs no correction."""
         return self.undoubted and self.step.item(STEP_RESTS_S) == 0.0
 
     @property

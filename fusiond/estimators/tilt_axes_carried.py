@@ -1,4 +1,4 @@
-"""Compiled kernels: P and sensitivities after an update that turned the axes of a tilt.
+"""Compiled kernels: rotation of P and sensitivities after an update that rotated the tilt axes.
 
 As fusiond.estimators.tilt_axes says, with what turn_rate and antenna_place add.
 """
@@ -30,7 +30,7 @@ SLIGHT_M_S2 = 1e-4
 
 @compiled("f8(f8[::1], f8[::1])")
 def heading_turn(before: Array, after: Array) -> float:
-    """By how much (rad) about the vertical an attitude q_nb (4,) was turned to another."""
+    """Rotation (rad) about the vertical from one attitude q_nb (4,) to another."""
     w, x, y, z = before[0], before[1], before[2], before[3]
     to_w, to_x, to_y, to_z = after[0], after[1], after[2], after[3]
     along = w * to_w + x * to_x + y * to_y + z * to_z
@@ -73,8 +73,8 @@ def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indic
 
 @compiled("b1(f8[:, :], i8[::1])")
 def may_part(p: Array, slots: Indices) -> bool:
-    """True if an update may tell tilt and force biases, the `slots` (j,) of P (n, n), apart that
-    nothing has told apart."""
+    """True if an update may separate tilt and force biases, the `slots` (j,) of P (n, n), that were
+    inseparable so far."""
     if slots.size == 0:
         return False
     tilt = max(p[PHI, PHI], p[PHI + 1, PHI + 1])
@@ -119,8 +119,10 @@ def keep_rows(
     lever: Indices,
     late: Indices,
 ) -> None:
-    """M (n, k) <- T M after an update of an estimate `before`, which has `turned` the axes (rad):
-    what is known of the gyros, and of the antenna's place."""
+    """Apply M (n, k) <- T M after an update of an estimate `before`.
+
+    The update has rotated the axes by `turned` (rad); gyro errors and antenna position are kept.
+    """
     if gyros.size:
         told = before[_TOLD:_ARM_AFTER]
         for j in range(3):
@@ -135,8 +137,8 @@ def keep_rows(
 
 @compiled("void(f8[::1], f8[::1], f8[::1], i8[:, ::1])")
 def keep_downward(before: Array, nav: Array, xi: Array, biases: Indices) -> None:
-    """Share of an update in xi's force `biases` downward, along the mean of the axes before and
-    after: the vertical bias takes the difference."""
+    """Preserve the downward component of the force `biases` in xi, along the mean of the axes
+    before and after; the vertical bias takes the difference."""
     if biases.shape[1] == 0:
         return
     old, new = dcm_elements(before[Q0:NAV_SIZE]), dcm_elements(nav[Q0:])
@@ -151,7 +153,7 @@ def keep_downward(before: Array, nav: Array, xi: Array, biases: Indices) -> None
 
 @compiled("i8[::1](i8[::1], i8[::1], i8[::1], i8[::1])", allocates=True)
 def _turned_slots(forces: Indices, gyros: Indices, lever: Indices, late: Indices) -> Indices:
-    """States whose rows and columns an update's T has others than those of the identity (k,)."""
+    """Slots (k,) whose rows and columns of an update's T differ from the identity."""
     behind = 3 + forces.size + gyros.size
     slots = np.empty(behind + (3 + lever.size + late.size if lever.size else 0), dtype=np.int64)
     for j in range(3):
@@ -167,7 +169,7 @@ def _turned_slots(forces: Indices, gyros: Indices, lever: Indices, late: Indices
 
 @compiled("void(f8[:, ::1], i8[::1], f8[:, ::1])", allocates=True)
 def turn_covariance(cov: Array, slots: Indices, t: Array) -> None:
-    """P <- T P T^T of P (w, w), where T is that of the identity but for rows and columns `slots`
+    """Transform P <- T P T^T of P (w, w), where T is the identity but for rows and columns `slots`
     (k,): t (k, k)."""
     count, end = slots.shape[0], 0
     mixed, rows = np.empty(count, dtype=np.int64), np.zeros((count, cov.shape[1]))
@@ -215,7 +217,7 @@ def carry_over(
     lever: Indices,
     late: Indices,
 ) -> float:
-    """P <- T P T^T and V <- T V after an update.
+    """Transform P <- T P T^T and V <- T V after an update.
 
     Of P (w, w) with n states, of a `bank` if it has any room, and of an estimate `before`;
     `keep_downward` of xi (n,). Returned is by how much (rad) the update has turned the axes about

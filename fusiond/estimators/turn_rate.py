@@ -1,4 +1,4 @@
-r"""Gyro error of an update that changes the rate at which a vehicle is taken to turn.
+r"""Gyro error after an update that changes the estimated turn rate.
 
 While tilt and force bias hide each other (fusiond.estimators.tilt_axes), both stay as they are on
 the vehicle: of a computed attitude C that turns about the vertical at w, with a tilt t and a rate

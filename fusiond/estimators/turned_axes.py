@@ -1,4 +1,4 @@
-"""Effect of an interval on the tilt axes of a covariance: compiled kernels.
+"""Compiled kernels: effect of an interval on the tilt axes of a covariance.
 
 The equations are in fusiond.estimators.tilt_axes. Covariances (width, width) are flat, and nothing
 of P21 comes into what else they hold: it is made of P12 (fusiond.estimators.covariance). What
@@ -26,9 +26,8 @@ TURN_SIZE = 5
 
 @compiled("void(f8[::1], i8, f8)", forceinline=True)
 def turn_tilt(cov: Array, width: int, known: float) -> None:
-    """Add to `cov`, flat and of `width` rows, what a turn does to the axes of a tilt, if nobody
-    knows whether it was one: the heading's variance was `known` (rad^2) before it
-    (fusiond.estimators.tilt_axes)."""
+    """Add to `cov`, flat and of `width` rows, a turn's effect on the tilt axes, if it may not have
+    been real: the heading variance before it was `known` (rad^2) (fusiond.estimators.tilt_axes)."""
     grown = cov[2 * width + 2] - known
     if grown > 0.0:
         north, east, both = cov[0], cov[width + 1], cov[1]
@@ -48,9 +47,9 @@ def turn_down(
     grown_north: float,
     grown_east: float,
 ) -> None:
-    """Add to `cov`, flat and of `width` rows, what a tilt that only the gyros' errors have made
-    does to the vertical force: variances (rad^2) that a tilt has `grown` by, times those of the
-    force biases across (fusiond.estimators.tilt_axes)."""
+    """Add to `cov`, flat and of `width` rows, the effect of a tilt from gyro errors on the vertical
+    force: variances (rad^2) by which a tilt has `grown`, times those of the lateral force biases
+    (fusiond.estimators.tilt_axes)."""
     upright = step[STEP_DCM + 8]
     north, east, vertical = 0.0, 0.0, -1
     for i in range(6, 12):
@@ -88,7 +87,7 @@ def turn_at_rest(w: float, x: float, y: float, z: float, after: Array, turn: Arr
 
 @compiled("i8(i8[::1], i8[::1])", forceinline=True)
 def _vertical(sensor_slot: Indices, sensor_kind: Indices) -> int:
-    """The force bias that takes what is left downward; -1 if there is none."""
+    """Slot of the force bias that takes the downward remainder; -1 without one."""
     for i in range(10, 12):
         if sensor_kind[i] == PLAIN:
             slot: int = sensor_slot[i]
@@ -137,7 +136,7 @@ def rest_axes(
     sensor_slot: Indices,
     sensor_kind: Indices,
 ) -> None:
-    """P <- T P T^T of n states, of a `turn` at rest."""
+    """Transform P <- T P T^T of n states, for a `turn` at rest."""
     rest_rows(cov, width, n, turn, sensor_slot, sensor_kind)
     vertical = _vertical(sensor_slot, sensor_kind)
     for i in range(n):

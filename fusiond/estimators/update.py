@@ -67,7 +67,7 @@ def whiten(cov: Array, z: Array, h: Array, r: Array, y: Array, g: Array) -> floa
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
 def fold_in(cov: Array, dx: Array, y: Array, g: Array) -> None:
-    """Update `dx` (n,) and `cov` (w, w), in place, by what `whiten` left."""
+    """Update `dx` (n,) and `cov` (w, w), in place, from the results of `whiten`."""
     m = g.shape[0]
     at = 0
     while at < m:
@@ -106,8 +106,8 @@ def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: A
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])", allocates=True)
 def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
-    """Fold rows z = h dx + noise (variances r) into `dx` (n,) and `cov` (w, w), in place; nothing
-    changes where S is not positive."""
+    """Fold rows z = h dx + noise (variances r) into `dx` (n,) and `cov` (w, w), in place; no change
+    if S is not positive."""
     m = z.shape[0]
     innovation, y, g = np.empty(m), np.empty(m), np.empty((m, cov.shape[1]))
     take_off(z, h, dx, innovation)
@@ -117,7 +117,8 @@ def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], f8[::1])")
 def feed_back(nav: Array, xi: Array, d: Array) -> None:
-    """Take the estimated errors `d` (n,) out of `nav` (10,), add its parameters to `xi` (n,)."""
+    """Subtract the estimated errors `d` (n,) from `nav` (10,) and add its parameters to `xi`
+    (n,)."""
     for i in range(CORE_SIZE, d.shape[0]):
         xi[i] += d[i]
     rotate_quaternion(nav[Q0:], d[0], d[1], d[2], True)

@@ -1,4 +1,4 @@
-"""A CSV file as this project reads it: commas between cells, points in numbers, not compressed.
+"""Normalisation of a CSV file: comma between cells, decimal points, uncompressed.
 
 Semicolons or tabs between the cells, and then commas in the numbers, are what spreadsheets write in
 half of the world. Each is one character for another, so that line numbers stay. `.gz` is opened.
@@ -49,7 +49,7 @@ def first_line(data: Text) -> bytes:
 
 
 def _contents(path: Path) -> Text:
-    """All bytes of a file: large arrays have large pages, a third of the time of `read_bytes`."""
+    """Read all bytes of a file, into large memory pages in a third of the time of `read_bytes`."""
     with path.open("rb") as file:
         data = np.empty(os.fstat(file.fileno()).st_size, dtype=np.uint8)
         data = data[: file.readinto(data.data)]
@@ -72,8 +72,8 @@ def _unzipped(data: bytes) -> bytes:
 
 
 def _without_quotes(data: Text) -> Text:
-    """Cells in quotes, as R writes names and spreadsheets what they are told to: no number and no
-    name of a column needs them."""
+    """Remove quotes around cells, as R and spreadsheets write; numbers and column names need
+    none."""
     if b'"' in first_line(data) or b'"' in first_line(data[len(first_line(data)) + 1 :]):
         return np.where(data == ord('"'), np.uint8(ord(" ")), data)
     return data

@@ -1,4 +1,4 @@
-"""Numeric CSV tables with a header row: read fast, and name every row that cannot be true.
+"""Fast reader of numeric CSV tables with a header row; it names every implausible row.
 
 `fusiond.files.csv_dialect` makes one dialect of several. Plain decimals are read by a compiled
 reader, other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank
@@ -33,11 +33,11 @@ Flags = NDArray[np.bool_]
 
 _TEXT_DTYPE = "U64"
 _MAX_TIME_S = 9e9
-"""Seconds beyond which nanoseconds leave a 64-bit integer."""
+"""Largest time (s) whose nanoseconds fit a 64-bit integer."""
 
 
 class TableError(Exception):
-    """A file that cannot be read as the table it should be; the text names file and reason."""
+    """Error: a file that cannot be read as its table; the text names file and reason."""
 
 
 class MissingPackageError(Exception):
@@ -89,7 +89,7 @@ TIME = Column("t_s", low=-_MAX_TIME_S, high=_MAX_TIME_S)
 
 @immutable()
 class RawTable:
-    """The rows that may be true, by column name (n,), and those that may not, in file order."""
+    """Plausible rows by column name (n,), and the rejected ones, in file order."""
 
     columns: dict[str, Floats]
     text: dict[str, list[str]]
@@ -97,12 +97,12 @@ class RawTable:
 
 
 FEWEST_ZEROS = 10
-"""Rows from which on a sigma that is always 0 is one that was not written down; a lone 0 is a row
-that cannot be true."""
+"""Rows from which a sigma that is always 0 means that none was written; a single 0 is implausible.
+"""
 
 
 def counted(refused: Mapping[str, int]) -> list[Rejection]:
-    """Rejections of what has no lines, frames and sentences, from their number by reason."""
+    """Rejections of bytes, frames and sentences without line numbers, from counts by reason."""
     return [Rejection(0, name, f"{n} times", n) for name, n in refused.items() if n]
 
 
@@ -190,7 +190,7 @@ def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> N
 
 
 def _as_text(data: Text) -> TextIO:
-    """A byte that is none of UTF-8 costs the cell that it stands in."""
+    """Decode as UTF-8; an invalid byte costs its cell only."""
     return TextIOWrapper(BytesIO(data.data), encoding="utf-8-sig", errors="replace")
 
 
@@ -207,7 +207,7 @@ def _header(data: Text) -> list[str]:
 
 
 def _read_plain(data: Text, start: int, rows: int, header: list[str]) -> _Parsed | None:
-    """A file of plain decimals, such as this project writes; None if there is anything else."""
+    """Parse a file of plain decimals, such as this project writes; None for any other."""
     values = np.empty((len(header), rows))
     if not parse_rows(data, start, values):
         return None

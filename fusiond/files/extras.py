@@ -1,5 +1,5 @@
-"""Installation of an extra into the running Python: no index has fusiond
-itself, so the packages are named."""
+"""Installation of an extra into the running Python. fusiond is on no package index, so its packages
+are named."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from importlib.util import find_spec
 
 
 def install(extra: str) -> str:
-    """The command that installs `extra`, as fusiond's metadata states it. A Debian package has no
-    pip of its own: the system's does it."""
+    """Command that installs `extra`, from fusiond's metadata. A Debian package lacks pip; the
+    system's is used."""
     try:
         stated = requires("fusiond") or []
     except PackageNotFoundError:  # run from a folder, without an installation

@@ -1,4 +1,4 @@
-"""Kinds of files that are given in the place of a receiver's log: named, not read."""
+"""Recognition of files given in place of a receiver's log, for the error message."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BEGINNINGS: tuple[tuple[bytes, str], ...] = (
     (b"\x89MCAP", "a recording (MCAP): fusiond replay takes fusiond's own"),
     (b"SQLite format 3", "a data base (SQLite)"),
 )
-"""By their first bytes, as file(1) knows them."""
+"""Kinds by first bytes, as in file(1)."""
 _WITHIN: tuple[tuple[bytes, str], ...] = (
     (b"RINEX VERSION", "a RINEX file: --aid raw=FILE"),
     (b"<gpx", "a GPX track, which has no accuracy: take the receiver's own log"),
@@ -23,12 +23,12 @@ _WITHIN: tuple[tuple[bytes, str], ...] = (
     (b"<!doctype", "a page of the web: the download went wrong"),
     (b"lat_deg", "a table: --aid gnss=FILE (or the kind that its columns are of)"),
 )
-"""By what stands in the first kilobyte, in letters of any size."""
+"""Kinds by text in the first kilobyte, without case."""
 _LOOKED_AT = 1024
 
 
 def kind_of(data: bytes) -> str:
-    """Name of what `data` is instead of a receiver's log, with what to do; "" if nobody knows."""
+    """Name of the file's actual kind, with the remedy; "" if unknown."""
     if not data:
         return "the file is empty"
     if not data.strip(b"\0"):

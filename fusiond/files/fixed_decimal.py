@@ -28,7 +28,7 @@ _INF = int.from_bytes(b"inf", "little")
 _UNITS = np.array([10**k for k in range(19)], dtype=np.int64)
 _SCALES = np.array([10.0**k for k in range(MAX_DECIMALS + 1)])
 _FILL = np.array([10 ** (-k % 4) for k in range(MAX_DECIMALS + 1)], dtype=np.uint64)
-"""Padding of so many decimals to a multiple of four."""
+"""Padding of a number of decimals to a multiple of four."""
 _DIGITS = _ZERO + np.arange(10**4)[:, np.newaxis] // (1000, 100, 10, 1) % 10
 _FOURS = _DIGITS.astype(np.uint8).view("<u4").ravel().astype(np.uint32)
 """The digits of 0000 to 9999, the first in the lowest byte: one look instead of four divisions."""
@@ -70,8 +70,8 @@ def _write_whole(out: NDArray[np.uint8], at: np.uint64, number: np.uint64) -> np
 def _write_part(
     out: NDArray[np.uint8], at: np.uint64, decimals: np.uint64, number: np.uint64
 ) -> np.uint64:
-    """Write so many decimals, as a whole number, at `out[at:]`; returns their end, after which
-    three bytes may change."""
+    """Write decimals as a whole number at `out[at:]`; returns the end, after which three bytes may
+    change."""
     end = at + decimals
     number *= _FILL[decimals]
     if decimals > np.uint64(8):
@@ -147,7 +147,7 @@ def format_rows(
 
 _EXACT = 2**53
 _EXACT_FOUR, _EXACT_EIGHT = _EXACT // 10**4, _EXACT // 10**8
-"""Numbers that so many more digits leave exact, or beyond 2^53 and within 64 bits."""
+"""Largest numbers that remain exact, or within 64 bits, with four or eight more digits."""
 _POWERS = np.array([10.0**k for k in range(23)])
 _ZEROS, _OVER, _HIGH = (np.uint64(byte * 0x0101010101010101) for byte in (_ZERO, 0x76, 0x80))
 _NEWLINES, _LOW = (np.uint64(byte * 0x0101010101010101) for byte in (_NEWLINE, 0x7F))
@@ -166,7 +166,7 @@ def _newlines(words: NDArray[np.uint64]) -> int:
 
 
 def newlines(text: NDArray[np.uint8]) -> int:
-    """Number of digits in a text (n,) that lies at the beginning of its memory."""
+    """Number of digits in a text (n,) at the start of its memory."""
     whole = len(text) // 8 * 8
     words = _newlines(text[:whole].view(np.uint64))
     return words + int(np.count_nonzero(text[whole:] == _NEWLINE))
@@ -174,7 +174,7 @@ def newlines(text: NDArray[np.uint8]) -> int:
 
 @compiled("u8(u1[::1], u8)", forceinline=True)
 def _eight(text: NDArray[np.uint8], at: np.uint64) -> np.uint64:
-    """Eight bytes, the first lowest, less '0' each where they are digits."""
+    """Eight bytes, the first lowest, with '0' subtracted from digits."""
     word = np.uint64(0)
     for k in range(8):
         word |= np.uint64(text[at + np.uint64(k)]) << np.uint64(8 * k)
@@ -209,7 +209,7 @@ def _digits(
 def _many_digits(
     text: NDArray[np.uint8], at: np.uint64, number: np.uint64
 ) -> tuple[np.uint64, np.uint64]:
-    """As `_digits`; the first eight at once, or four."""
+    """Number of digits, as `_digits`, tested eight or four at once."""
     if at + np.uint64(8) <= np.uint64(text.shape[0]):
         word = _eight(text, at)
         # No carry comes of a digit, so that those before the first other byte are seen as such.
@@ -225,7 +225,7 @@ def _many_digits(
 
 @compiled("b1(u1[::1], i8, f8[:, ::1])", nogil=True)
 def parse_rows(text: NDArray[np.uint8], begin: int, values: NDArray[np.float64]) -> bool:
-    """Read `values` (columns, rows) from `text[begin:]`, rows of cells with a comma in between.
+    """Parse `values` (columns, rows) from `text[begin:]`, rows of cells separated by commas.
 
     False, with `values` in part written, if a cell is anything but an optional sign, digits and an
     optional point (at most 2^53 without the point), or if there are more or fewer cells.

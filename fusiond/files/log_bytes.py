@@ -1,4 +1,4 @@
-"""The bytes of a receiver's log, whatever was done to its file on the way.
+"""Bytes of a receiver's log, unpacked from any compression.
 
 Unpacked where it is a gzip file, whatever it is called, as far as that goes: the last block of one
 whose writer lost its power is cut. Text that a shell of Windows has redirected (`>` of PowerShell)
@@ -17,18 +17,18 @@ from fusiond.files.csv_tables import Rejection, TableError
 _GZIP = b"\x1f\x8b"
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _ANY_HEADER = 16 + zlib.MAX_WBITS
-"""Of `zlib.decompressobj`: gzip's."""
+"""Window size for `zlib.decompressobj` with a gzip header."""
 
 
 class LogBytes(NamedTuple):
-    """`cut` says where the file ends before its end, "" where it does not."""
+    """Log's bytes; `cut` describes a truncation, "" without one."""
 
     data: bytes
     cut: str = ""
 
     @property
     def notes(self) -> list[Rejection]:
-        """The same, for who reads a report."""
+        """Notes for a report."""
         return [Rejection(0, "file_cut", f"{self.cut}: read is what comes before", 0)] * bool(
             self.cut
         )
@@ -47,7 +47,7 @@ def log_bytes(path: Path) -> LogBytes:
 
 
 def _unpacked(data: bytes) -> LogBytes:
-    """All members, one after another; zeros behind the last are padding."""
+    """Unpack all members in sequence; zeros behind the last are padding."""
     parts: list[bytes] = []
     while data.startswith(_GZIP):
         member = zlib.decompressobj(_ANY_HEADER)

@@ -1,4 +1,4 @@
-"""Rows of figures in a Parquet file that an interruption does not cost.
+"""Rows of figures in a Parquet file that survive an interruption.
 
 A Parquet file is written whole. Until then each row is a line of JSON in `F.parquet.journal`, put
 there as soon as it is known; `RowFile` finds rows in both, so that a batch that was killed goes on
@@ -25,7 +25,7 @@ COMPRESSION = "zstd"
 
 
 class RowFile:
-    """The rows of `path`, and those that are added. Close writes the file.
+    """Rows of `path` with additions, written on close.
 
     Raises `MissingPackageError` without pyarrow, `TableError` for what is no file of rows, OSError.
     """
@@ -53,7 +53,7 @@ class RowFile:
 
 
 def read_rows(path: Path, without: Collection[str] = ()) -> list[Row]:
-    """The rows of a Parquet file, but for some names and those for which a row has nothing."""
+    """Rows of a Parquet file, without some names and without empty values."""
     arrow, parquet = _arrow()
     try:
         wanted = [name for name in parquet.read_schema(path).names if name not in without]
@@ -64,7 +64,7 @@ def read_rows(path: Path, without: Collection[str] = ()) -> list[Row]:
 
 
 def write_rows(path: Path, rows: list[Row]) -> None:
-    """All rows, in place of what is there; a reader sees the old file or the new one."""
+    """Replace all rows of a file atomically."""
     arrow, parquet = _arrow()
     names = list(dict.fromkeys(name for row in rows for name in row))
     columns = {name: arrow.array([row.get(name) for row in rows]) for name in names}

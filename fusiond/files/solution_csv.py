@@ -53,8 +53,8 @@ def _label_table(labels: tuple[str, ...]) -> NDArray[np.uint8]:
 def _tabulate(
     times: NDArray[np.int64], nav: Floats, sigmas: Floats, stated: Flags, values: Floats
 ) -> None:
-    """Write `values` (n, 19), the numbers of a file's rows, of states as `SolutionWriter.states`
-    takes them."""
+    """Write `values` (n, 19), the numbers of a file's rows, from states as in
+    `SolutionWriter.states`."""
     for i in range(times.shape[0]):
         values[i, 0] = times[i] * 1e-9
         values[i, 1] = nav[i, LAT] * _DEG
@@ -74,7 +74,7 @@ def _tabulate(
 
 
 class SolutionWriter:
-    """Streams rows to a path, to a binary stream, or to standard output ("-")."""
+    """Writer of solution rows to a path, a binary stream, or standard output ("-")."""
 
     def __init__(self, target: Path | str | BinaryIO) -> None:
         self._owned = isinstance(target, Path | str) and str(target) != "-"

@@ -64,7 +64,7 @@ def _stack(raw: RawTable, names: tuple[str, ...]) -> Floats:
 
 @immutable()
 class ImuTable:
-    """Mean angular rate (rad/s) and specific force (m/s^2) since the row before, sensor axes.
+    """Mean angular rate (rad/s) and specific force (m/s^2) since the last row, sensor axes.
 
     `t_s` (n,); `samples` (n, 6): `gyro` and `accel` (n, 3), side by side.
     """
@@ -187,7 +187,7 @@ def read_rdss(path: Path | str) -> RdssTable:
 
 @immutable()
 class AttitudeTable:
-    """Roll, pitch, yaw (rad, NED to body, 3-2-1) and one sigma, (n, 3); NaN is not given."""
+    """Roll, pitch, yaw (rad, NED to body, 3-2-1) and one sigma, (n, 3); NaN: not given."""
 
     t_s: Floats
     t_arrival_s: Floats
@@ -231,7 +231,7 @@ def _angle_without_sigma(angle: str, sd: str) -> Rule:
 @immutable()
 class BearingTable:
     """Azimuth and elevation (rad, sensor axes) of known points and one sigma, (n, 2); `point`
-    latitude, longitude (rad), height (m), (n, 3). NaN sigma is not given."""
+    latitude, longitude (rad), height (m), (n, 3). NaN sigma: not given."""
 
     t_s: Floats
     t_arrival_s: Floats
@@ -316,7 +316,7 @@ def read_wheel(path: Path | str) -> WheelTable:
 
 @immutable()
 class BarometerTable:
-    """Pressure of the air (Pa) and one sigma of the height that it stands for (m), (n,)."""
+    """Air pressure (Pa) and one sigma of the corresponding height (m), (n,)."""
 
     t_s: Floats
     t_arrival_s: Floats

@@ -1,4 +1,4 @@
-"""Solutions of the navigator, one after another, as the table that a solution file is read into."""
+"""Navigator's solutions as the table of a solution file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fusiond.navigation.solution import Solution
 
 
 def trajectory_of(solutions: Iterable[Solution]) -> TrajectoryTable:
-    """A row a solution, `t_s` = `t_ns` in seconds, NaN where the solution does not say."""
+    """Table of solutions with `t_s` = `t_ns` in seconds, NaN for unknown values."""
     rows = list(solutions)
     return TrajectoryTable(
         t_s=np.array([s.t_ns * 1e-9 for s in rows], dtype=np.float64),

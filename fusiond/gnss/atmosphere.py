@@ -43,13 +43,13 @@ from fusiond.navigation.compiled import compiled
 Array = npt.NDArray[np.float64]
 
 RELATIVE_HUMIDITY = 0.7
-"""Of the air below; 0.3 more or less changes the zenith delay by 5 cm at sea level."""
+"""Relative humidity of the air near the ground; a change of 0.3 changes the zenith delay by 5 cm at
+sea level."""
 MAX_HEIGHT_M = 10_000.0
 LAYER_M = 375_000.0
 BEIDOU_RADIUS_M = 6_378_000.0
 MIN_SINE = math.sin(math.radians(2.0))
-"""Of the elevation that models are asked for at least: Niell fitted his functions down to 3
-degrees."""
+"""Least sine of an elevation for the models: Niell fitted his functions down to 3 degrees."""
 DAY_S = 86400.0
 YEAR_D = 365.25
 
@@ -198,6 +198,6 @@ def klobuchar_beidou(
 
 @compiled("f8(f8)")
 def slant(sine: float) -> float:
-    """Mapping 1.001 / sqrt(0.002001 + sin^2 E) that the troposphere's sigma is stated with."""
+    """Mapping 1.001 / sqrt(0.002001 + sin^2 E) of the troposphere's sigma."""
     s = max(sine, 0.0)
     return 1.001 / math.sqrt(0.002001 + s * s)

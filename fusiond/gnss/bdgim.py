@@ -1,4 +1,4 @@
-r"""Delay in the ionosphere by BDGIM, of which BeiDou-3 broadcasts nine coefficients in B-CNAV.
+r"""Ionospheric delay by BDGIM, with BeiDou-3's nine coefficients from B-CNAV.
 
     delay = MF 40.28e16 / f^2 VTEC,    MF = 1 / sqrt(1 - (Re cos E / (Re + H))^2)    m
     VTEC  = sum_i alpha_i A_i + sum_j beta_j B_j                                     TECU
@@ -39,7 +39,7 @@ SLOT_D = 2.0 / 24.0
 TECU_M = 40.28e16 / CARRIER_HZ["C", "1"] ** 2
 """Delay at B1C of 1e16 electrons a square metre."""
 FLOORS = ((35.0, 10.0), (20.0, 8.0), (12.0, 6.0), (-math.inf, 4.0))
-"""Bounds; where alpha_1 is above the first, VTEC is at least alpha_1 over the second."""
+"""Lower bounds; where alpha_1 is above the first, VTEC is at least alpha_1 over the second."""
 
 _HIGHEST, _ORDERS = 5, 4
 _BROADCAST = ((0, 0), (1, 0), (1, 1), (1, -1), (2, 0), (2, 1), (2, -1), (2, 2), (2, -2))

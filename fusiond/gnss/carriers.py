@@ -1,4 +1,4 @@
-r"""Carrier phases from epoch to epoch: slant delay of a satellite, and its displacement.
+r"""Carrier phase changes between epochs: slant delay and displacement of a satellite.
 
 Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
 gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
@@ -69,38 +69,38 @@ SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_CO
 FOLLOWED, LOCK_LOST, CYCLE_SLIP = 0, 1, 2
 
 CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
-"""Those of `fusiond.gnss.ranges.RangeNoise`, the first over a uniform sky above 10 deg: the mean of
-1 / sin^2 E is there 1 / sin 10 deg."""
+"""Constants of `fusiond.gnss.ranges.RangeNoise`. The first is a mean over a uniform sky above 10
+deg, where the mean of 1 / sin^2 E is 1 / sin 10 deg."""
 PRIOR_COUNT, MOST_COUNT = 20.0, 400.0
 """Weight of that as a number of independent codes, a sky; older than so many are forgotten by
 halves: satellites of an hour."""
 SCALE_SQUARED = (0.1, 10.0)
-"""Antennas from a choke ring to a hand in a street have code multipath of 0.15 to 3 m (Groves
-9.3.4), the model 0.5."""
+"""Limits of the code multipath's scale, squared: antennas from a choke ring to a hand in a street
+have 0.15 to 3 m (Groves 9.3.4), the model 0.5."""
 PHASE_M, PHASE_THERMAL_M = 0.003, 0.0015
-"""Multipath that changes from epoch to epoch, of 48 mm that a reflection can make at most; a loop
-of 15 Hz at 45 dB-Hz has 1.2 mm (Groves 9.3.3). That of a receiver is learned as its codes' noise
-is, from what two carriers part by."""
+"""Phase noise: multipath that changes from epoch to epoch, of at most 48 mm for a reflection; a
+loop of 15 Hz at 45 dB-Hz has 1.2 mm (Groves 9.3.3). A receiver's value is learnt like its codes'
+noise, from the difference of two carriers."""
 PHASE_LENGTH_M = 0.19
-"""On L1; on other carriers it is so much of their length."""
+"""Phase noise in wavelengths, by that on L1."""
 CLIPPED = 9.0
 """No change of two carriers counts as more than three sigma: a slip is no noise."""
 MULTIPATH_S = 60.0
-"""For how long multipath of code lasts: minutes at rest, seconds on the move."""
+"""Duration of code multipath: minutes at rest, seconds in motion."""
 LONGEST_S = 2.0
-"""Beyond this Dopplers tell no slip any more."""
+"""Longest interval over which Dopplers detect a slip."""
 FORGOTTEN_S = 120.0
-"""After this the delay begins anew."""
+"""Interval after which the delay is reset."""
 DELAY_RATE_M_S = 0.01
 """Largest rate of a slant delay by itself: ten times the quiet ionosphere's 1 mm/s
 (Klobuchar, in Parkinson and Spilker 1996, vol. 1, chapter 12)."""
 SLIP_SIGMAS = 4.0
-"""Carriers part by so many sigmas of their noise at most (one in 16,000), and by what the
-ionosphere may do. One cycle lost on both of L1 and L2 parts them by 54 mm, L1 and L5 by 65 mm: in
-noise of less than 14 mm it is found; smaller ones are left to the filter's innovation."""
+"""Largest difference of two carriers in sigmas of their noise (one in 16,000), beside the
+ionosphere's change. A cycle lost on both L1 and L2 changes the difference by 54 mm, on L1 and L5 by
+65 mm: detected with noise below 14 mm; smaller changes are left to the filter's innovation."""
 SLIP_RATE_M_S = 0.5
-"""Between the mean of two Dopplers and the carrier's rate, or a wavelength over dt where that is
-more. A hand that swings with 3 m/s^2 twice a second leaves 0.2 m/s over 0.25 s."""
+"""Largest difference of the mean of two Dopplers and the carrier's rate, or a wavelength over dt if
+larger. A hand that swings with 3 m/s^2 twice a second causes 0.2 m/s over 0.25 s."""
 JUMP_M_S = 3.0
 """Common part of all satellites beyond their Dopplers: a clock's phase that walks by 0.1 m by the
 root of a second makes 0.45 m/s over 50 ms, one set by a millisecond within 2 s 150,000."""
@@ -115,7 +115,7 @@ def scale_squared(kept: Array) -> float:
 
 @compiled("f8(f8, f8)", forceinline=True)
 def _phase_variance(cno: float, length: float) -> float:
-    """Of a carrier of a wave length (m), m^2, by the model."""
+    """Variance (m^2) of a carrier of a wavelength (m), by the model."""
     weak = 1.0
     if not math.isnan(cno):
         weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
@@ -125,7 +125,7 @@ def _phase_variance(cno: float, length: float) -> float:
 
 @compiled("f8(f8, f8, f8)", forceinline=True)
 def _code_variance(cno: float, stated: float, scale: float) -> float:
-    """Of a pseudorange (m^2), wherever the satellite stands, with its model `scale` times."""
+    """Variance (m^2) of a pseudorange at any elevation, with its model `scale` times."""
     weak = 1.0
     if not math.isnan(cno):
         weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
@@ -146,8 +146,8 @@ def _delay(
     scale: float,
     seen: Array,
 ) -> None:
-    """The slant delay with this epoch's codes and with the carriers' `change`; NaN: none. Adds to
-    the sums of what has been `seen` of the codes."""
+    """Write the slant delay from this epoch's codes and the carriers' `change`; NaN: none. Adds to
+    the sums of `seen` codes."""
     more = plan[GAMMA] - 1.0
     code = (second[P_B] - first[P_A] - plan[DELAY]) / more
     noise = _code_variance(first[CNO], first[SD_A], scale)
@@ -172,7 +172,7 @@ def _delay(
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8, f8[::1])")
 def _write_rates(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
-    """The slant delay, its variance, and twice its covariance with the code."""
+    """Write the slant delay, its variance, and twice its covariance with the code."""
     if plan[GAMMA] == 0.0 or state[_PAIR] != plan[PAIR] or state[_T] - state[_T_PAIR] > 0.0:
         return
     more = plan[GAMMA] - 1.0

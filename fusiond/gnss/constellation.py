@@ -1,4 +1,4 @@
-r"""BeiDou-3 and GPS as they are designed: broadcast ephemerides from orbit parameters.
+r"""Nominal BeiDou-3 and GPS constellations: broadcast ephemerides from orbit parameters.
 
 In axes that stand still and coincide with the Earth's at `EPOCH_S`, tau = t - EPOCH_S:
 
@@ -110,7 +110,7 @@ def _synchronous_m(node_rate: float) -> float:
 
 
 def beidou_slots() -> Iterator[Slot]:
-    """BeiDou-3: 3 GEO, 3 IGSO a third of a turn apart on one ground track, 24 MEO."""
+    """Slots of BeiDou-3: 3 GEO, 3 IGSO a third of a turn apart on one ground track, 24 MEO."""
     a = _synchronous_m(0.0)
     for prn, longitude in GEO_LONGITUDES_DEG.items():
         yield Slot("C", prn, "geo", a, 0.0, math.radians(longitude))
@@ -131,7 +131,7 @@ def beidou_slots() -> Iterator[Slot]:
 
 
 def gps_slots() -> Iterator[Slot]:
-    """GPS: the 24 baseline slots, PRN 1 to 24."""
+    """Slots of GPS: the 24 baseline slots, PRN 1 to 24."""
     prn = 0
     for node, arguments in GPS_SLOTS_DEG:
         for u in arguments:
@@ -140,7 +140,7 @@ def gps_slots() -> Iterator[Slot]:
 
 
 def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
-    """All slots of the systems that are designed here: "C" and "G". Raises ValueError."""
+    """Slots of the supported systems: "C" and "G". Raises ValueError."""
     makers = {"C": beidou_slots, "G": gps_slots}
     if unknown := set(systems) - set(makers):
         raise ValueError(f"no constellation for {sorted(unknown)}")
@@ -220,7 +220,7 @@ def constellation(
     systems: Sequence[System] = ("C", "G"),
     epoch_s: float = EPOCH_S,
 ) -> tuple[Ephemeris, ...]:
-    """All that is broadcast at GPS time `week`, `tow_s`, one ephemeris for each satellite."""
+    """Broadcast messages at GPS time `week`, `tow_s`, one ephemeris for each satellite."""
     return tuple(ephemeris(slot, week, tow_s, epoch_s) for slot in slots(systems))
 
 
@@ -253,11 +253,11 @@ class Sky(NamedTuple):
     velocity_ecef_m_s: Array
 
     def above(self, elevation_rad: float) -> Sky:
-        """Only those at or above an elevation."""
+        """Satellites at or above an elevation."""
         return self.only(self.elevation >= elevation_rad)
 
     def only(self, keep: NDArray[np.bool_]) -> Sky:
-        """Only those marked in `keep` (n,)."""
+        """Satellites marked in `keep` (n,)."""
         names = tuple(s for s, k in zip(self.satellites, keep, strict=True) if k)
         return Sky(names, *(values[keep] for values in self[1:]))
 

@@ -30,13 +30,13 @@ AGEING_M_S = 1e-3
 INTERVALS, LEAST_S, MOST_S = 3.0, 30.0, 180.0
 BIAS_LASTS_S = 3600.0
 MODULUS, STEP_S = 1024, 8.0
-"""Of BeiDou's toe, as corrections name an ephemeris."""
+"""Modulus and step of BeiDou's toe, by which corrections identify an ephemeris."""
 MESSAGES: dict[System, tuple[str, ...]] = {"G": ("lnav",), "E": ("inav",), "C": ("d1", "d2")}
 """Messages that corrections are of."""
 
 
 class Applied(NamedTuple):
-    """A satellite's ephemeris with its correction (14,), as `elements_row` takes them, the `bias`
+    """Ephemeris of a satellite with its correction (14,), as `elements_row` takes them, the `bias`
     (m) of each signal, and one sigma of its ranges (m)."""
 
     ephemeris: Ephemeris
@@ -60,12 +60,12 @@ class Corrections:
             parts[correction.part] = correction
 
     def __bool__(self) -> bool:
-        """True if there have been any."""
+        """True if any correction has been received."""
         return bool(self._parts)
 
     def issue(self, system: System, prn: int, week: int, tow_s: float) -> int | None:
-        """Issue of the ephemeris that the satellite's correction is of at a GPS time; None where
-        none holds."""
+        """Issue of the ephemeris that the satellite's correction refers to at a GPS time; None
+        without a valid one."""
         parts = self._parts.get((system, prn), {})
         orbit, clock, bias = (parts.get(p) for p in ("orbit", "clock", "bias"))
         if orbit is None or clock is None or bias is None or orbit.solution != clock.solution:
@@ -93,14 +93,14 @@ class Corrections:
 
 
 def issue_of(ephemeris: Ephemeris) -> int:
-    """The issue of an ephemeris as corrections name it."""
+    """Issue of an ephemeris, as corrections identify it."""
     if ephemeris.system == "C":
         return int(ephemeris.toe_s / STEP_S) % MODULUS
     return ephemeris.issue
 
 
 def _age_s(correction: Correction, week: int, tow_s: float) -> float:
-    """Seconds from the instant that it holds at."""
+    """Seconds since the correction's reference instant."""
     return (week - correction.week) * WEEK_S + (tow_s - correction.tow_s)
 
 

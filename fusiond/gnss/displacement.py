@@ -1,4 +1,4 @@
-r"""Displacement that the lasting errors of a sky's ranges make of an antenna's place.
+r"""Displacement of the antenna's position by slowly varying range errors.
 
 Errors of orbits, clocks, group delays and of what is left of the ionosphere last for many minutes,
 each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. Of
@@ -38,25 +38,25 @@ from fusiond.navigation.compiled import compiled
 Array = npt.NDArray[np.float64]
 
 PLACE_M, CLOCK_M = 30.0, 1.0
-"""One sigma of what is known of place and clock but for the epoch: an inertial unit over a minute;
-a crystal whose phase walks by 0.1 m by the root of a second, over a hundred."""
+"""One sigma of position and clock before the epoch: an inertial unit over a minute; a crystal with
+a random walk of 0.1 m by the root of a second, over a hundred."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
-"""Of the displacement's states by their defaults, `bias_sd_m` and `bias_down_sd_m`: that is what a
-sky of eight satellites displaces, and stands for what the sky at hand does."""
+"""Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
+satellites, scaled to the present sky."""
 LEAST_M = 1e-3
-"""Of K along an axis: below it the sky displaces nothing, and nothing is carried on."""
+"""Least K along an axis (m); a sky with less displaces nothing and ends the state."""
 FLOOR_M = 0.2
-"""Noise of a range over a minute, which bounds what one satellite weighs."""
+"""Noise of a range over a minute, which bounds a satellite's weight."""
 HOLDS_S = 30.0
 """A satellite of a MEO moves by a quarter of a degree."""
 FLICKERS_S = 3.0
-"""Satellites that come and go within it are of one sky: their errors are the same when they come
-again, which the sum does not know."""
+"""Time within which satellites that disappear and return belong to one sky, with unchanged errors.
+"""
 
 
 @compiled("void(f8[:, ::1], i8)", forceinline=True)
 def _invert(a: Array, m: int) -> None:
-    """Invert a positive matrix (m, m) in its place, by Gauss and Jordan."""
+    """Invert a positive definite matrix (m, m) in place by Gauss-Jordan elimination."""
     for p in range(m):
         pivot = 1.0 / a[p, p]
         a[p, p] = 1.0
@@ -154,9 +154,9 @@ def displace(
 
 
 class Displacement(NamedTuple):
-    """Of a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the two errors of
-    all, `variance` (n,) m^2 of what is not known of what lasts, `root` (3, 3) K and `back` (3, 3)
-    its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states."""
+    """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
+    two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
+    3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -168,7 +168,7 @@ class Displacement(NamedTuple):
 
     @classmethod
     def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
-        """Of the rows of an epoch, with `variance` (n,) m^2 left of what lasts."""
+        """Displacement for an epoch's rows, with residual `variance` (n,) m^2 of lasting errors."""
         n = len(rows.satellites)
         effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
         clocks = int(rows.clock.max(initial=0)) + 1
@@ -181,12 +181,12 @@ class Displacement(NamedTuple):
         return cls(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA)
 
     def holds(self, rows: Rows, t_s: float) -> bool:
-        """True if it is that of an epoch of these rows, too."""
+        """True if the rows have the same satellites within its validity."""
         same = rows.satellites == self.satellites
         return 0.0 <= t_s - self.t_s < (HOLDS_S if same else FLICKERS_S)
 
     def carried(self, before: Displacement) -> tuple[Array, Array]:
-        """R (3, 3) and cov(w) (3, 3) from what was `before`."""
+        """Transition R (3, 3) and noise covariance cov(w) (3, 3) from the sky `before`."""
         n, last = len(self.satellites), len(before.satellites)
         moved: dict[str, Array] = {}
         left: dict[str, float] = {}

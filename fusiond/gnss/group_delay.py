@@ -1,4 +1,4 @@
-r"""Group delay of a signal in the satellite, against the clock of the ephemeris.
+r"""Group delay of a signal in the satellite, relative to the clock of the ephemeris.
 
     pseudorange + c (dt - d) = range + ...        d in s, in terms of the broadcast group delays
 
@@ -57,15 +57,15 @@ _L1_L2 = (CARRIER_HZ["G", "1"] / CARRIER_HZ["G", "2"]) ** 2
 _E1_E5A = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "5"]) ** 2
 _E1_E5B = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "7"]) ** 2
 _DATA_BAND = {"bcnav1": "1", "bcnav2": "5"}
-"""Band of the data component whose ISC a message has."""
+"""Band of the data component whose ISC a message contains."""
 _DATA_SHARE = {"1P": 0.0, "1D": 1.0, "1X": 0.25, "5P": 0.0, "5D": 1.0, "5X": 0.5}
 
 
 def group_delay(
     ephemeris: Ephemeris, signal: str, sent: SignalDelays | None = None
 ) -> GroupDelay | None:
-    """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris, and by what CNAV
-    has `sent`; None if unknown."""
+    """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris and CNAV data
+    `sent`; None if unknown."""
     band, delays = signal[0], ephemeris.group_delay_s
     if sent is not None:
         for name, correction_s in sent.correction_s:
@@ -110,7 +110,8 @@ def _beidou(band: str, signal: str, delays: tuple[float, ...]) -> GroupDelay | N
 
 
 def _bcnav(signal: str, delays: tuple[float, ...], data_band: str) -> GroupDelay | None:
-    """`delays` (T_GD of B1C's pilot, T_GD of B2a's, ISC of the data component on `data_band`)."""
+    """Delay from `delays` (T_GD of B1C's pilot, T_GD of B2a's, ISC of the data component on
+    `data_band`)."""
     if signal[0] == "6":
         return GroupDelay(0.0)
     share = _DATA_SHARE.get(signal)

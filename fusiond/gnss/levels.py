@@ -1,4 +1,4 @@
-r"""Levels: what a satellite's ranges are off by, as long as it stays, beside all others.
+r"""Constant range bias of each satellite while it is tracked.
 
 Of the errors e_k of `Rows.lasting` variance L the mean over the sky is a displacement or the
 clock's (fusiond.gnss.displacement); what of e_k is not shows in the innovations nu, for the others
@@ -36,7 +36,7 @@ LASTS_S = 1800.0
 EVERY_S = 0.9
 """Innovations closer together say the same, as multipath lasts longer: those of each second."""
 FORGOTTEN_S = 300.0
-"""After this a satellite is a fresh one: a street's corners take it away for less."""
+"""Time after which a satellite is treated as new; street corners hide it for less."""
 SIGMAS = 3.0
 # Of a satellite, by its slot: r (m), V and L (m^2), when it was last seen (GPS time, s; 0: never).
 # Slot 0 is no satellite's: when levels were last learned.
@@ -46,7 +46,7 @@ _OFFSET, _VARIANCE, _PRIOR, _T = range(COLUMNS)
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8, f8[::1], f8[::1])")
 def _expect(levels: Array, values: Array, t_s: float, offset: Array, variance: Array) -> None:
-    """Write r (n,) and V (n,) of rows' `values` at `t_s`, and take them off."""
+    """Write r (n,) and V (n,) of rows' `values` at `t_s`, and subtract them."""
     for k in range(offset.shape[0]):
         known = levels[int(values[rk.SLOT, k])]
         prior = values[rk.LASTING, k]
@@ -73,8 +73,8 @@ def _learn(
     z: Array,
     place: Array,
 ) -> None:
-    """Keep r and V of rows, and take innovations z (n,) in, if there are any, whose place has the
-    variances `place` (n,)."""
+    """Store r and V of rows, updated by innovations z (n,) if any, whose position has the variances
+    `place` (n,)."""
     n = clock.shape[0]
     for k in range(n):
         known = levels[int(values[rk.SLOT, k])]
@@ -124,7 +124,7 @@ class Levels(NamedTuple):
     seen: list[tuple[Array, Array]] | None
 
     def after(self) -> Array:
-        """Levels after it; the filter has looked at it before."""
+        """Levels after the epoch, once the filter has processed it."""
         found = self.before.copy()
         z, place = self.seen[0] if self.seen else (_NONE, _NONE)
         of = self.offset, self.variance
@@ -133,7 +133,7 @@ class Levels(NamedTuple):
 
 
 def take_off(last: Levels | None, rows: Rows, t_s: float) -> Levels:
-    """Take the levels off the rows of an epoch, whose variance is left with what is not known."""
+    """Subtract the levels from an epoch's rows; the variances keep the unknown part."""
     before = np.zeros((SLOTS, COLUMNS)) if last is None else last.after()
     n = len(rows.satellites)
     offset, variance = np.empty(n), np.empty(n)

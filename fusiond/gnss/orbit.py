@@ -53,7 +53,7 @@ BDT_WEEK_0_IN_GPS_WEEKS = 1356
 
 GEO_TILT_RAD = math.radians(-5.0)
 _TILTED = ("d1", "d2")
-"""Messages whose GEO orbits are so; B-CNAV knows no GEO."""
+"""Messages whose GEO orbits are inclined; B-CNAV has no GEO."""
 
 
 class Constants(NamedTuple):
@@ -80,7 +80,8 @@ def is_beidou_geo(system: System, prn: int) -> bool:
 
 
 def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
-    """GPS week and second of week of a system's own week and second; seconds may pass the week."""
+    """GPS week and second of week of a system's own week and second; seconds may exceed the
+    week."""
     if system == "C":
         return week + BDT_WEEK_0_IN_GPS_WEEKS, seconds + BDT_BEHIND_GPS_S
     return week, seconds
@@ -98,7 +99,7 @@ _COLUMNS = 47
 
 
 SMALL_RAD = 1e-3
-"""Below it `turned` is exact to rounding."""
+"""Angle below which `turned` is exact to rounding."""
 
 
 @compiled("UniTuple(f8, 2)(f8, f8, f8)", forceinline=True)
@@ -112,7 +113,7 @@ def turned(cosine: float, sine: float, small: float) -> tuple[float, float]:
 
 @compiled("void(f8[::1], f8, f8[::1])")
 def _correct(q: Array, age: float, state: Array) -> None:
-    """Take an orbit's error, as it is at an `age` (s), off the position in `state` (8,)."""
+    """Subtract an orbit's error at an `age` (s) from the position in `state` (8,)."""
     x, y, z, vx, vy, vz = state[0], state[1], state[2], state[3], state[4], state[5]
     speed = math.sqrt(vx * vx + vy * vy + vz * vz)
     ax, ay, az = vx / speed, vy / speed, vz / speed
@@ -218,9 +219,9 @@ NOT_CORRECTED = (0.0,) * 14
 
 
 def elements_row(ephemeris: Ephemeris, corrected: Sequence[float] = NOT_CORRECTED) -> Array:
-    """One ephemeris as the row (47,) that `satellite_states` takes. `corrected` (14,): 1; week and
-    second (GPS time) that the orbit's correction holds at, radial, along, across (m), their rates;
-    week and second of the clock's, C0, C1, C2."""
+    """Row (47,) of an ephemeris for `satellite_states`. `corrected` (14,): 1; week and second (GPS
+    time) of the orbit correction, radial, along, across (m), their rates; week and second of the
+    clock correction, C0, C1, C2."""
     e = ephemeris
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
@@ -243,7 +244,8 @@ def elements_row(ephemeris: Ephemeris, corrected: Sequence[float] = NOT_CORRECTE
 
 
 class SatelliteStates(NamedTuple):
-    """`position` (n, 3) m and `velocity` (n, 3) m/s in ECEF, `clock_s` (n,), `clock_drift` (n,)."""
+    """Satellite states: `position` (n, 3) m and `velocity` (n, 3) m/s in ECEF, `clock_s` (n,),
+    `clock_drift` (n,)."""
 
     position: Array
     velocity: Array
@@ -261,7 +263,7 @@ class Orbits:
     def of(
         cls, ephemerides: Sequence[Ephemeris], corrected: Sequence[Sequence[float]] = ()
     ) -> Orbits:
-        """Stack ephemerides in their order, with the correction of each, if there are any."""
+        """Stack ephemerides in order, each with its correction, if any."""
         given = corrected or (NOT_CORRECTED,) * len(ephemerides)
         rows = [elements_row(e, c) for e, c in zip(ephemerides, given, strict=True)]
         return cls(np.array(rows).reshape(len(rows), _COLUMNS))
@@ -271,7 +273,7 @@ class Orbits:
         return self._states(week, tow_s, False)
 
     def sent(self, week: int, tow_s: float, pseudorange_m: Array) -> SatelliteStates:
-        """States at the transmission of what came in at `tow_s` of the receiver's clock.
+        """States at the transmission of signals received at `tow_s` of the receiver's clock.
 
         Receiver time minus pseudorange / c is the satellite's own time of transmission, whatever
         the receiver's clock error is: no iteration over the flight time.

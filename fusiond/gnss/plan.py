@@ -1,4 +1,4 @@
-"""Plan of an epoch: the signals that serve, as long as the same ones come and no ephemeris changes.
+"""Cached choice of an epoch's signals, valid until signals or ephemerides change.
 
 One signal of each satellite serves as range and carrier, a second one for its slant delay
 (`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
@@ -66,8 +66,8 @@ BEIDOU_IONO_HZ = CARRIER_HZ["C", "2"]
 BAND_DELAY_M = 3.0
 """10 ns: what receivers delay one carrier more than another."""
 LEAST_GAMMA = 1.3
-"""Of (f_a / f_b)^2: nearer carriers (B3I and B2a, 1.16; E1 and E6 have 1.52) make noise tenfold,
-and metres of what a receiver delays one more than the other."""
+"""Least (f_a / f_b)^2: closer carriers (B3I and B2a, 1.16; E1 and E6 have 1.52) amplify noise
+tenfold, and receiver delays to metres."""
 
 
 @immutable()
@@ -92,7 +92,7 @@ class RangeNoise:
     rate_m_s: float = 0.05
 
     def array(self) -> Array:
-        """As `range_kernel.range_rows` takes it."""
+        """Array for `range_kernel.range_rows`."""
         return np.array(
             (
                 self.multipath_m,
@@ -120,7 +120,7 @@ class RangeOptions:
 
 
 class Plan(NamedTuple):
-    """Plan of the signals that serve, as long as the same ones come and no ephemeris changes."""
+    """Cached choice of an epoch's signals, valid until signals or ephemerides change."""
 
     keys: list[tuple[System, int, str]]
     version: int
@@ -140,14 +140,14 @@ class Plan(NamedTuple):
     fixed: Array
     ionosphere: Array
     issues: Array
-    """(n,): numbers that change where orbit, clock or ionosphere do, and with them a carrier's
-    constant."""
+    """Numbers (n,) that change with orbit, clock or ionosphere, and so with a carrier's constant.
+    """
     refused: tuple[tuple[str, str], ...]
 
 
 class _Served(NamedTuple):
-    """Of a satellite: which signal is its range, which one measures the ionosphere beside it, its
-    group (system, BeiDou-2, carrier), and its rows of the plan but for the group's."""
+    """Signals of a satellite: the range, the second for the ionosphere, its group (system,
+    BeiDou-2, carrier), and its rows of the plan without the group's."""
 
     at: int
     second: int | None
@@ -166,7 +166,7 @@ class Planner:
         self.options = options
 
     def plan(self, epoch: RawGnssEpoch, keys: list[tuple[System, int, str]], now: float) -> Plan:
-        """Of an epoch whose signals are `keys`, at `now` (s of GPS time)."""
+        """Plan for an epoch with signals `keys`, at `now` (s of GPS time)."""
         by_satellite: dict[tuple[System, int], dict[str, int]] = {}
         for k, s in enumerate(epoch.signals):
             if s.system in self.options.systems:
@@ -212,7 +212,7 @@ class Planner:
     def _corrected(
         self, epoch: RawGnssEpoch, satellites: dict[tuple[System, int], dict[str, int]]
     ) -> dict[System, dict[int, Applied]]:
-        """By system that goes by corrections, those of its satellites."""
+        """Satellites with corrections, by system."""
         found: dict[System, dict[int, Applied]] = {}
         if not self.store.corrections:
             return found
@@ -233,7 +233,7 @@ class Planner:
         found: dict[str, int],
         corrected: dict[System, dict[int, Applied]],
     ) -> _Served | str:
-        """Of one satellite's signals those that serve."""
+        """Choose the signals of one satellite."""
         first = epoch.signals[next(iter(found.values()))]
         wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
         outcome = "no_group_delay"
@@ -346,7 +346,7 @@ class Planner:
 
 
 def _by_bias(applied: Applied, signal: str) -> GroupDelay:
-    """Group delay that stands for a bias, which is added to the range."""
+    """Group delay that represents a bias, which is added to the range."""
     return GroupDelay(-applied.bias[signal] / SPEED_OF_LIGHT_M_S)
 
 

@@ -1,4 +1,4 @@
-r"""Range and range rate equations of one epoch, for all satellites at once.
+r"""Range and range rate equations of an epoch, for all satellites at once.
 
     rho = |s - r|,  l = (s - r) / rho,   s = Rz(we tau) s_t,  tau = rho / c,  v = Rz(we tau) v_t
     P + c (dt - d) - T - I = rho + b_system + noise
@@ -86,9 +86,9 @@ WALK_M_SQRT_S = 0.002
 """Walk of a carrier at the zenith beside the models: satellites' clocks, 1e-12 to 3e-12 over 10 s,
 are 3 to 9 mm, ionosphere and troposphere 1 mm/s at most."""
 BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
-"""One sigma of what a receiver delays BeiDou-2 more than BeiDou-3: of B1I (a Septentrio's has
-0.5 m), and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13
-(2021), 15, find metres on two makes of receivers."""
+"""One sigma of a receiver's delay of BeiDou-2 against BeiDou-3: of B1I (0.5 m for a Septentrio),
+and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13 (2021), 15,
+find metres on two makes of receivers."""
 
 _NEPERS = 0.1 * math.log(10.0)
 """A decibel of power as an exponent of e."""
@@ -121,7 +121,7 @@ NOISE_VALUES = 8
 def _take_off_ionosphere(
     signals: Array, carriers: Array, local: float, on_earth: bool, out: Array
 ) -> None:
-    """Settle each satellite's delay by model and carriers, and what is left of it."""
+    """Determine each satellite's delay by model and carriers, and its residual."""
     n = signals.shape[0]
     weights, offsets, middles = np.zeros(n), np.zeros(n), np.zeros(n)
     for k in range(n):

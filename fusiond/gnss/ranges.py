@@ -52,7 +52,7 @@ Array = npt.NDArray[np.float64]
 __all__ = ["Followed", "Picked", "RangeModel", "RangeNoise", "RangeOptions", "Rows", "nothing_kept"]
 
 PLAN_HOLDS_S = 10.0
-"""Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
+"""Time after which ephemerides are chosen again, and by which one may exceed its validity."""
 
 _FIRST = attrgetter(
     "pseudorange_m",
@@ -128,7 +128,7 @@ class Rows:
         return found
 
     def only(self, keep: npt.NDArray[np.bool_]) -> Rows:
-        """Those marked in `keep` (n,)."""
+        """Satellites marked in `keep` (n,)."""
         return Rows(
             tuple(compress(self.satellites, keep)),
             tuple(compress(self.signals, keep)),
@@ -140,13 +140,13 @@ class Rows:
         )
 
     def without(self, satellites: Collection[str]) -> Rows:
-        """The same without some satellites."""
+        """Rows without some satellites."""
         return self.only(np.array([s not in satellites for s in self.satellites], bool))
 
 
 class Picked(NamedTuple):
-    """An epoch's signals that serve, (n, 7) as measured, and the second ones (n, 5), NaN where
-    there is none."""
+    """Chosen signals of an epoch, (n, 7) as measured, and the second ones (n, 5), NaN where
+    absent."""
 
     plan: Plan
     week: int
@@ -192,7 +192,7 @@ class RangeModel:
         return self.evaluate(self.followed(epoch), receiver)
 
     def followed(self, epoch: RawGnssEpoch) -> Followed:
-        """An epoch after those that were asked for before."""
+        """Epoch followed from earlier ones."""
         return self.follow(self.pick(epoch), self._kept)
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
@@ -218,7 +218,7 @@ class RangeModel:
         return Picked(plan, epoch.week, epoch.tow_s, measured, second)
 
     def follow(self, picked: Picked, kept: Array) -> Followed:
-        """Take an epoch in to what is `kept` of the ones before, which is changed."""
+        """Update the state `kept` of earlier epochs by an epoch, in place."""
         plan = picked.plan
         carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
         refused = np.empty(len(plan.serving), np.int64)

@@ -30,7 +30,7 @@ Indices = npt.NDArray[np.intp]
 EXHAUSTIVE_UP_TO = 14
 STARTS = 4
 SINGULAR = 1e-8
-"""|det G| below this counts as no geometry; a useful set has 0.1 to 3."""
+"""Determinant |det G| below which there is no geometry; a useful set has 0.1 to 3."""
 
 
 def gdop_squared(line_of_sight: Array, sets: Indices) -> Array:
@@ -77,7 +77,7 @@ def _starts(line_of_sight: Array) -> list[Indices]:
 
 
 def _grown(line_of_sight: Array, first: int) -> Indices:
-    """Add, three times, the satellite farthest from the span of the rows of G so far."""
+    """Extend the set three times by the satellite farthest from the span of its rows of G."""
     rest = np.column_stack([-line_of_sight, np.ones(len(line_of_sight))])
     members = [first]
     for _ in range(3):
@@ -90,7 +90,7 @@ def _grown(line_of_sight: Array, first: int) -> Indices:
 
 
 def _exchange(line_of_sight: Array, members: Indices) -> tuple[Indices, float]:
-    """Steepest single exchanges until none lowers GDOP."""
+    """Exchange satellites by steepest descent until no exchange lowers GDOP."""
     n = len(line_of_sight)
     value = float(gdop_squared(line_of_sight, members[None, :])[0])
     while True:

@@ -44,7 +44,7 @@ FALSE_ALARM = 0.001
 MAX_ITERATIONS = 12
 STEP_M = 1e-3
 MAX_CONDITION = 1e5
-"""Of H: GDOP over about 1e4, where 1 m of range is 10 km."""
+"""Largest condition number of H: GDOP over about 1e4, where 1 m of range is 10 km."""
 
 
 class Dops(NamedTuple):
@@ -84,7 +84,8 @@ class SinglePoint(NamedTuple):
 
 
 def design(line_of_sight: Array, system: npt.NDArray[np.intp]) -> tuple[Array, list[int]]:
-    """H (n, 3 + clocks) of positions and clocks, and the index of each clock's system."""
+    """Design matrix H (n, 3 + clocks) of positions and clocks, and the index of each clock's
+    system."""
     present = sorted(set(system.tolist()))
     h = np.zeros((len(system), 3 + len(present)))
     h[:, :3] = -line_of_sight
@@ -185,7 +186,7 @@ def _fit(model: RangeModel, followed: Followed, position: Array, out: list[str])
 
 
 def _velocity(rows: Rows) -> tuple[Array | None, Array | None, float | None]:
-    """Velocity (3,) ECEF m/s, its covariance and drift m/s from the rows that have a rate."""
+    """Velocity (3,) ECEF m/s, its covariance and drift m/s, from the rows with a rate."""
     has = np.isfinite(rows.rate_m_s)
     if has.sum() < 4:
         return None, None, None

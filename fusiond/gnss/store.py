@@ -31,15 +31,15 @@ from fusiond.gnss.group_delay import GroupDelay, group_delay
 from fusiond.gnss.orbit import WEEK_S, Orbits, gps_time
 
 MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
-"""GPS: fit interval of 4 h centred on toe (IS-GPS-200N 20.3.4.4 and table 20-XI). Galileo: 4 h
-(Galileo OS SDD: longest time a set of navigation data is valid). BeiDou: a new set each hour, for
-the hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4; toe on the hour), and one hour more for a set that
-was not received whole."""
+"""Longest validity of an ephemeris. GPS: fit interval of 4 h centred on toe (IS-GPS-200N 20.3.4.4
+and table 20-XI). Galileo: 4 h (Galileo OS SDD: longest time a set of navigation data is valid).
+BeiDou: a new set each hour, for the hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4; toe on the hour),
+and one hour more for an incomplete reception."""
 COMPARED_S, OTHER_ORBIT_M = 14_400.0, 1e5
-"""Four hours beyond its toe a broadcast orbit is kilometres off, after a manoeuvre tens; two
-satellites are thousands apart."""
+"""Interval and distance that show another satellite's orbit: four hours beyond its toe a broadcast
+orbit is kilometres off, after a manoeuvre tens; two satellites are thousands apart."""
 KEPT_ISSUES = 4
-"""By message: the present issue, the next, and what measurements out of a queue may need."""
+"""Issues kept by message: the present one, the next, and one for queued measurements."""
 
 Missing = Literal["no_ephemeris", "unhealthy", "stale_ephemeris"]
 
@@ -69,11 +69,11 @@ class EphemerisStore:
         """Numbers that have become another satellite's so far."""
 
     def __len__(self) -> int:
-        """Satellites of which an ephemeris is held."""
+        """Number of satellites with an ephemeris."""
         return len({key[:2] for key in self._kept})
 
     def add(self, message: NavigationMessage) -> None:
-        """Take in what a decoder completed; the same again changes only when it was seen."""
+        """Add a decoded message; a repetition only updates its instant."""
         if isinstance(message, Correction):
             self.corrections.add(message)
             self.version += 1
@@ -120,7 +120,7 @@ class EphemerisStore:
         return bool(np.linalg.norm(old - new) > OTHER_ORBIT_M)
 
     def delay(self, ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
-        """Group delay of a signal by all that its satellite has sent; None if unknown."""
+        """Group delay of a signal by all data of its satellite; None if unknown."""
         sent = self._delays.get((ephemeris.system, ephemeris.prn))
         return group_delay(ephemeris, signal, sent)
 
@@ -140,7 +140,7 @@ class EphemerisStore:
     def select(
         self, system: System, prn: int, week: int, tow_s: float, band: str = ""
     ) -> Ephemeris | Missing:
-        """The ephemeris for a GPS time, or why there is none.
+        """Ephemeris for a GPS time, or the reason for its absence.
 
         `band` (first character of a signal): Galileo's clock for E5a is that of F/NAV, BeiDou's
         delays for B1C and B2a are in B-CNAV; without it D1 is given, which has none.

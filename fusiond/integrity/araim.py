@@ -65,10 +65,11 @@ VERTICAL = 2
 """The third axis; the first two are horizontal."""
 _ROOT_2 = math.sqrt(2.0)
 MAX_CONDITION = 1e5
-"""Of G without a mode's satellites: beyond it 1 m of range is kilometres, no solution."""
+"""Largest condition number of G without a mode's satellites; beyond it 1 m of range is kilometres.
+"""
 ALL_IN_VIEW_SHARE = 0.5
-"""Part of the integrity risk that the solution without exclusion may take where exclusion may
-follow: half, as nothing says that either is more precious."""
+"""Share of the integrity risk for the all-in-view solution where exclusion may follow: half, since
+neither event is preferred."""
 
 
 @immutable()
@@ -93,7 +94,7 @@ LPV_200 = Requirement(9.8e-8, 2e-9, 3.9e-6, 9e-8, 1e-8, 8e-8, 1e-5)
 
 @immutable()
 class Epoch:
-    """Satellites of one epoch and what may be wrong with them.
+    """Satellites of one epoch with their errors and fault probabilities.
 
     `line_of_sight` (n, 3): from receiver to satellite in level axes, the vertical one last;
     `constellation` (n,) indices from 0; `integrity_sigma_m` (URA, troposphere and receiver),
@@ -130,7 +131,7 @@ class Epoch:
 
 
 class FaultMode(NamedTuple):
-    """Satellites (n,) that a mode takes away, and its probability."""
+    """Fault mode: the satellites (n,) that it removes, and its probability."""
 
     out: Mask
     prior: float
@@ -148,7 +149,7 @@ class Separation(NamedTuple):
 
 
 class Protection(NamedTuple):
-    """Protection levels (m), infinite where there is no bound, and what led to them."""
+    """Protection levels (m), infinite without a bound, with their intermediate results."""
 
     hpl_m: float
     vpl_m: float
@@ -160,8 +161,8 @@ class Protection(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """Separation |x(k) - x(0)| over its threshold, the largest of all; the sum of squared residuals
-    and its bound (infinite without redundancy)."""
+    """Largest separation |x(k) - x(0)| over its threshold; the sum of squared residuals and its
+    bound (infinite without redundancy)."""
 
     largest_ratio: float
     residual: float
@@ -173,7 +174,7 @@ class Detection(NamedTuple):
 
 
 class Exclusion(NamedTuple):
-    """Satellites left out (n,) of the epoch, and the protection of what remains."""
+    """Satellites excluded (n,) from the epoch, and the protection of the rest."""
 
     out: Mask
     protection: Protection
@@ -182,8 +183,8 @@ class Exclusion(NamedTuple):
 def protection_level(
     weight: Array, offset: Array, sigma: Array, risk: float, tolerance_m: float = 1e-3
 ) -> float:
-    """The least level, rounded up by at most `tolerance_m`, with
-    sum weight Q((level - offset) / sigma) <= risk; weight, offset and sigma (m,).
+    """Smallest level, rounded up by at most `tolerance_m`, with sum weight Q((level - offset) /
+    sigma) <= risk; weight, offset and sigma (m,).
 
     By bisection: each term alone needs no less than the lower bound, and at the upper bound no term
     has more than its equal part. Infinite where risk is not positive or a sigma not finite.
@@ -211,7 +212,7 @@ def _risk_of(terms: list[tuple[float, float, float]], level: float) -> float:
 
 
 def _level_of(term: tuple[float, float, float], risk: float) -> float:
-    """Level at which one term alone has `risk`; minus infinity where it never has as much."""
+    """Level at which one term alone has `risk`; minus infinity where its risk is always smaller."""
     weight, offset, sigma = term
     return offset - gaussian_quantile(min(1.0, risk / weight)) * sigma
 
@@ -237,7 +238,7 @@ def fault_modes(epoch: Epoch, unmonitored_risk: float) -> tuple[tuple[FaultMode,
 
 
 def _most_events(priors: Sequence[float], risk: float) -> int:
-    """The least number of independent events that more come together of with `risk` at most."""
+    """Smallest number of independent events that is exceeded with probability `risk` at most."""
     # Probabilities of 0, 1, ... events, one event after another.
     count = np.array([1.0])
     for p in priors:
@@ -304,7 +305,8 @@ def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
 
 
 def _solve(design: Array, variance: Array, out: Mask) -> tuple[Array, Array] | None:
-    """S (3, n) without the satellites in `out` (n,), and one sigma (3,); None without solution."""
+    """Gain S (3, n) without the satellites in `out` (n,), and one sigma (3,); None without
+    solution."""
     keep = ~out
     used = np.append([True, True, True], design[keep, 3:].any(axis=0))
     g = design[np.ix_(keep, used)]
@@ -318,7 +320,7 @@ def _solve(design: Array, variance: Array, out: Mask) -> tuple[Array, Array] | N
 
 
 def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirement) -> Detection:
-    """True if the measurements y (n,), less what a linearisation point predicts, fit together.
+    """Test the measurements y (n,), relative to a linearisation point, for mutual consistency.
 
     The sum of squared residuals is a sanity check: a fault outside the modes shows there.
     """
@@ -344,8 +346,8 @@ def _residual(epoch: Epoch, y: Array) -> tuple[float, int]:
 
 
 def exclude(epoch: Epoch, requirement: Requirement, y: Array) -> Exclusion | None:
-    """The measurements y (n,) with what must be left out of them left out, nothing where they fit
-    together; None where no fault mode explains them, or without a solution."""
+    """Exclude satellites that contradict the measurements y (n,), relative to a linearisation
+    point; no satellite if all agree. None where no fault mode explains y, or without a solution."""
     whole = protect(epoch, shared(requirement, ALL_IN_VIEW_SHARE))
     if whole is None:
         return None

@@ -1,4 +1,4 @@
-"""The catalogue of what may be wrong: a hypothesis a kind, and what such a fault is like.
+"""Catalogue of fault hypotheses: one for each kind of fault, with its signature.
 
 Each names its size in the unit in which people are told, the prior of that size and how often such
 a fault begins, each with its source; by which signature it enters the motion or the measurements
@@ -62,28 +62,28 @@ from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 DEG = math.degrees(1.0)
 BODY = ("x", "y", "z")
 SENSOR, PLACE, MOTION, TIME, OWN, OVER = range(6)
-"""Classes: between kinds of one class nobody has to choose before something is done."""
+"""Classes of kinds; kinds of one class need no decision between them before an action."""
 RECEIVER_PER_H, DELAYED_PER_H, SPOOFED_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1e-4, 1.0
 TURNS_PER_H = 0.01
-"""A unit works loose in its mount now and then in the life of a vehicle, not once an hour: what may
-have begun a moment ago is 0.2 deg of tilt for ever then, of a unit that knows it to 0.05."""
+"""Rate at which a unit turns in its mount, an hour: seldom in a vehicle's life. A rate of one an
+hour would add 0.2 deg of tilt for good to a unit that knows its tilt to 0.05 deg."""
 POSITION_SD_M = (20.0, 20.0, 20.0)
 TOGETHER = "all receivers"
-"""The device of a kind that is of all of them."""
+"""Device name of a kind that concerns all devices."""
 LAGGED_S = 0.5
-"""One sigma of a lag that nobody knows of."""
+"""One sigma of an unknown lag."""
 FOLLOWED_SPREAD = 0.3
-"""One sigma of a share of what a fault has done: it is told from noise at three sigma or so."""
+"""One sigma of the followed share of a fault; it differs from noise at about three sigma."""
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
-"""Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
-no longer than what the state for it admits is that state's."""
+"""Delays, each of which represents its neighbours within a relative sigma. Shorter delays belong to
+the state for the offset in time."""
 
 
 @immutable()
 class Kind:
-    """One hypothesis: `size` numbers of a prior `sd` (SI), told times `per_unit` in `unit`; it
-    begins `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device` it spoils
-    what `locates` and what `moves`, or all."""
+    """Fault hypothesis with `size` parameters of prior `sd` (SI), published times `per_unit` in
+    `unit`; its rate is `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device`
+    it affects the series that `locates` and `moves` select, or all."""
 
     name: str
     text: str
@@ -104,23 +104,23 @@ class Kind:
 
     @property
     def size(self) -> int:
-        """Of how many numbers the fault is."""
+        """Number of parameters of the fault."""
         return len(self.sd)
 
     @property
     def corrected(self) -> bool:
-        """True if the filter goes on without it: it is one of its states."""
+        """True if the filter corrects the fault, which is one of its states."""
         return self.signature in (STATES, TURNED, SHIFTED, FOLLOWED)
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
-        """True if a series of such a device is no measurement any more."""
+        """True if the fault invalidates a series of such a device."""
         if self.corrected or self.device not in (TOGETHER, device):
             return False
         return self.of == OWN or (self.locates and locates) or (self.moves and moves)
 
 
 def sensor_kinds(model: Model) -> list[Kind]:
-    """Of the inertial unit, as steps of those states that the model has for it."""
+    """Faults of the inertial unit, as steps of the model's states for it."""
     rates = [model.parameters(RATE_ERROR + axis) for axis in range(3)]
     forces = [model.parameters(FORCE_ERROR + axis) for axis in range(3)]
     found = []
@@ -155,9 +155,9 @@ def sensor_kinds(model: Model) -> list[Kind]:
 
 
 def position_kinds(device: str) -> list[Kind]:
-    """Of positions: off, or running away. Sizes: a reflection in a street is metres to tens of
-    metres off (Groves, 2nd ed., section 9.4.4); what pulls a receiver away does so at a metre a
-    second."""
+    """Faults of positions: an offset or a drift. Sizes: a reflection in a street displaces by
+    metres to tens of metres (Groves, 2nd ed., section 9.4.4); a spoofer drags a receiver away at a
+    metre a second."""
     of = partial(Kind, device=device, moves=False)
     return [
         of(
@@ -172,7 +172,7 @@ def position_kinds(device: str) -> list[Kind]:
 
 
 def velocity_kinds(device: str) -> list[Kind]:
-    """Of velocities: off, or running away."""
+    """Faults of velocities: an offset or a drift."""
     of = partial(Kind, device=device, locates=False)
     return [
         of(
@@ -187,7 +187,7 @@ def velocity_kinds(device: str) -> list[Kind]:
 
 
 def carried_kinds(device: str) -> list[Kind]:
-    """Of a device whose positions are carried off at the velocity that it adds: what is spoofed."""
+    """Spoofing: positions move away at the velocity that is added to the velocities."""
     of = Kind(
         *("carried_off", f"{device} is carried off", "m/s", CARRIED, TIME),
         *((1.0, 1.0, 1.0), SPOOFED_PER_H),
@@ -197,8 +197,8 @@ def carried_kinds(device: str) -> list[Kind]:
 
 
 def delay_kinds(device: str) -> list[Kind]:
-    """Of a device, or of its velocities alone: late by about so much. The amount is one of the lag:
-    its share of it is told."""
+    """Delay of a device, or of its velocities alone, near each listed lag. The size is a share of
+    the lag."""
     return [
         Kind(
             *(name, text, "s", DELAY, of),
@@ -219,8 +219,8 @@ def delay_kinds(device: str) -> list[Kind]:
 
 
 def time_kinds(device: str, model: Model) -> list[Kind]:
-    """Of a device's offset in time, as a step of the states for it: a line's latency is known to a
-    tenth of a second."""
+    """Step of a device's offset in time, through its states: a line's latency is known to a tenth
+    of a second."""
     slots = [slots[0] for name in _times(device) if (slots := model.slots_of(name))]
     if not slots:
         return []
@@ -251,7 +251,7 @@ def _times(device: str) -> tuple[str, ...]:
 
 
 def speed_kinds(device: str) -> list[Kind]:
-    """Of a wheel: its scale, of which minus one is a wheel that stands still."""
+    """Faults of a wheel: its scale; minus one is a stuck sensor."""
     of = Kind(
         *("wheel_scale", f"{device} speed is off by", "%", SPEED, OWN),
         *((0.5,), DELAYED_PER_H, 100.0),
@@ -270,7 +270,7 @@ def row_kinds(
     axes: tuple[str, ...],
     per_hour: float = RECEIVER_PER_H,
 ) -> list[Kind]:
-    """Of any other measurement: each of its rows is off."""
+    """Faults of any other measurement: an offset of each row."""
     of = Kind(
         *("offset", f"{device} {text}", unit, ROWS, OWN),
         *(sd, per_hour, per_unit),
@@ -281,8 +281,8 @@ def row_kinds(
 
 
 def over_kind() -> Kind:
-    """That a source's fault is over, which the solution has followed until then: as likely as that
-    fault, which lasts a minute in the mean. Its size is the share of what was followed."""
+    """End of a source's fault that the solution has followed, with the odds of a fault of a
+    minute's mean duration. Its size is the followed share."""
     return Kind(
         *("over", "a source's fault that the solution followed is over:", "%", FOLLOWED, OVER),
         *((FOLLOWED_SPREAD,), 3600.0 / LASTS_S, 100.0),
@@ -293,16 +293,16 @@ def over_kind() -> Kind:
 
 
 def changed_kind(device: str) -> Kind:
-    """That a device's positions have jumped within what they share: found beside the bank, which
-    takes it for a fault of them (fusiond.integrity.shared_error)."""
+    """Jump of a device's positions within their shared error, found outside the bank, which would
+    take it for a fault (fusiond.integrity.shared_error)."""
     text = f"{device} position has changed within what its fixes share,"
     of = "position_change", text, "m", FOLLOWED, OVER
     return Kind(*of, (1.0, 1.0, 1.0), RECEIVER_PER_H, device=device)
 
 
 def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]:
-    """All of a model and the devices of `aiding`, name to kind of section; with a vehicle that does
-    not slip where `slips`."""
+    """Hypotheses of a model and the devices of `aiding` (name to kind of section), with those of a
+    vehicle without slip where `slips`."""
     found = sensor_kinds(model)
     for device, kind in aiding.items():
         if kind == "gnss":
@@ -330,7 +330,7 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
 
 
 def table_of(kinds: Sequence[Kind]) -> FaultTable:
-    """The same for the kernels."""
+    """Table of the hypotheses for the kernels."""
     ints = np.zeros((len(kinds), KIND_INTS), dtype=np.int64)
     numbers = np.ones((len(kinds), KIND_NUMBERS))
     devices = tuple(dict.fromkeys(kind.device for kind in kinds if kind.device))

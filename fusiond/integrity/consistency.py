@@ -1,4 +1,4 @@
-r"""Is the filter's covariance to be believed? Innovation tests of one source, online.
+r"""Consistency tests of the innovations of one source against their covariance, online.
 
     eps(k)  = nu^T(k) S^-1(k) nu(k)                       chi-square, m degrees of freedom   (5)
     average = sum_k eps(k) / (K m)                        K m average: chi-square, K m  (6), (7)
@@ -61,11 +61,11 @@ WORDS: tuple[Verdict, ...] = ("consistent", "pessimistic", "optimistic", "colour
 LAGS = 8
 """Lags of the paper's test."""
 FEWEST = 20
-"""Epochs below which the law of Q has not been checked: the verdict is `too_few`."""
+"""Fewest epochs for which the law of Q has been checked; below it the verdict is `too_few`."""
 INTERVAL_LEVEL = 0.95
-"""Of the intervals shown for single figures, as the paper's. The verdict does not use them."""
+"""Confidence level of displayed intervals, as in the paper. The verdict does not use them."""
 POWER = 0.9
-"""Probability with which the `detectable` figures are noticed."""
+"""Probability with which the `detectable` figures are detected."""
 _LAG = np.arange(1, LAGS + 1)
 
 
@@ -77,11 +77,12 @@ class ConsistencyOptions:
     window: int = 100
     """K, epochs. More see smaller faults, and later."""
     alpha: float = 0.01
-    """Share of windows of a matched filter that are not found consistent, both tests together."""
+    """Rate of false alarms of both tests together: windows of a matched filter that are not
+    `consistent`."""
     gate: float = 1.0
-    """Probability with which a consistent innovation passed the gate; 1: none is left out."""
+    """Probability with which a consistent innovation passed the gate; 1: no gate."""
     whitened: bool = True
-    """False: rho of the innovations as they are, as the paper has it; `add` then needs S."""
+    """False: rho of the original innovations, as in the paper; `add` then needs S."""
     shared: bool = False
     """Successive measurements share an error that the filter follows. The solution takes it over,
     so that innovations show nothing of it: small ones are `cannot_tell`, not `pessimistic`."""
@@ -100,9 +101,9 @@ class Consistency:
     """Results of the tests. Figures that need more epochs than there are, are NaN."""
 
     verdict: Verdict
-    """Of the monitor: with hysteresis. Of `judge`: equal to `window_verdict`."""
+    """Verdict of the monitor, with hysteresis; of `judge`, equal to `window_verdict`."""
     window_verdict: Verdict
-    """Of this window alone."""
+    """Verdict of this window alone."""
     k: int
     """K, epochs in the window."""
     dof: int
@@ -110,26 +111,27 @@ class Consistency:
     nis_average: float
     """Normalised innovation squared per degree of freedom; 1 is expected."""
     nis_interval: Interval
-    """At INTERVAL_LEVEL."""
+    """Interval of the NIS average at INTERVAL_LEVEL."""
     nis_limits: Interval
-    """Outside these the verdict is `pessimistic` or `cannot_tell`, or `optimistic`."""
+    """Limits of the NIS average; outside them the verdict is `pessimistic` or `cannot_tell`, or
+    `optimistic`."""
     nis_p: float
     """Two-sided p-value of the average."""
     rho: tuple[float, ...]
     """rho(1) .. rho(8)."""
     rho_interval: Interval
-    """At INTERVAL_LEVEL, of one lag alone."""
+    """Interval of rho at one lag, at INTERVAL_LEVEL."""
     portmanteau: float
-    """Q; 8 is expected."""
+    """Portmanteau statistic Q; its expectation is 8."""
     portmanteau_limit: float
-    """Above this the innovations are coloured."""
+    """Limit of Q, above which the innovations are coloured."""
     portmanteau_p: float
     alpha: float
     """Overall level of the verdict."""
     detectable_ratio: Interval
-    """NIS average in truth, outside which POWER of the windows are noticed (white innovations)."""
+    """True NIS averages outside which a share POWER of windows is detected (white innovations)."""
     detectable_rho: float
-    """Autocorrelation at a single lag from which POWER of the windows are noticed."""
+    """Autocorrelation at a single lag from which a share POWER of windows is detected."""
 
     @property
     def nis_inside(self) -> bool:
@@ -138,7 +140,7 @@ class Consistency:
 
     @property
     def rho_inside(self) -> tuple[bool, ...]:
-        """By lag, whether rho lies in its interval; one in twenty does not, by chance."""
+        """Membership of rho in its interval by lag; one in twenty is outside by chance."""
         return tuple(self.rho_interval[0] <= r <= self.rho_interval[1] for r in self.rho)
 
 
@@ -197,7 +199,7 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
 
 
 def _between(shape: float, scale: float, outside: float) -> Interval:
-    """Bounds of a gamma law with this probability inside, half of it at either end."""
+    """Bounds of a gamma law with probability `outside`, half of it at either end."""
     return (
         scale * gamma_quantile(shape, outside / 2.0),
         scale * gamma_quantile(shape, outside / 2.0, upper=True),
@@ -205,14 +207,14 @@ def _between(shape: float, scale: float, outside: float) -> Interval:
 
 
 def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
-    """Shape and scale of the gamma law of the average of K chi-squares cut off at the gate."""
+    """Shape and scale of the gamma law of the average of K chi-squares, truncated at the gate."""
     mean, variance = _cut_off(dof / k, gate)
     return k * mean * mean / variance, variance / (mean * dof)
 
 
 @lru_cache(maxsize=256)
 def _cut_off(m: float, gate: float) -> tuple[float, float]:
-    """Mean and variance of a chi-square with m degrees that is cut off at the gate.
+    """Mean and variance of a chi-square with m degrees, truncated at the gate.
 
     E[x^j; x < g] = m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
     """

@@ -1,4 +1,4 @@
-r"""Agreement of a device's positions with its velocities while it is out.
+r"""Agreement of an excluded device's positions with its velocities.
 
     |p_k - p_(k-1) - (v_k + v_(k-1)) h / 2| <= 4 sqrt(2 s_p^2 + s_v^2 h^2 / 2)        north and east
 
@@ -17,11 +17,11 @@ from fusiond.navigation.earth import meridian_radius, transverse_radius
 
 SIGMAS = 4.0
 LONGEST_NS = 2_500_000_000
-"""Fixes farther apart leave too much of the way between them to two velocities."""
+"""Longest interval of fixes: beyond it two velocities do not determine the displacement."""
 
 
 class Agreement(NamedTuple):
-    """The last position and velocity, and since when (ns) successive ones fit each other."""
+    """Last position and velocity, and the start (ns) of their agreement."""
 
     position: PositionCandidate | None = None
     velocity: VelocityCandidate | None = None
@@ -31,11 +31,11 @@ class Agreement(NamedTuple):
 
     @property
     def lasted_ns(self) -> int:
-        """For how long they have fitted."""
+        """Duration (ns) of the agreement."""
         return self.upto_ns - self.since_ns
 
     def with_measurement(self, measurement: AidingMeasurement) -> Agreement:
-        """With one position or velocity more."""
+        """Agreement after one more position or velocity."""
         found = self
         for candidate in measurement.candidates():
             if isinstance(candidate, PositionCandidate):

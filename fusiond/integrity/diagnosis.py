@@ -1,4 +1,4 @@
-r"""Diagnosis: which hypothesis is identified, and what follows for the filter and its sources.
+r"""Diagnosis: the identified hypothesis, and its consequences for filter and sources.
 
 A hypothesis is identified where
 
@@ -58,7 +58,7 @@ Array = NDArray[np.float64]
 PLACE_ROW = 6
 """First row of the position in the error state."""
 ALIKE = 7.0
-"""Hypotheses of the class that are less likely by more than this count nothing."""
+"""Log likelihood difference beyond which another hypothesis of the class is ignored."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
 """Five fixes of a receiver that sends each second; a minute is what a vehicle's MEMS unit keeps to
 within a hundred metres."""
@@ -72,7 +72,7 @@ class Correction(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """All that a later restore needs."""
+    """State for a later restore."""
 
     series: dict[str, Series]
     findings: tuple[Finding, ...]
@@ -81,8 +81,8 @@ class Memory(NamedTuple):
 
 
 class Diagnosis:
-    """Judges each measurement once it has been looked at; a function of the measurements in order
-    alone."""
+    """Diagnosis of each measurement after its innovation; depends only on the measurements in
+    order."""
 
     def __init__(self, kinds: Sequence[Kind] = ()) -> None:
         self._kinds = tuple(kinds)
@@ -90,7 +90,7 @@ class Diagnosis:
         self._shared: set[str] = set()
         """Series that a checkpoint has too: copied before they are changed."""
         self._agreement: Mapping[str, Agreement] = {}
-        """By device that is out; replaced, never changed."""
+        """Agreement of each excluded device; replaced, never changed."""
         self._lasting: Mapping[str, Lasting] = {}
         """Last reason of exclusion by series; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
@@ -108,7 +108,7 @@ class Diagnosis:
         self._lasting = memory.lasting
 
     def reset(self) -> None:
-        """The filter starts anew."""
+        """Restart with the filter."""
         self._series, self._shared, self.findings = {}, set(), ()
         self._agreement, self._lasting = {}, {}
 
@@ -116,7 +116,7 @@ class Diagnosis:
 
     @property
     def series(self) -> Mapping[str, Series]:
-        """By source, as they are; not to be changed."""
+        """Series by source; read-only."""
         return self._series
 
     @property
@@ -126,14 +126,14 @@ class Diagnosis:
 
     @property
     def positions_out(self) -> bool:
-        """True if there are positions, and none is in service."""
+        """True if position series exist and none is in service."""
         positions = [s for s in self._series.values() if s.locates]
         return bool(positions) and all(s.out for s in positions)
 
     @property
     def contradicts(self) -> str | None:
-        """The device whose positions and velocities fit each other and not the filter; None where
-        there is none."""
+        """Device whose positions and velocities agree with each other and contradict the filter;
+        None without one."""
         if not self.positions_out:
             return None
         for device, agreement in self._agreement.items():
@@ -148,7 +148,7 @@ class Diagnosis:
     # ------------------------------------------------------------------ judgement
 
     def own(self, measurement: AidingMeasurement) -> Series:
-        """The series of a measurement, which may be changed."""
+        """Series of a measurement, for a change."""
         one = self._series.get(measurement.source)
         if one is not None and measurement.source not in self._shared:
             return one
@@ -159,9 +159,8 @@ class Diagnosis:
         return one
 
     def plain(self, measurement: AidingMeasurement) -> Series | None:
-        """The series of a measurement of which nothing is to be judged beyond its gate and
-        hypotheses: it is nominal, and nothing of its device is out; None of another. It may be
-        changed."""
+        """Series of a measurement that needs only gate and hypotheses: nominal, with no excluded
+        series of its device; else None. The caller may change it."""
         one = self._series.get(measurement.source)
         if one is None or one.state is not Service.NOMINAL or one.failed:
             return None
@@ -170,8 +169,8 @@ class Diagnosis:
         return self.own(measurement) if measurement.source in self._shared else one
 
     def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
-        """The series of a measurement, before it is folded in; one that repeats itself leaves
-        service, with all of its device."""
+        """Series of a measurement, before its update; a repeating series leaves service, with all
+        of its device."""
         # By its class: one that stands for another has its own offers.
         one, shown = self._series.get(measurement.source), getattr(type(measurement), "shown", None)
         if one is None or measurement.source in self._shared:
@@ -242,8 +241,8 @@ class Diagnosis:
         return correction
 
     def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
-        """False of a position's fault before the position of that instant has come, where it may
-        be the error that positions share (fusiond.integrity.shared_error)."""
+        """False for a position's fault before the position of that instant has arrived, if it may
+        be the shared error (fusiond.integrity.shared_error)."""
         kind = self._kinds[int(found.item(BEST)) // RESTARTS]
         if kind.of != PLACE or measurement.locates:
             return True
@@ -288,9 +287,9 @@ class Diagnosis:
         return Finding(kind, t_ns, told.onset_s, size, sd, told.log_odds)
 
     def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float) -> None:
-        """Series that a fault removes from service, and those of faults of its device that fit as
-        well: nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a
-        straight may be off, or late, and the velocity with it."""
+        """Exclude the series that a fault affects, and those of similarly likely faults of its
+        device: none of them is trusted before the faults are distinguished. A fix of 60 m behind on
+        a straight may have an offset, or a delay that affects the velocity as well."""
         fits = bank.explains & (bank.log_odds > max(0.0, finding.log_odds - DECIDED))
         fits &= bank.log_likelihood >= fit - APART
         found = []
@@ -313,8 +312,8 @@ class Diagnosis:
         self._lasting = lasting
 
     def _over_by_others(self, one: Series) -> float:
-        """Log likelihood that a fault for which a series is out is over, by what else it has
-        spoiled: a fault is one story of all of it."""
+        """Log likelihood that the fault which excluded a series is over, by the other series that
+        it affects: a fault ends for all at once."""
         known = set(self._lasting.get(one.source, Lasting()).findings)
         others = [s for n, s in self._series.items() if s.out and n != one.source]
         return sum(
@@ -335,8 +334,8 @@ class Diagnosis:
     def lasting(
         self, measurement: AidingMeasurement, one: Series, estimator: Estimator
     ) -> Array | None:
-        """Terms of each fault in an innovation of a series that may be out (k, 3), if it lasts;
-        None where none is known."""
+        """Terms (k, 3) of each lasting fault in an innovation of a series that may be excluded;
+        None if unknown."""
         bank, added = estimator.hypotheses, []
         if bank is None:
             return None
@@ -346,7 +345,7 @@ class Diagnosis:
         return np.array(added) if added else None
 
     def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
-        """Those of the class and device of a kind that explain it nearly as well."""
+        """Hypotheses of the class and device of a kind with nearly its likelihood."""
         explains, log_odds = bank.explains, bank.log_odds
         return [
             bank.estimated(RESTARTS * row + restart)
@@ -382,8 +381,8 @@ class Diagnosis:
         )
 
     def _agrees(self, measurement: AidingMeasurement, one: Series) -> None:
-        """One of a device that is out, or was, has come: does the device fit itself? What repeats
-        itself while the vehicle moves says nothing of that."""
+        """Update the agreement of a device that is or was excluded. A value that repeats while the
+        vehicle moves is no evidence."""
         if not (one.locates or one.moves) or measurement.screened or one.repeats > 0:
             return
         known = self._agreement.get(measurement.device, Agreement())
@@ -394,7 +393,7 @@ class Diagnosis:
 
 
 def _somewhere_else(measurement: AidingMeasurement, estimator: Estimator) -> Correction:
-    """The filter's position is open by how far a position is from it."""
+    """Open the filter's position covariance by the distance of a position from it."""
     spread = np.zeros((estimator.model.size, estimator.model.size))
     nav = estimator.nav
     lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)

@@ -1,4 +1,4 @@
-"""Findings, and for which of them a series is out while it may last."""
+"""Findings, and those of them that may still exclude a series."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Finding(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For people."""
+        """Text for the operator."""
         k, row = self.kind, self.largest
         axis = f", {k.axes[row]}" if k.axes[row] else ""
         amount = f"{self.size[row]:.3g} {k.unit}, {self.sd[row]:.2g} at one sigma{axis}"
@@ -37,21 +37,21 @@ class Finding(NamedTuple):
 
 
 class Lasting(NamedTuple):
-    """The faults for which a series may be out, and by how much (log likelihood) each has been
-    worse than the best since."""
+    """Faults that may still exclude a series, and the log likelihood by which each has been worse
+    than the best since."""
 
     findings: tuple[Finding, ...] = ()
     worse: tuple[float, ...] = ()
 
     @staticmethod
     def of(findings: Iterable[Finding]) -> Lasting:
-        """Of faults that fit alike."""
+        """Faults of `findings` that fit alike."""
         found = tuple(findings)
         return Lasting(found, (0.0,) * len(found))
 
     def judged(self, nis: Sequence[float]) -> Lasting:
-        """After one more innovation, whose chi-square is `nis` (k,) if each of them lasts: a fault
-        is none that another one explains better, a thousand to one."""
+        """Faults after one more innovation, with chi-square `nis` (k,) under each of them. A fault
+        a thousand times less likely than another one is dropped."""
         best = min(nis)
         worse = [
             w + 0.5 * min(one - best, MOST_EVIDENCE) for w, one in zip(self.worse, nis, strict=True)
@@ -60,6 +60,6 @@ class Lasting(NamedTuple):
         return Lasting(tuple(self.findings[k] for k in kept), tuple(worse[k] for k in kept))
 
     def without(self, over: Lasting) -> Lasting:
-        """Less those that have turned out to be over."""
+        """Remaining faults without those that are over."""
         kept = [k for k, finding in enumerate(self.findings) if finding not in over.findings]
         return Lasting(tuple(self.findings[k] for k in kept), tuple(self.worse[k] for k in kept))

@@ -45,7 +45,7 @@ def _slide(
     weights: Array,
     rho: Array,
 ) -> float:
-    """Put epoch `now` into the ring, keep the sums over the window, write rho (8,) by (8).
+    """Insert epoch `now` into the ring, update the window's sums, write rho (8,) by (8).
 
     Returns Q = sum of `weights` (8,) rho^2.
 
@@ -117,8 +117,8 @@ def _slide_over(
     held: NDArray[np.int64],
     turned: NDArray[np.int64],
 ) -> int:
-    """Epochs `now` and those after it, `new` (n, m), one after the other; how often the verdict has
-    `turned` (n, 2): after which of them, and to which of `WORDS`.
+    """Insert successive epochs `new` (n, m) from `now` on. The number of changed verdicts, and in
+    `turned` (n, 2) the epoch and new verdict (index of `WORDS`) of each.
 
     `nis` and `energy` (n,) are theirs. `held` (3,): the verdict, the window's, and for how many
     epochs the second has contradicted the first; after `patience` it takes its place. 0: the window
@@ -177,12 +177,12 @@ class ConsistencyMonitor:
 
     @property
     def verdict(self) -> Verdict:
-        """With hysteresis."""
+        """Verdict with hysteresis."""
         return word(int(self._held[0]), self.options.shared)
 
     @property
     def window_verdict(self) -> Verdict:
-        """Of this window alone."""
+        """Verdict of this window alone."""
         return word(int(self._held[1]), self.options.shared)
 
     def add(self, nu: Array, s: Array | None = None) -> None:
@@ -205,9 +205,8 @@ class ConsistencyMonitor:
     def take(
         self, rows: Array, nis: Array, energy: Array | None = None
     ) -> list[tuple[int, Verdict]]:
-        """Take innovations (n, m) of successive epochs, of which NIS and energy (n,), the same
-        where they are whitened, are known already: `add` without its checks. After which of them
-        the verdict turned, and to what."""
+        """Add innovations (n, m) of successive epochs with known NIS and energy (n,), which are
+        equal if whitened: `add` without its checks. Epochs and new verdicts of each change."""
         energy = nis if energy is None else energy
         finite = np.isfinite(nis + energy)
         if not finite.all():

@@ -45,10 +45,10 @@ from fusiond.navigation.distributions import gaussian_quantile
 Array = NDArray[np.float64]
 
 INDEPENDENT_PER_HOUR = 3600.0
-"""One a second. Errors of an aided filter last longer, 24 s in the study `protection`, which would
-be 150: more samples than there are make the level larger, here by a tenth."""
+"""Independent samples an hour: one a second. Errors of an aided filter last longer, 24 s in the
+study `protection`, or 150 an hour; more samples raise the level, here by a tenth."""
 AXIS_SHARE = (0.25, 0.25, 0.5)
-"""Of the risk to north, east, down: half to the horizontal, half to the vertical."""
+"""Shares of the risk north, east, down: half to the horizontal, half to the vertical."""
 
 
 @immutable()
@@ -67,7 +67,7 @@ class IntegrityRisk:
 
 
 class Level(NamedTuple):
-    """Protection level (m) of one axis, and which devices (k,) are apart beyond the threshold."""
+    """Protection level (m) of one axis, and the devices (k,) beyond the separation threshold."""
 
     level_m: float
     apart: NDArray[np.bool_]
@@ -102,7 +102,8 @@ class FilterProtection(NamedTuple):
 def filter_protection(
     covariances: Array, separations: Array, limits: IntegrityRisk, vertical: bool = True
 ) -> FilterProtection:
-    """Levels from P (1 + k, 3, 3), m^2, and separations (k, 3), m, north, east, down."""
+    """Protection levels from covariances (1 + k, 3, 3), m^2, and separations (k, 3), m, north,
+    east, down."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     north, east, *down = (
         axis_level(variances[:, q], separations[:, q], AXIS_SHARE[q], limits)

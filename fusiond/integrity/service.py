@@ -74,7 +74,8 @@ class Service(enum.StrEnum):
 
 @dataclass(slots=True)
 class Series:
-    """One series: its state and since when, why it is out, failures and passes in a row."""
+    """Service of one series: state and its start, reason of exclusion, failures and passes in a
+    row."""
 
     source: str
     device: str
@@ -82,7 +83,7 @@ class Series:
     moves: bool
     state: Service = Service.NOMINAL
     out: bool = False
-    """True if it is looked at, and not fused."""
+    """True if the series is excluded: compared, not fused."""
     since_ns: int = 0
     received_ns: int = 0
     reason: str = ""
@@ -93,20 +94,20 @@ class Series:
     proven_ns: int = 0
     """End of probation (ns), which is as long as the exclusion was."""
     over: float = 0.0
-    """Log likelihood that the fault for which it is out is over, against that it lasts."""
+    """Log likelihood ratio that the excluding fault is over rather than lasting."""
     value: object = None
     repeats: int = 0
     unchanged: bool = False
-    """True if the last value was that before it, to the bit."""
+    """True if the last value repeated the one before it, to the bit."""
     noise: Array = field(default_factory=unlearned)
     repeating: float = 1.0
-    """Probability that a value repeats the one before it, as shown so far in motion."""
+    """Probability that a value repeats the one before it, as observed in motion."""
     shares: bool = False
-    """True of positions that share an error, which the filter estimates."""
+    """True for positions with a shared error that the filter estimates."""
 
     @staticmethod
     def of(measurement: AidingMeasurement) -> Series:
-        """A new one, for the first of its measurements."""
+        """New series, for its first measurement."""
         return Series(
             measurement.source,
             measurement.device,
@@ -123,7 +124,7 @@ class Series:
         return other
 
     def received(self, t_ns: int) -> None:
-        """One has come."""
+        """Note an arrival."""
         if t_ns - self.received_ns > FORGET_NS:
             self.failed = self.passed = self.repeats = 0
             if self.state is Service.SUSPECTED:
@@ -131,7 +132,7 @@ class Series:
         self.received_ns = t_ns
 
     def exclude(self, t_ns: int, reason: str) -> None:
-        """It leaves service."""
+        """Exclude the series."""
         self.state, self.since_ns, self.reason, self.out_ns = Service.OUT, t_ns, reason, t_ns
         self.out = True
         forget_lately(self.noise)
@@ -139,7 +140,8 @@ class Series:
         self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
 
     def gated(self, t_ns: int, explained: bool) -> None:
-        """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
+        """Note a gate failure of a series in service; `explained`: by a fault of the inertial
+        unit."""
         self.failed += 1
         again = self.state is Service.PROBATION
         if again or (self.failed >= REFUSED_IN_A_ROW and not explained):
@@ -148,7 +150,7 @@ class Series:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
 
     def fused(self, t_ns: int, whitened: tuple[float, ...]) -> None:
-        """One has passed, with that innovation."""
+        """Note a pass of the gate, with the whitened innovation."""
         rows = len(whitened)
         if 0 < rows <= 3:
             y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
@@ -160,9 +162,9 @@ class Series:
     def looked_at(
         self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
     ) -> None:
-        """One that is out was compared with what is published. `lasting`: by how much more
-        chi-square its innovation is if the fault for which it is out lasts; not a number where none
-        is known. `others`: log likelihood that it is over by what else it has spoiled.
+        """Compare a measurement of an excluded series with the published solution. `lasting`:
+        increase of the innovation's chi-square if the excluding fault lasts; NaN if unknown.
+        `others`: log likelihood that the fault is over, by its other series.
 
         A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
         """
@@ -181,14 +183,14 @@ class Series:
             self.readmit(t_ns)
 
     def readmit(self, t_ns: int) -> None:
-        """It is back in service."""
+        """Return the series to service."""
         self.proven_ns = 2 * t_ns - self.out_ns
         self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
         self.failed = self.passed = 0
 
     def went_on(self, t_ns: int, value: object, moved: int) -> None:
-        """Several have come while it was nominal, the last at `t_ns`, none with the `value` of the
-        one before it; None of a constraint. The vehicle `moved` at so many of them."""
+        """Note several arrivals of a nominal series, the last at `t_ns`, without repeated values;
+        `value` is None for a constraint. The vehicle moved at `moved` of them."""
         self.received_ns = t_ns
         if value is None:
             return
@@ -197,8 +199,8 @@ class Series:
             self.repeating += -self.repeating / REPEATS_KEPT
 
     def repeats_itself(self, value: object, moving: bool) -> bool:
-        """True if a new value makes so many alike to the bit, of a vehicle that is `moving`, that
-        it is no measurement. What stands may repeat."""
+        """True if values repeat to the bit too often for a measurement of a `moving` vehicle. At
+        rest values may repeat."""
         self.unchanged = value == self.value
         same = moving and self.unchanged
         self.value, self.repeats = value, self.repeats + 1 if same else 0

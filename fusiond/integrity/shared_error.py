@@ -1,4 +1,4 @@
-r"""Positions that jump within what a receiver's fixes share: no fault of the receiver.
+r"""Jumps of positions within a receiver's shared error, which are not a fault.
 
 Successive fixes share an error s b, b ~ N(0, S) of a Gauss-Markov process, which the filter
 estimates (fusiond.aiding.position). A drift that is too slow to be told, or other satellites than
@@ -30,7 +30,7 @@ from fusiond.estimators.hypotheses import Estimated
 from fusiond.integrity.catalogue import POSITION_SD_M
 
 PLACE = slice(6, 9)
-"""Of the position in the error state."""
+"""Slots of the position in the error state."""
 
 
 def renewed_slots(

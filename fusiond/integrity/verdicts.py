@@ -1,5 +1,4 @@
-"""One consistency monitor for each source of measurements: what its innovations say of the filter's
-sigma."""
+"""Consistency monitors of all sources: the evidence of their innovations on the filter's sigma."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ Array = NDArray[np.float64]
 
 @dataclass(slots=True)
 class _Series:
-    """A monitor, and what it is to judge: m, number in the order of all, innovation (m,), NIS."""
+    """Monitor with its input: m, global number, innovation (m,), NIS."""
 
     monitor: ConsistencyMonitor
     waiting: list[tuple[int, int, Sequence[float] | Array, float]] = field(default_factory=list)
@@ -54,9 +53,9 @@ class Verdicts:
         self._series: dict[str, _Series] = {}
         self._heard = 0
         self.waiting: list[tuple[AidingMeasurement, Outcome]] = []
-        """Fused and not judged yet, once each though a rewind brings it again."""
+        """Fused measurements not yet judged, once each even after rewinds."""
         self._turned: list[tuple[int, str, Verdict]] = []
-        """Verdicts that have turned and are not told yet, with the number of the innovation."""
+        """Changed verdicts not yet reported, with the number of the innovation."""
 
     def judge(self, measurement: AidingMeasurement, outcome: Outcome) -> None:
         """A measurement has been fused; to be called once for each, though a rewind brings it
@@ -86,8 +85,7 @@ class Verdicts:
         return series
 
     def report(self) -> None:
-        """Judge what has come since the last time, and say which verdicts have turned, in the order
-        in which they did."""
+        """Judge the innovations since the last call; report changed verdicts in order."""
         self._judge_all()
         for _, source, verdict in sorted(self._turned):
             self._on_change(source, verdict)
@@ -110,7 +108,7 @@ class Verdicts:
                     self._turned.append((numbers[row], source, verdict))
 
     def reset(self) -> None:
-        """The filter starts anew: what came before says nothing of it."""
+        """Restart with the filter: earlier innovations are no evidence on it."""
         self.waiting.clear()
         self._turned.clear()
         for series in self._series.values():

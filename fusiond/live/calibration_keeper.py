@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.state_keeper import state_file
@@ -32,7 +32,7 @@ SAVE_EVERY_S = 300
 
 
 class CalibrationKeeper:
-    """Keeps one vehicle's calibration beside its saved state, where that is kept.
+    """Store of one vehicle's calibration, beside its saved state, if that is configured.
 
     What is taken up is told in the log. `on_event(code, text)` hears `calibration_damaged` and
     `calibration_refused`.
@@ -54,7 +54,7 @@ class CalibrationKeeper:
         self._working: asyncio.Task[None] | None = None
 
     def restore_into(self, navigator: Navigator) -> None:
-        """Let the navigator take up the calibration of the last run, if its mounting is this."""
+        """Restore the last run's calibration into the navigator, if the mounting is unchanged."""
         if self._path is None:
             return
         try:
@@ -71,7 +71,7 @@ class CalibrationKeeper:
             log.info("%s: %s", self._path, ", ".join(names) or "no saved calibration")
 
     def keep(self, t_ns: int, navigator: Navigator) -> None:
-        """Renew the file, if it is due and something has been observed."""
+        """Write the file when due, if a parameter has been observed."""
         busy = self._working is not None and not self._working.done()
         if self._path is None or busy or not self._due.due(t_ns):
             return
@@ -80,7 +80,7 @@ class CalibrationKeeper:
             self._working = asyncio.create_task(asyncio.to_thread(_write, self._path, saved))
 
     async def close(self, navigator: Navigator) -> None:
-        """Keep the last of it, after what is under way has ended."""
+        """Write the last calibration, after a pending write has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])
         saved = self._of(navigator)

@@ -1,4 +1,4 @@
-"""From inputs to the solution: clock, drivers, navigator, put together without any I/O of its own.
+"""Processing chain from inputs to the solution: clock, drivers, navigator, without I/O.
 
 It is a function of what it had loaded, its drivers' inputs, an operator's commands and its ticks.
 The daemon feeds it from devices, a replay from a recording: the same bits come of both.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
@@ -26,8 +26,8 @@ from fusiond.navigator.timeline import Entry
 
 
 class Chain:
-    """One vehicle's way from inputs to the solution. `saved` is the state that a start may align
-    from; `on_outcome` hears how each measurement ended."""
+    """Chain of one vehicle from inputs to the solution. `saved`: state for the alignment;
+    `on_outcome` receives each measurement's outcome."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Chain:
             self._on_outcome(entry)
 
     def tick(self, t_ns: int) -> Solution:
-        """Run the filter on all that has come, and read the solution at `t_ns`."""
+        """Run the filter on all input and read the solution at `t_ns`."""
         self.sources.release(t_ns)
         arrived = self.sources.take_imu(t_ns)
         if arrived is not None:

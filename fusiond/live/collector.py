@@ -1,4 +1,4 @@
-"""The cyclic garbage collector, run in the slack after a tick instead of anywhere.
+"""Schedule of the cyclic garbage collector, which runs in the slack after a tick.
 
 A collection costs what its generation holds: some 0.1 us an object. CPython begins one by how many
 more objects were made than went; a daemon whose queues are full makes as many as go, so that count
@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 _MS = 1_000_000
 _DUE_NS = (0, 100 * _MS, 10_000 * _MS)
-"""Since the last of each generation: the youngest after every tick (0.02 ms), the middle one after
-ten, as CPython has it; the oldest, which holds some 10,000 objects that live (3 ms), seldom."""
+"""Intervals of the generations: the youngest after every tick (0.02 ms), the middle one after ten,
+as in CPython; the oldest, which holds some 10,000 live objects (3 ms), seldom."""
 _FORCED_NS = (100 * _MS, 1_000 * _MS, 20_000 * _MS)
 """Cycles hold memory, and each collection takes longer: done now if no slack was long enough."""
 _DEAR_NS = 4 * _MS
@@ -33,7 +33,7 @@ class Collector:
         self._cost_ns = [0, 0, 0]
         self._last_ns = [0, 0, 0]
         self._backoff = 1
-        """Of the oldest generation: by so much its times are longer."""
+        """Factor on the intervals of the oldest generation."""
         self._was_enabled = gc.isenabled()
         self.collections = 0
         self.forced = 0
@@ -47,13 +47,13 @@ class Collector:
         self._last_ns = [self._now()] * 3
 
     def stop(self) -> None:
-        """As it was before."""
+        """Restore the collector's settings."""
         gc.unfreeze()
         if self._was_enabled:
             gc.enable()
 
     def use_slack(self, slack_ns: int) -> None:
-        """Collect the oldest generation that is due, if its last cost and half of it fit the
+        """Collect the oldest generation that is due, if one and a half times its last cost fits the
         slack."""
         start_ns = self._now()
         for generation in (2, 1, 0):

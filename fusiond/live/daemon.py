@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
@@ -54,21 +54,21 @@ from fusiond.outputs.commands import (
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
-from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
+from fusiond.recording.state_digest import state_digest
 from fusiond.workers.forked import Forked
 
 log = logging.getLogger("fusiond")
 
 SWITCH_S = 0.0005
-"""Time that a tick waits for a thread that computes, as the log's does ten times a second: 5 ms by
-CPython's default, by which one tick of a hundred began 7 ms late."""
+"""Longest wait (s) of a tick for a computing thread, such as the log's, ten times a second.
+CPython's default of 5 ms delayed one tick in a hundred by 7 ms."""
 _NOT_KEPT = "NUMBA_CACHE_DIR, or XDG_CACHE_HOME, is no folder that may be written"
 
 
 class Daemon:
-    """One vehicle. `on_solution` hears every tick's solution (the demo, tests); `front` is there
-    already where it had to wait for kernels."""
+    """Daemon of one vehicle. `on_solution` receives every tick's solution (for demo and tests);
+    `front` exists already if it had to wait for kernels."""
 
     def __init__(
         self,
@@ -124,11 +124,11 @@ class Daemon:
 
     @property
     def solution(self) -> Solution | None:
-        """Of the last tick."""
+        """Solution of the last tick."""
         return self._chain.solution
 
     def _completed(self, outputs: dict[str, Output]) -> dict[str, Output]:
-        """With what the navigator's parts have to do with them."""
+        """Outputs with callbacks into the navigator's parts."""
         mqtt = outputs.get("mqtt")
         if isinstance(mqtt, MqttPublisher):
             mqtt.on_confirmed = self._chain.messaging.confirm
@@ -238,7 +238,7 @@ class Daemon:
         self._messages.keep(t_ns, self._chain.messaging)
 
     def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
-        """A state that a part of the log can be replayed from, now and then."""
+        """Log a state from which a part of the log can be replayed, at intervals."""
         if self.recorder.state_due(t_ns):
             state = self._warm.state(solution, self.navigator)
             if state is not None:
@@ -248,7 +248,7 @@ class Daemon:
         self.recorder.innovation(entry)
 
     def _carry_out(self, command: Command) -> str | Awaitable[str]:
-        """An operator's command, and what was done. Raises `CommandRefusedError`."""
+        """Execute an operator's command; its result. Raises `CommandRefusedError`."""
         try:
             match command:
                 case StartRecording():
@@ -269,7 +269,7 @@ class Daemon:
         return f"{text}; {missing}" if missing else text
 
     def _each_second(self, solution: Solution) -> None:
-        """Tell the service manager how it stands."""
+        """Report status and watchdog to the service manager."""
         self._front.report_status(f"{solution.mode}: {solution.reason}", self.sources.all_running)
 
 

@@ -1,4 +1,4 @@
-"""Events: what an operator should know, logged and passed to listeners."""
+"""Events for the operator, logged and passed to listeners."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.live.journal import fields
 from fusiond.outputs.messages.event import EventMessage, event_message
 from fusiond.outputs.messages.event_catalogue import entry_of
@@ -27,7 +27,7 @@ class Events:
         self._unheard: deque[EventMessage] = deque(maxlen=MOST_UNHEARD)
 
     def listen(self, *listeners: Callable[[EventMessage], None]) -> None:
-        """Pass `listeners` every event from now on, and those that nobody has received yet."""
+        """Pass every event to `listeners` from now on, and earlier events without a listener."""
         self._listeners.extend(listeners)
         while self._unheard:
             message = self._unheard.popleft()

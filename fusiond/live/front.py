@@ -8,7 +8,7 @@ import logging
 from collections.abc import Awaitable, Callable, Mapping
 from importlib.metadata import version
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
@@ -37,7 +37,8 @@ _NO_TICK = SchedulerStatus(0, 0, 0.0, 0.0, 0.0, 0.0, (), 0, 0, 0.0)
 
 
 class Front:
-    """One vehicle's. `on_command` carries out an operator's command once somebody can."""
+    """Outputs of one vehicle before the daemon is ready. `on_command` executes an operator's
+    command once possible."""
 
     def __init__(self, config: Config, clock: Clock) -> None:
         self.config = config
@@ -66,7 +67,7 @@ class Front:
         return self.on_command(command)
 
     def report_status(self, text: str, all_running: bool) -> None:
-        """One sentence for the service manager; readiness where it is due."""
+        """Send a status sentence to the service manager, and readiness when due."""
         if self.ready:
             self.service.status(text)
         elif all_running or (self.clock.now_ns() - self.started_ns) * 1e-9 > READY_AFTER_S:
@@ -76,8 +77,8 @@ class Front:
             self.service.status(text)
 
     async def wait_for(self, compiling: Forked, stop: asyncio.Event) -> None:
-        """Say how far the kernels are, over MQTT, in the journal and to the service manager, until
-        they are compiled or `stop` is set."""
+        """Report the progress of compilation over MQTT, journal and service manager, until it is
+        complete or `stop` is set."""
         self.output_tasks.start({n: o for n, o in self.outputs.items() if n == "mqtt"})
         loop = asyncio.get_running_loop()
         over = loop.create_future()

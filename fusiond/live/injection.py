@@ -64,10 +64,10 @@ class Injection:
     def __init__(self, on_event: Callable[[str, str, str], None]) -> None:
         self._on_event = on_event
         self.faults: dict[str, Fault] = {}
-        """By source."""
+        """Active faults by source."""
 
     def inject(self, command: Inject, t_ns: int) -> str:
-        """Begin a fault at `t_ns`, in place of one that the source has; what was done."""
+        """Start a fault at `t_ns`, replacing one of the same source; a description."""
         self.faults[command.source] = Fault(command, t_ns)
         self._on_event(command.source, "injected", _description(command))
         return f"{command.source}: {_description(command)}"
@@ -99,7 +99,7 @@ class Injection:
 
 
 class Fault:
-    """One that is in force, or holds back what it has delayed."""
+    """Injected fault that is active, or still holds delayed measurements."""
 
     def __init__(self, command: Inject, t_ns: int) -> None:
         self.command = command

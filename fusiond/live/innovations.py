@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from math import isfinite
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.navigator.timeline import Entry, Key
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.innovations import Innovation
 
 MOST = 200
-"""Of one message: positions and velocities of a receiver at 20 Hz for 5 s, 20 kB. The oldest go."""
+"""Most innovations of one message: positions and velocities of a receiver at 20 Hz for 5 s, 20 kB.
+The oldest are dropped."""
 
 
 class Innovations:
@@ -30,7 +31,7 @@ class Innovations:
             del self._ended[next(iter(self._ended))]
 
     def since(self) -> list[Innovation]:
-        """All since the last call, by validity."""
+        """Innovations since the last call, in order of validity."""
         ended, self._ended = self._ended, {}
         return [
             message for key in sorted(ended) if (message := self._message(ended[key])) is not None

@@ -1,4 +1,4 @@
-"""Journal entries, with level, source and code as fields of the journal, and their limit.
+"""Journal entries with level, source and code as fields, and their rate limit.
 
     journalctl -u fusiond -p warning
     journalctl -u fusiond FUSIOND_SOURCE=gnss FUSIOND_CODE=device_absent
@@ -21,7 +21,7 @@ from fusiond.live.standard_error import StandardErrorHandler
 
 SOCKET = Path("/run/systemd/journal/socket")
 PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
-"""Of syslog(3)."""
+"""Priorities of syslog(3)."""
 
 
 def fields(source: str, code: str) -> dict[str, str]:
@@ -30,7 +30,7 @@ def fields(source: str, code: str) -> dict[str, str]:
 
 
 class JournalHandler(logging.Handler):
-    """Writes to the journal and never waits for it: what it does not take is counted in `lost`."""
+    """Handler that writes to the journal without waiting; refused entries are counted in `lost`."""
 
     def __init__(self, path: Path = SOCKET) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class JournalHandler(logging.Handler):
 
 
 def _field(name: str, value: str) -> bytes:
-    """NAME=value; what has several lines has its length in front."""
+    """Encode NAME=value; a value of several lines is preceded by its length."""
     data = value.encode(errors="replace")
     if b"\n" in data:
         return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
@@ -70,8 +70,8 @@ def _field(name: str, value: str) -> bytes:
 
 
 def handler(environ: Mapping[str, str] = os.environ) -> logging.Handler:
-    """For the journal where standard error goes there (JOURNAL_STREAM, systemd.exec(5)), else for
-    standard error; of one cause it takes a few lines a minute."""
+    """Log handler for the journal where standard error goes there (JOURNAL_STREAM,
+    systemd.exec(5)), else for standard error; limited to a few lines a minute of one cause."""
     found = _handler(environ)
     found.addFilter(LogLimit())
     return found

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 MOST = 4
-"""Records of one cause in a window, and one more that says that others are left out: ten in any
-minute at most, however it lies over two windows."""
+"""Most records of one cause in a window, besides one that reports the omission: ten in any minute,
+across two windows."""
 WINDOW_S = 60.0
 CAUSES = 512
 """Remembered at once; those that have been silent longest are forgotten first."""

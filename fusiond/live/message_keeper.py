@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.messaging import Messaging
 from fusiond.live.state_keeper import state_file
@@ -33,7 +33,7 @@ log = logging.getLogger("fusiond")
 
 
 class MessageKeeper:
-    """Keeps one vehicle's messages beside its saved state, where that is kept.
+    """Store of one vehicle's messages, beside its saved state, if that is configured.
 
     `on_event(code, text)` hears `messages_damaged`, and `messages_not_kept` once a row of failures.
     """
@@ -54,8 +54,8 @@ class MessageKeeper:
         self._working: asyncio.Task[None] | None = None
 
     def load(self, messaging: Messaging) -> str | None:
-        """Let messages go on from what the last run kept, aged by the time since; that in JSON,
-        None where there is nothing."""
+        """Restore the last run's messages, aged by the time since; the stored JSON, None without
+        one."""
         if self._path is None or not os.path.lexists(self._path):
             return None
         from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
@@ -78,7 +78,7 @@ class MessageKeeper:
         return KEPT_MESSAGES.dump_json(kept).decode()
 
     def keep(self, t_ns: int, messaging: Messaging) -> None:
-        """Write what has changed, unless a write is under way; at every tick."""
+        """Write changes, unless a write is pending; called every tick."""
         busy = self._working is not None and not self._working.done()
         if self._path is None or busy or messaging.revision == self._written:
             return
@@ -86,7 +86,7 @@ class MessageKeeper:
         self._working = asyncio.create_task(self._write(self._path, revision, text))
 
     async def kept(self, revision: int, messaging: Messaging) -> str:
-        """Wait until this revision is on disk; "" or why it is not."""
+        """Wait until this revision is on disk; "" or the reason of failure."""
         if self._path is None:
             return "not kept over a restart: no state_file"
         while self._written < revision and not self._error:
@@ -96,7 +96,7 @@ class MessageKeeper:
         return self._error and f"not kept on disk: {self._error}"
 
     async def close(self, t_ns: int, messaging: Messaging) -> None:
-        """Keep the last state, after what is under way has ended."""
+        """Write the last state, after a pending write has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])
         if self._path is not None and messaging.revision != self._written:
@@ -119,7 +119,7 @@ def _aged(box: KeptBox, passed_s: float) -> KeptBox:
 
 
 def _text(kept: KeptMessages) -> bytes:
-    """As JSON, with as many of those that nobody was told as a state file has room for."""
+    """Encode as JSON, with as many unreported messages as the state file has room for."""
     from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
 
     text = KEPT_MESSAGES.dump_json(kept)

@@ -20,7 +20,7 @@ from drivers.rdss.mail import (
     MessageStage,
 )
 from drivers.rdss.report import DAY_S, PositionReport
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Solution
@@ -39,7 +39,7 @@ MOST_UNCONFIRMED = 40
 MOST_CARDS = 256
 """Retained topics at the broker, one each; a command terminal lists 100 (ICXX)."""
 AHEAD_NS = 60 * SECOND_NS
-"""A report that is younger than we are, by more than clocks differ, is of the day before."""
+"""Lead over our clock from which a report is of the day before."""
 
 
 class Messaging:
@@ -103,7 +103,7 @@ class Messaging:
             self._report_due = code
 
     def tick(self, t_ns: int, solution: Solution) -> None:
-        """Report the solution, if that is due and there is one."""
+        """Send a position report, if due and a solution exists."""
         if self._options.card is None:
             return
         if self._interval is not None and self._interval.due(t_ns):
@@ -125,7 +125,7 @@ class Messaging:
                 self._on_event("position_reports", "report_refused", str(error))
 
     def _report(self, solution: Solution) -> PositionReport | None:
-        """None while place or time is not known."""
+        """Position report of a solution; None without position or time."""
         utc_ns = self._clock.utc_ns(solution.t_ns)
         if utc_ns is None or not (isfinite(solution.lat_rad) and isfinite(solution.lon_rad)):
             return None
@@ -196,13 +196,13 @@ class Messaging:
             yield self._waiting.popleft()
 
     def confirm(self, message: object) -> None:
-        """A broker has confirmed a message, or there is none to tell."""
+        """Note that a broker has confirmed a message, or that none exists."""
         if isinstance(message, ShortMessage) and message.serial in self._unconfirmed:
             del self._unconfirmed[message.serial]
             self.revision += 1
 
     def state(self, t_ns: int) -> KeptMessages:
-        """All that has to outlive the process."""
+        """State that must outlive the process."""
         from fusiond.live.stored_messages import KeptMessages, kept_box  # noqa: PLC0415
 
         utc_ns = self._clock.utc_ns(t_ns)
@@ -214,7 +214,7 @@ class Messaging:
         )
 
     def resume(self, kept: KeptMessages) -> None:
-        """Go on from what the run before has kept, at the instant when that was taken up."""
+        """Resume with the last run's state, as of the instant of its restore."""
         from fusiond.live.stored_messages import restore  # noqa: PLC0415
 
         t_ns = kept.taken_up_ns or 0

@@ -1,10 +1,10 @@
-"""Commands of the operator, and how they are carried out."""
+"""Execution of the operator's commands."""
 
 from __future__ import annotations
 
 import math
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.live.injection import Injection
 from fusiond.live.messaging import Messaging
 from fusiond.live.sources import Sources
@@ -24,7 +24,7 @@ EARTH_RADIUS_M = 6.371e6  # mean; the distance is told to people
 
 
 class Operator:
-    """Carries out the commands of `outputs.commands`, whichever way they come in."""
+    """Executor of the commands of `outputs.commands`, from any input."""
 
     def __init__(
         self, navigator: Navigator, sources: Sources, injection: Injection, messaging: Messaging
@@ -94,7 +94,8 @@ class Operator:
 
 
 def distance_m(lat_a: float, lon_a: float, lat_b: float, lon_b: float) -> float:
-    """Distance (m) between two places (rad) on a sphere, to half a percent: haversine formula."""
+    """Distance (m) between two positions (rad) on a sphere, to half a percent: haversine
+    formula."""
     across = math.cos(lat_a) * math.cos(lat_b) * math.sin(0.5 * (lon_b - lon_a)) ** 2
     chord = math.sin(0.5 * (lat_b - lat_a)) ** 2 + across
     return 2.0 * EARTH_RADIUS_M * math.asin(math.sqrt(min(1.0, chord)))

@@ -11,14 +11,14 @@ from fusiond.outputs.base import Output
 
 
 class OutputTasks:
-    """`on_event(source, code, text)` hears of an output that failed and is started again."""
+    """Tasks of the outputs. `on_event(source, code, text)` receives failures and restarts."""
 
     def __init__(self, on_event: Callable[[str, str, str], None]) -> None:
         self._on_event = on_event
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def start(self, outputs: Mapping[str, Output]) -> None:
-        """Start a task for each output that has none."""
+        """Start a task for each output without one."""
         for name, output in outputs.items():
             if name not in self._tasks:
                 fell = partial(self._on_event, name, "output_fault")

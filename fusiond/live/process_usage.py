@@ -1,4 +1,4 @@
-"""Resources of this process, and memory that it can release."""
+"""Resources of this process, and release of unused memory."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ STATM, SMAPS = Path("/proc/self/statm"), Path("/proc/self/smaps")
 
 
 class ProcessUsage:
-    """CPU and memory of this process: `sample()` gives percent of one core since the last call
-    and resident memory in MB (10^6 bytes), None where the kernel does not show it."""
+    """CPU and memory of this process: `sample()` gives percent of one core since the last call and
+    resident memory in MB (10^6 bytes), None where the kernel does not show it."""
 
     def __init__(self) -> None:
         self._page_bytes = os.sysconf("SC_PAGESIZE")
@@ -40,8 +40,8 @@ _M_ARENA_MAX = -8
 
 
 def share_one_heap() -> None:
-    """Let all threads allocate from one heap, before there are any: each of glibc's own keeps a
-    megabyte and more for a thread that writes ten times a second (mallopt(3), M_ARENA_MAX)."""
+    """Limit glibc to one heap for all threads, before any starts: further ones cost a megabyte or
+    more each for a thread that writes ten times a second (mallopt(3), M_ARENA_MAX)."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
@@ -65,9 +65,8 @@ def widen_descriptor_table() -> None:
 
 
 def release_start_memory() -> None:
-    """Let go of what the start alone needed: pages of libraries, among them LLVM's, 45 MB, once it
-    has loaded the kernels and is called no more, and 13 MB of the others; bitcode, 7 MB; freed
-    memory, 1 MB.
+    """Release memory that only the start needed: pages of libraries, among them LLVM's, 45 MB,
+    unused once the kernels are loaded, and 13 MB of others; bitcode, 7 MB; freed memory, 1 MB.
 
     madvise(2), MADV_DONTNEED: pages of a mapping that nobody wrote to are clean copies of the
     file, and those that are used are read again. malloc_trim(3) is glibc's.
@@ -82,7 +81,7 @@ def release_start_memory() -> None:
 
 
 def _clean_mappings() -> Iterator[tuple[int, int]]:
-    """First and last address of read-only mappings of libraries without a written page.
+    """Addresses of read-only mappings of libraries without a written page.
 
     The linker writes to a page when it resolves addresses; the file has no copy of that."""
     try:

@@ -32,7 +32,7 @@ from fusiond.outputs.topics import (
     TRACKER,
     Topic,
 )
-from fusiond.outputs.tracking import Tracking
+from fusiond.outputs.tracker_schedule import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.
@@ -44,7 +44,7 @@ Make = Callable[[int, int | None], tuple[Topic, Message] | None]
 
 
 class Publishing:
-    """Makes a vehicle's messages in the tick and hands them to every output, which keeps them."""
+    """Builder of a vehicle's messages in the tick, which hands them to every output."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Publishing:
         self.serve(config, outputs)
 
     def serve(self, config: Config, outputs: Mapping[str, Output]) -> None:
-        """From now on by this configuration, to these outputs."""
+        """Switch to this configuration and these outputs."""
         self._outputs = outputs
         self._digest = config_digest(config)
         self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
@@ -82,7 +82,7 @@ class Publishing:
         self._calibrated: tuple[CalibrationState, ...] = ()
 
     def tick(self, t_ns: int, solution: Solution) -> None:
-        """Publish what is due at the tick of `t_ns`, the status at every change of mode too.
+        """Publish the messages due at the tick of `t_ns`, and the status at every change of mode.
 
         The large messages of a second are made and go out a tick each, in ticks that have half of
         their period left: the filter may have gone back for a late fix, and a broker hands a

@@ -22,20 +22,21 @@ MQTT = "mqtt"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """`config` is what holds from now on. Keys with dots: `taken`, and those of `restart`."""
+    """Result of a reload: `config` is valid from now on. Dotted keys: those `taken`, and those that
+    need a `restart`."""
 
     config: Config
     taken: tuple[str, ...]
     restart: tuple[str, ...]
     outputs: frozenset[str]
-    """Those that are made anew, are new or are no more."""
+    """Outputs that are changed, new or removed."""
     gates: Mapping[str, float]
     """New gate probability, by section of `aiding`."""
 
 
 def difference(running: Config, read: Config) -> Difference:
-    """Between what the daemon runs by and what was read. Raises `ConfigError` where what can be
-    taken does not go with what needs a restart."""
+    """Compare the running configuration with the file. Raises `ConfigError` where accepted changes
+    conflict with those that need a restart."""
     before, after = dict(_flat(running.model_dump())), dict(_flat(read.model_dump()))
     changed = sorted(
         key

@@ -15,7 +15,7 @@ from fusiond.navigator.warm_start import WarmStart
 
 @dataclass(frozen=True, slots=True)
 class RestoredState:
-    """None where there was nothing that could be used."""
+    """State restored from disk; None where nothing was usable."""
 
     saved: SavedState | None = None
     warm: KeptState | None = None

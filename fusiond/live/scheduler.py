@@ -42,7 +42,7 @@ class Every:
 
 
 class LatencyHistogram:
-    """Lateness in fixed log-spaced bins, ten a decade from 10 us to 10 s; constant memory."""
+    """Histogram of latency in fixed log-spaced bins, ten a decade from 10 us to 10 s."""
 
     def __init__(self) -> None:
         self.bins = [0] * _BINS
@@ -60,7 +60,7 @@ class LatencyHistogram:
         self.sum_ns += lateness_ns
 
     def quantile_ms(self, p: float) -> float:
-        """Upper edge of the bin that holds the quantile (at most 26 % high), in ms; 0 if empty."""
+        """Upper edge (ms) of the bin with the quantile, at most 26 % high; 0 if empty."""
         wanted = p * self.count
         seen = 0
         for index, n in enumerate(self.bins):

@@ -29,7 +29,7 @@ class ServiceManager:
 
     @property
     def watchdog_s(self) -> float | None:
-        """The watchdog's period (WATCHDOG_USEC), None where it is off or not meant for us."""
+        """Watchdog period (WATCHDOG_USEC); None if off or for another process."""
         return None if self._watchdog_ns is None else self._watchdog_ns / 1e9
 
     def _send(self, state: str) -> None:
@@ -45,7 +45,7 @@ class ServiceManager:
         self._send("READY=1" + (f"\nSTATUS={_one_line(status)}" if status else ""))
 
     def status(self, text: str) -> None:
-        """One sentence for `systemctl status`."""
+        """Send a sentence for `systemctl status`."""
         self._send(f"STATUS={_one_line(text)}")
 
     def reloading(self) -> None:
@@ -53,7 +53,7 @@ class ServiceManager:
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """Shutdown has begun."""
+        """Report the start of the shutdown."""
         self._send("STOPPING=1")
 
     def feed_watchdog(self, t_ns: int) -> None:

@@ -22,8 +22,8 @@ from drivers.measurements import DeviceEvent, Height, ImuSample, Measurement, Ti
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from drivers.rdss.mail import Mail
 from drivers.standard_atmosphere import standard_pressure_pa
-from fusiond.clock.clock import Clock
 from fusiond.clock.results import Instant
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
@@ -45,7 +45,7 @@ EventSink = Callable[[str, str, str], None]
 
 
 class Source:
-    """One device: its driver and what came of its measurements."""
+    """Device: its driver and the outcomes of its measurements."""
 
     def __init__(self, name: str, driver: Any) -> None:
         self.name = name
@@ -57,7 +57,7 @@ class Source:
 
 
 class Sources:
-    """All devices of a configuration. `on_event(source, code, text)` hears what they report."""
+    """Devices of a configuration. `on_event(source, code, text)` receives their reports."""
 
     def __init__(
         self,
@@ -75,9 +75,9 @@ class Sources:
         clock.on_event = lambda code, text: on_event("clock", code, text)
         self.imu = ImuChoice(config.imu, on_event)
         self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
-        """Hears every measurement with its instant."""
+        """Callback with every measurement and its instant."""
         self.on_mail: Callable[[Mail], None] = lambda mail: None
-        """Hears of short messages."""
+        """Callback with short messages."""
         self.all: dict[str, Source] = {}
         self._polls: list[Callable[[], None]] = []
         points = driver_entry_points()
@@ -116,7 +116,7 @@ class Sources:
             poll()
 
     def release(self, t_ns: int) -> None:
-        """Take in what an injected delay has held back until the tick at `t_ns`."""
+        """Accept measurements of an injected delay that are due by the tick at `t_ns`."""
         for item in self._injection.tick(t_ns):
             self._receive(item)
 
@@ -170,7 +170,7 @@ class Sources:
         return {name: inputs for name, inputs in found.items() if inputs is not None}
 
     def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Tell the terminals that can use it the height of their antenna by the solution.
+        """Send the antenna's height in the solution to the terminals that use it.
 
         Of the lever arm only its upward part counts: tilt moves a roof antenna by centimetres.
         """
@@ -183,7 +183,7 @@ class Sources:
                 hint(height_m - down, sd_m, t_ns, centre_sd_m)
 
     def _pressure_hint(self, barometer: Height) -> None:
-        """Tell the terminals that can use it the pressure that a barometer's height stands for."""
+        """Send the pressure of a barometer's height to the terminals that use it."""
         for source in self.all.values():
             hint = getattr(source.driver, "pressure_hint", None)
             if hint is not None:
@@ -195,8 +195,8 @@ class Sources:
         return [ask(t_ns) for ask in asks if ask is not None]
 
     def faults(self, now_ns: int) -> tuple[FaultReport, ...]:
-        """Of the whole vehicle, the inertial unit's under the name of the one that is used; the
-        latest at the end."""
+        """Faults of the vehicle, those of the inertial unit under the name of the one in use; the
+        latest last."""
         return tuple(
             fault_report(f.finding, f.finding.kind.device or self.imu.used or "imu", now_ns)
             for f in self._navigator.service.faults(now_ns)

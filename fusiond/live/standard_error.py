@@ -14,14 +14,14 @@ from collections import deque
 from typing import TextIO
 
 MOST_LINES = 1000
-"""Lines that may wait, tracebacks among them: a minute of a hundred causes (`LogLimit`)."""
+"""Most waiting lines, tracebacks included: a minute of a hundred causes (`LogLimit`)."""
 FAREWELL_S = 1.0
-"""Time for the last lines at the end, a fifth of what systemd allows a stop."""
+"""Time for the last lines at the end, a fifth of systemd's stop timeout."""
 
 
 class StandardErrorHandler(logging.StreamHandler[TextIO]):
-    """Writes at once until `begin_thread`, so that processes can be forked before it. `lost` counts
-    lines since the last that was taken, which says how many."""
+    """Handler that writes directly until `begin_thread`, so that processes can be forked before it.
+    `lost` counts lines since the last accepted one, which states the number."""
 
     def __init__(self) -> None:
         super().__init__(sys.stderr)
@@ -33,7 +33,7 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
         self._thread: threading.Thread | None = None
 
     def begin_thread(self) -> None:
-        """From now on nobody who logs waits."""
+        """Start the writer thread; logging no longer waits."""
         self._thread = threading.Thread(target=self._write_waiting, name="log", daemon=True)
         self._thread.start()
 
@@ -51,12 +51,12 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
         self._news.set()
 
     def flush(self) -> None:
-        """Write what waits, as far as it is taken."""
+        """Write waiting lines as far as accepted."""
         if self._thread is None:
             super().flush()
 
     def close(self) -> None:
-        """Write what waits, a second at most; later lines are written at once."""
+        """Write waiting lines for at most a second; later lines are written directly."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._ending = True
@@ -65,8 +65,8 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
         super().close()
 
     def _write_waiting(self) -> None:
-        """By the descriptor: what is stuck in a write would hold the lock of Python's own buffer,
-        which the interpreter takes at its end."""
+        """Write to the descriptor: a blocked write through Python's buffer would hold its lock,
+        which the interpreter takes at exit."""
         descriptor = self.stream.fileno()
         while True:
             self._news.wait()

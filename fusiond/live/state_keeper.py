@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
@@ -33,7 +33,7 @@ FORGET_SPEED_M_S = 1.0
 
 
 class StateKeeper:
-    """Keeps one vehicle's state in `state_file`, else in systemd's state directory, else not.
+    """Store of one vehicle's state in `state_file`, else in systemd's state directory, else none.
 
     Files are written and removed in a thread: a tick never waits for a disk. One that cannot be
     is told in the log. `on_event(code, text)` hears `saved_state_damaged` and
@@ -56,7 +56,7 @@ class StateKeeper:
         self._save = Every(SAVE_EVERY_S * SECOND_NS)
 
     def load(self) -> SavedState | None:
-        """The state of the last run, None if there is none that can be used."""
+        """State of the last run; None without a usable one."""
         if self._path is None:
             return None
         utc_ns = self._clock.utc_ns(self._clock.now_ns())
@@ -88,7 +88,7 @@ class StateKeeper:
             self._working = asyncio.create_task(asyncio.to_thread(_remove, self._path))
 
     async def close(self, solution: Solution | None, *, confirmed: bool) -> None:
-        """Keep the last solution, after what is under way has ended."""
+        """Write the last solution, after a pending write has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])
         state = None if solution is None else self._state(solution, confirmed)
@@ -117,7 +117,7 @@ class StateKeeper:
 
 
 def _speed_m_s(solution: Solution) -> float:
-    """NaN where nothing is navigated."""
+    """Speed of the solution; NaN without navigation."""
     if solution.mode not in (Mode.NAVIGATING, Mode.COASTING):
         return math.nan
     return math.hypot(*solution.v_ned_m_s)

@@ -1,4 +1,4 @@
-"""Short messages as they are kept over a restart: those that wait, and those that nobody was told.
+"""Stored short messages: those that wait, and received ones not yet published.
 
 Instants are ages: a monotonic clock may start anew.
 """
@@ -25,7 +25,7 @@ Natural = Annotated[int, Field(ge=0, le=2**62)]
 
 @dataclass(frozen=True, slots=True)
 class KeptWording:
-    """A `Wording` with its bytes in hex."""
+    """`Wording` with its bytes in hex."""
 
     payload: Hex
     encoding: TextEncoding
@@ -61,8 +61,8 @@ class KeptBox:
 
 @dataclass(frozen=True, slots=True)
 class KeptMessages:
-    """By terminal; `untold` are messages that no broker has confirmed. `utc_s` is when it was
-    written, None where that was not known; `taken_up_ns` when a start took it up."""
+    """Stored messages by terminal; `untold` are those that no broker has confirmed. `utc_s` is the
+    instant of writing, None if unknown; `taken_up_ns` that of the restore."""
 
     serial: Natural
     boxes: dict[str, KeptBox]
@@ -75,7 +75,7 @@ KEPT_MESSAGES = TypeAdapter(KeptMessages)
 
 
 def kept_box(outbox: Outbox, inbox: Inbox, t_ns: int) -> KeptBox:
-    """A terminal's messages as they are at `t_ns`."""
+    """Messages of a terminal at `t_ns`, for storage."""
     return KeptBox(
         outbox.number,
         tuple(_kept(m, t_ns) for m in outbox.waiting),
@@ -104,7 +104,7 @@ def _kept(m: Outgoing, t_ns: int) -> KeptMessage:
 
 
 def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
-    """Restore the wait for receipts, at the most as long as the first time again."""
+    """Restore waits for receipts, each at most as long as a new one."""
     wordings = tuple(Wording(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings)
     return Outgoing(
         kept.key,

@@ -1,4 +1,4 @@
-"""Supervision: a fault of one part costs that part, for a while, never the daemon."""
+"""Supervision of parts: a failed part is restarted after a delay, the daemon continues."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from fusiond.clock.clock import Clock
-from fusiond.clock.utc_envelope import UtcKnown
+from fusiond.clock.stamp_mapping import Clock
+from fusiond.clock.utc_from_arrivals import UtcKnown
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
@@ -86,8 +86,7 @@ class WarmKeeper:
         """State offered to the navigator."""
 
     def restore_into(self, navigator: Navigator) -> None:
-        """Let clock and navigator go on from the state of the last run, if it is one of this
-        boot."""
+        """Restore the last run's clock and navigator, if the boot is the same."""
         if self._path is None:
             return
         try:
@@ -104,7 +103,7 @@ class WarmKeeper:
             self._event("warm_state_refused", f"{self._path}: {error}")
 
     def keep(self, t_ns: int, solution: Solution, navigator: Navigator) -> None:
-        """Renew the file, if it is due and the solution is worth it."""
+        """Write the file when due, if the solution is good enough."""
         busy = self._working is not None and not self._working.done()
         if self._path is None or busy or not self._due.due(t_ns):
             return
@@ -113,7 +112,7 @@ class WarmKeeper:
             self._working = asyncio.create_task(asyncio.to_thread(self._write, self._path, state))
 
     async def close(self, solution: Solution | None, navigator: Navigator) -> None:
-        """Keep the last state, after what is under way has ended: `restart` is a gap, too."""
+        """Write the last state, after a pending write has ended; a `restart` is a gap, too."""
         if self._working is not None:
             await asyncio.wait([self._working])
         state = None if solution is None else self.state(solution, navigator)
@@ -121,8 +120,8 @@ class WarmKeeper:
             await asyncio.to_thread(self._write, self._path, state)
 
     def state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
-        """The state as it is, None where it is not worth keeping: axes and biases of a spare are
-        none of the unit that the next run begins with."""
+        """Present state; None if not worth storing. Axes and biases of a spare do not fit the unit
+        of the next run's start."""
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
             return None
@@ -153,14 +152,14 @@ class WarmKeeper:
             self._report(f"warm state not kept: {error}")
 
     def _report(self, text: str) -> None:
-        """Once a row of failures: it would be twice a second."""
+        """Report a failed write, once a series; it would repeat twice a second."""
         if not self._failing:
             self._failing = True
             log.warning("%s", text)
 
 
 def _boot_id() -> str:
-    """Identifier of this boot; empty where the kernel does not say."""
+    """Identifier of this boot; empty where the kernel hides it."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:
@@ -168,7 +167,7 @@ def _boot_id() -> str:
 
 
 def _asleep_ns() -> int:
-    """Time that this boot has been suspended, ns: a monotonic clock that stood still."""
+    """Suspended time of this boot (ns), during which the monotonic clock stood still."""
     asleep = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(
         time.CLOCK_MONOTONIC
     )

@@ -19,11 +19,11 @@ from fusiond.navigation.error_model import FORCE_ERROR, FORCE_SCALE, RATE_ERROR,
 
 CLOCK_OFFSET, CLOCK_DRIFT = "clock_offset", "clock_drift"
 CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
-"""Place of an antenna (ECEF, m) at the epoch from which carriers are counted, and how much their
-clock has gone since (m): fusiond.aiding.carrier_anchor."""
+"""Antenna position (ECEF, m) at the epoch from which carriers are counted, and the carriers' clock
+since (m): fusiond.aiding.carrier_anchor."""
 CARRIER_WALK = 0.002**2
-"""Walk of all carriers beside their models (m^2/s), as fusiond.gnss.range_kernel has of each; a sky
-makes about as much a displacement of it as a satellite has at the zenith."""
+"""Random walk of all carriers beside their models (m^2/s), as in fusiond.gnss.range_kernel for
+each; the displacement error of a sky is about that of one satellite at the zenith."""
 SAR_MISALIGNMENT = "sar_misalignment"
 # One sigma (rad) of how a SAR antenna is mounted where nothing else says it: 0.1 deg, about what
 # paper 002's accuracy needs and a mechanical alignment keeps.
@@ -135,7 +135,8 @@ def position_bias(name: str, sd_m: float, tau_s: float, axes: str = "ne") -> Blo
 
 
 def shared_error(name: str, unit: str, sd: float, tau_s: float) -> Block:
-    """One state that some measurements share, a first-order Gauss-Markov process or a constant."""
+    """State of an error that several measurements share: a first-order Gauss-Markov process or a
+    constant."""
     steady = 0.0 if math.isinf(tau_s) else sd
     return Block(name, unit, (name,), (-1,), initial=sd, steady=steady, tau_s=tau_s)
 
@@ -169,7 +170,7 @@ def clock_blocks(
 
 
 def carrier_blocks(noise: ClockNoise) -> list[Block]:
-    """Anchor of carriers, and their clock, which goes as those of the codes do."""
+    """Carrier anchor and carrier clock, which drifts with the code clock."""
     columns = (-1, -1, -1)
     return [
         Block(CARRIER_ANCHOR, "m", ("x", "y", "z"), columns, initial=1.0, white=CARRIER_WALK),
@@ -183,7 +184,7 @@ def carrier_blocks(noise: ClockNoise) -> list[Block]:
 
 
 def misalignment(name: str, sd_rad: float, tau_s: float = math.inf) -> Block:
-    """Small angles x, y, z (rad) of a sensor's mounting, one sigma each; Markov where tau ends."""
+    """Misalignment angles x, y, z (rad) of a sensor, one sigma each; Markov where tau is finite."""
     steady = 0.0 if math.isinf(tau_s) else sd_rad
     return Block(
         name, "rad", ("x", "y", "z"), (-1, -1, -1), initial=sd_rad, steady=steady, tau_s=tau_s

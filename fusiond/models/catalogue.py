@@ -27,7 +27,7 @@ from fusiond.navigation.error_model import FORCE_ERROR
 
 
 def make_model(name: str, noise: ImuNoise, *extra: Block) -> Model:
-    """One of the shipped models, with an IMU's noise and further blocks.
+    """Shipped model by name, with an IMU's noise and further blocks.
 
     A further block takes the place of the model's own of the same name. KeyError for a name that
     is not one of MODELS.
@@ -51,9 +51,9 @@ def _gyro_markov(noise: ImuNoise, initial: float) -> Block:
 
 
 def _walking_biases(noise: ImuNoise) -> list[Block]:
-    """One state an axis for turn-on bias and its Markov part: a random walk that grows as the
-    Markov process does while t << tau (variance 2 s^2 t / tau), and faster, so never too sure,
-    later."""
+    """Bias of an axis as one state: turn-on bias and its Markov part. A random walk grows as the
+    Markov process while t << tau (variance 2 s^2 t / tau), and faster later, so its sigma is never
+    too small."""
     rate, force, tau = (
         noise.rate_bias_instability,
         noise.force_bias_instability,

@@ -1,4 +1,4 @@
-r"""The model of a vehicle without an inertial unit: it goes on as it goes, but for white noise.
+r"""Constant-velocity model with white acceleration noise, for a vehicle without an inertial unit.
 
     dr' = dv,   dv' = w,   w white with the density q = 2 s^2 tau
 
@@ -22,8 +22,8 @@ NAME = "constant_velocity"
 
 
 def constant_velocity(manoeuvre: tuple[float, float, float], extra: Sequence[Block] = ()) -> Model:
-    """The model with acceleration sigmas (m/s^2), horizontal and vertical, that last for a time (s)
-    and the further blocks of its measurements."""
+    """Model with acceleration sigmas (m/s^2), horizontal and vertical, of a correlation time (s),
+    and further blocks of its measurements."""
     level, vertical, lasts_s = manoeuvre
     return Model(
         NAME,

@@ -48,8 +48,8 @@ def tilt_memory_s(noise: ImuNoise) -> float:
 
 
 def density_of(initial: float, steady: float, tau_s: float, interval_s: float) -> float:
-    """q(T) of the module's text, for sigmas `initial` of the constant and `steady` of the Markov
-    part; their unit squared times seconds."""
+    """Density q(T) of the module's text, for sigmas `initial` of the constant and `steady` of the
+    Markov part; their unit squared times seconds."""
     if interval_s == 0.0:
         return 0.0
     x = interval_s / tau_s

@@ -47,8 +47,8 @@ class Model:
     blocks: tuple[Block, ...]
     hold_height: bool = False
     force_left_out: float = 0.0
-    """One sigma (m/s^2) of an accelerometer's bias that the model has no state for: a level that is
-    found by gravity is wrong by that."""
+    """One sigma (m/s^2) of an accelerometer bias without a state: levelling by gravity is wrong by
+    it."""
     size: int = field(init=False)
     width: int = field(init=False)
     active: NDArray[np.bool_] = field(init=False)
@@ -117,26 +117,23 @@ class Model:
         return self._slots_by_name.get(block, [])
 
     def slots_of_all(self, blocks: tuple[str, ...]) -> Indices:
-        """The slots of blocks one after another (k,), as kernels take them; not to be written."""
+        """Slots of blocks in sequence (k,), as kernels take them; read-only."""
         return self.indices[blocks]
 
     @cached_property
     def indices(self) -> _Indices:
-        """By the name of a block or by several names, `slots_of_all` of them: what measurements ask
-        at each of their instants."""
+        """Slots by name or names of blocks, cached since measurements need them at each instant."""
         return _Indices(self)
 
     @cached_property
     def listed(self) -> dict[tuple[str | tuple[str, ...], ...], tuple[int, ...]]:
-        """Slots as a packed row of numbers has them, by the names of blocks: what `list_slots` has
-        found."""
+        """Slots by names of blocks, as a packed row holds them, from `list_slots`."""
         return {}
 
     def list_slots(
         self, names: tuple[str | tuple[str, ...], ...], most: tuple[int, ...]
     ) -> tuple[int, ...]:
-        """Of each of some lists of blocks the number of slots, at `most` so many, and the slots,
-        with zeros up to as many."""
+        """Number and slots of each list of blocks, at most `most`, padded with zeros."""
         found: list[int] = []
         for blocks, count in zip(names, most, strict=True):
             slots = self.indices[blocks].tolist()[:count]
@@ -153,8 +150,8 @@ class Model:
         return found
 
     def slots_or_missing(self, *blocks: tuple[str, int]) -> Indices:
-        """The slots of blocks (name, states) one after another (k,), as kernels take them; -1 for
-        each state of a block that the model has not."""
+        """Slots of blocks (name, states) in sequence (k,), as kernels take them; -1 for a state
+        that the model lacks."""
         found = self._or_missing.get(blocks)
         if found is None:
             slots = [slot for name, n in blocks for slot in self.slots_of(name) or [-1] * n]
@@ -171,8 +168,8 @@ class Model:
 
     @cached_property
     def packed(self) -> Array:
-        """`noise`, `sensor_terms`, `rate_terms` and `active` one after another in whole doubles,
-        which a kernel finds in an array with all else."""
+        """Arrays `noise`, `sensor_terms`, `rate_terms` and `active` in sequence as doubles, for
+        kernels."""
         active = np.zeros(-(-self.size // 8) * 8, dtype=np.bool_)
         active[: self.size] = self.active
         parts = (self.noise, self.sensor_terms, self.rate_terms, active)
@@ -180,8 +177,7 @@ class Model:
 
     @cached_property
     def stated(self) -> NDArray[np.bool_]:
-        """(9,): whether position, velocity (n, e, d), roll, pitch, yaw are estimated at all, and
-        not held."""
+        """Flags (9,): position, velocity (n, e, d), roll, pitch, yaw are estimated, not held."""
         return np.concatenate((self.active[6:9], self.active[3:6], self.active[:3]))
 
     @cached_property
@@ -195,8 +191,8 @@ class Model:
 
     @cached_property
     def time_slot(self) -> int:
-        """The slot of the first receiver's offset in time, which a solution is published with; -1
-        where none is estimated."""
+        """Slot of the first receiver's offset in time, which applies to a published solution; -1
+        without one."""
         for block in self.blocks:
             if block.name.startswith(FIX_TIME):
                 return self.slots_of(block.name)[0]
@@ -225,7 +221,7 @@ class Model:
 
 
 class _Indices(dict[str | tuple[str, ...], Indices]):
-    """Slots of a model by the names of its blocks, found when they are first asked for."""
+    """Slots of a model by names of blocks, computed on first use."""
 
     def __init__(self, model: Model) -> None:
         super().__init__()

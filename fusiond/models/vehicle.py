@@ -1,4 +1,4 @@
-"""Blocks of what an owner cannot measure: how sensors sit on the vehicle, and when they speak.
+"""Blocks of unmeasured parameters of a vehicle: placement and delays of sensors.
 
 Each is a constant, or nearly one, that driving shows; what a drive does not show stays at its
 prior. The measurements that hold them say how they act (fusiond.aiding.body_velocity, position,
@@ -57,20 +57,20 @@ def wheel_scale(name: str, sd: float) -> Block:
 
 
 def wheel_rounding(name: str, sd: float) -> Block:
-    """By what share of its step a wheel's speed is too low, beside what rounding is taken to be: no
-    standard says which way whole km/h are made."""
+    """Share of a step by which a wheel's speed is low beside the assumed rounding: no standard
+    defines the rounding of km/h."""
     return _constant(name, "1", ("share",), sd)
 
 
 def time_offset(name: str, sd_s: float, skew: str = "") -> Block:
-    """Delay (s) of validity after its stamp; `skew` names the block of what that grows by."""
+    """Delay (s) of validity after its stamp; `skew` names the block of its rate."""
     walk = TIME_WALK_S_SQRT_S**2
     return Block(name, "s", ("t",), (-1,), initial=sd_s, white=walk, rate=skew)
 
 
 def clock_skew(name: str) -> Block:
-    """By how much (s/s) the offsets in time of a device grow: its clock and that of the inertial
-    unit run at two rates."""
+    """Growth (s/s) of a device's offset in time: its clock and the inertial unit's have different
+    rates."""
     return _constant(name, "1", ("rate",), CLOCK_SKEW_SD)
 
 

@@ -80,7 +80,8 @@ def judge_sensed(
     left: Array,
     rows: Array,
 ) -> None:
-    """Residuals of a guess for k velocities, in sigmas (k, 3), and their slopes (k, 3, 13).
+    """Write residuals of a guess for k velocities, in sigmas (k, 3), and their derivatives (k, 3,
+    13).
 
     The slopes are by phi, biases (6,) of force and rate, offset in time and first velocity
     (`fusiond.navigator.alignment.motion_fit`).

@@ -34,7 +34,7 @@ _STEPS = 40
 
 @lru_cache(maxsize=1024)
 def quantile(degrees: int, tail: float) -> float:
-    """Quantileof a chi-square variable of `degrees` degrees of freedom exceeded with probability
+    """Quantile of a chi-square variable of `degrees` degrees of freedom, exceeded with probability
     `tail`.
 
     Infinite for none, which is what is left of one less 1e-17. Raises ValueError for degrees below
@@ -57,7 +57,7 @@ def quantile(degrees: int, tail: float) -> float:
 
 
 def _tail(degrees: int, x: float) -> tuple[float, float]:
-    """Q(x), and its slope's magnitude."""
+    """Tail probability Q(x) and the magnitude of its derivative."""
     h = 0.5 * x
     half = 0.5 * degrees
     if degrees % 2:

@@ -1,4 +1,4 @@
-r"""Sensors whose axes are not square: what of it is noise, while the vehicle turns and speeds up.
+r"""Noise equivalent of sensor-axis non-orthogonality while the vehicle turns and accelerates.
 
     e_i = sum m_ij w_j,   d_i = sum n_ij f_j,   j other than i,   m_ij, n_ij ~ N(0, m^2)
 
@@ -42,10 +42,10 @@ Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 BEND_RAD = 0.5 * math.pi
-"""Theta: a street corner."""
+"""Angle theta: a street corner."""
 STOP_M_S, WITHIN_FIXES_M_S = 8.0, 2.0
-"""V: a stop in a street, or a corner; V': a second or two of either. With 40 m/s for V' sigma of
-a velocity is 1.3 times too large on simulated drives that were looked at."""
+"""Speeds V: a stop in a street, or a corner; V': a second or two of either. With 40 m/s for V'
+sigma of a velocity is 1.3 times too large on simulated drives that were looked at."""
 SMOOTH_S = 0.5
 """A fifth of the time that a corner takes; engine and road shake ten times faster."""
 MEAN_S = 60.0
@@ -63,8 +63,8 @@ def _follow(
     mean: Array,
     out: Array,
 ) -> None:
-    """Add to `out` (m, 6) the density after each of `samples` (m, 6); `mean` (13,) goes on from
-    call to call: smoothed rates and forces, their means, and of how many samples they are."""
+    """Add to `out` (m, 6) the density after each of `samples` (m, 6). `mean` (13,) persists from
+    call to call: smoothed rates and forces, their means, and the number of samples."""
     for i in range(samples.shape[0]):
         mean[12] += 1.0
         fast, slow = max(gain, 1.0 / mean[12]), max(slow_gain, 1.0 / mean[12])
@@ -104,7 +104,7 @@ class Crosstalk:
         )
         self._mean = np.zeros(13)
         self.squares = FromInstants()
-        """Factor (1,) of m^2 as the unit has shown it (fusiond.navigator.unit_grade)."""
+        """Factor (1,) of m^2 as estimated for the unit (fusiond.navigator.unit_grade)."""
 
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
         """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) at `times`

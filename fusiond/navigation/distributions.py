@@ -1,4 +1,4 @@
-r"""Tails and quantiles of the laws that gates, verdicts and protection levels ask for.
+r"""Tails and quantiles of distributions for gates, verdicts and protection levels.
 
 Gamma law of shape a and scale 1, P(a, x) + Q(a, x) = 1, with delta = x/a - 1:
 
@@ -44,16 +44,16 @@ _STANDARD = NormalDist()
 
 
 def gaussian_quantile(p: float) -> float:
-    """Quantile of a Gaussian variable of variance one below which it stays with probability `p`;
-    infinite at 0 and 1, NaN for what is no probability."""
+    """Quantile of a unit Gaussian variable for the probability `p`; infinite at 0 and 1, NaN
+    outside."""
     if 0.0 < p < 1.0:
         return _STANDARD.inv_cdf(p)
     return {0.0: -math.inf, 1.0: math.inf}.get(p, math.nan)
 
 
 def median(values: NDArray[np.float64]) -> float:
-    """Of values (n,), one at least; nan where one is. numpy's own, to be sure that these are no
-    masked ones, imports all of those: as long as a start takes to link twenty kernels."""
+    """Median of values (n,), n > 0; nan if one is. numpy's own imports masked arrays to exclude
+    them, which takes as long as linking twenty kernels at the start."""
     low, high = (len(values) - 1) // 2, len(values) // 2
     ordered = np.partition(values, (low, high, -1))
     return float(ordered[-1] if np.isnan(ordered[-1]) else 0.5 * (ordered[low] + ordered[high]))
@@ -94,18 +94,19 @@ def gamma_quantile(shape: float, p: float, upper: bool = False) -> float:
 
 
 def f_tail(d: float, n: float, x: float) -> float:
-    """The probability of more than `x` under the F law of `d` and `n` degrees of freedom."""
+    """Probability of more than `x` under the F law of `d` and `n` degrees of freedom."""
     return _f_tails(d, n, x)[1]
 
 
 def f_quantile(d: float, n: float, upper: float) -> float:
-    """Quantile of the F law of `d` and `n` degrees of freedom exceeded with probability `upper`."""
+    """Quantile of the F law of `d` and `n` degrees of freedom, exceeded with probability
+    `upper`."""
     return _quantile(lambda x: _f_tails(d, n, x), upper, True, 1.0)
 
 
 def noncentrality(x: float, degrees: int, lower: float) -> float:
-    """lambda for which a noncentral chi-square variable stays below `x` with probability `lower`;
-    0 where it does so more seldom without any."""
+    """Noncentrality lambda for which a noncentral chi-square variable stays below `x` with
+    probability `lower`; 0 if the central one does so more seldom."""
 
     def tails(shift: float) -> tuple[float, float, float]:
         # In the shift what lies below becomes less: its complement has the places of P and Q.
@@ -118,7 +119,7 @@ def noncentrality(x: float, degrees: int, lower: float) -> float:
 
 
 def _ahead(shape: float, x: float) -> float:
-    """D."""
+    """Factor D."""
     if shape < _STIRLING_FROM:
         return math.exp(shape * math.log(x) - x - math.lgamma(shape + 1.0))
     delta = (x - shape) / shape
@@ -147,7 +148,7 @@ def _fraction(shape: float, x: float) -> float:
 
 
 def _f_tails(d: float, n: float, x: float) -> tuple[float, float, float]:
-    """Below `x`, above it, and the density there."""
+    """Probabilities below and above `x`, and the density there."""
     if x <= 0.0:
         return 0.0, 1.0, 0.0
     a, b = 0.5 * d, 0.5 * n
@@ -173,8 +174,8 @@ def _beta_fraction(a: float, b: float, y: float) -> float:
 
 
 def _lentz(first: float, terms: Iterator[tuple[float, float]]) -> float:
-    """first + a1/(b1 + a2/(b2 + ...)) of `terms` (a, b), by Lentz's way as Thompson and Barnett
-    have it."""
+    """Continued fraction first + a1/(b1 + a2/(b2 + ...)) of `terms` (a, b), by Lentz's method as
+    modified by Thompson and Barnett."""
     value = above = first or _TINY
     below = 0.0
     for a, b in terms:
@@ -187,7 +188,7 @@ def _lentz(first: float, terms: Iterator[tuple[float, float]]) -> float:
 
 
 def _noncentral(x: float, degrees: int, shift: float) -> tuple[float, float]:
-    """The probability of less than `x`, and how fast it falls with `shift`."""
+    """Probability of less than `x`, and its decrease with `shift`."""
     a, h = 0.5 * degrees, 0.5 * x
     weight = math.exp(-0.5 * shift)
     p = gamma_tails(a, h)[0]
@@ -208,8 +209,8 @@ def _noncentral(x: float, degrees: int, shift: float) -> tuple[float, float]:
 def _quantile(
     tails: Callable[[float], tuple[float, float, float]], p: float, upper: bool, x: float
 ) -> float:
-    """Quantile where `tails` (below, above, density) has `p` below, or above if `upper`; begun at
-    `x`."""
+    """Quantile at which `tails` (below, above, density) has `p` below, or above if `upper`;
+    iteration from `x`."""
     # The smaller one of the two tails is known to its last digit.
     which = int(upper != (p > 0.5))
     sign, tail = (-1.0 if which else 1.0), (1.0 - p if p > 0.5 else p)

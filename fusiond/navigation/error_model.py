@@ -121,7 +121,7 @@ def apply_for(width: int) -> Callable[[Array, Array, Array, Array], None]:
 
     @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])", variant=width, forceinline=True)
     def apply(rows: Array, sensor: Array, c: Array, out: Array) -> None:
-        """out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
+        """Write out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
 
         All flat, `width` doubles a row. `sensor` holds rate error x y z, force error x y z. In
         five loops, so that the coefficients of each stay in registers: in one loop most are spilled

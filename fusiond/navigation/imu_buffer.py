@@ -40,7 +40,7 @@ MARGIN = 3
 
 
 def sound(samples: Array) -> NDArray[np.bool_]:
-    """Mask of samples (m, 6) that are finite and within what any sensor can say."""
+    """Mask of samples (m, 6) that are finite and within the range of any sensor."""
     found: NDArray[np.bool_] = np.abs(samples[:, :3]).max(axis=1, initial=0.0) <= MAX_RATE_RAD_S
     found &= np.abs(samples[:, 3:]).max(axis=1, initial=0.0) <= MAX_FORCE_M_S2
     return found
@@ -75,7 +75,7 @@ def _magnitudes(samples: Array, found: Array) -> None:
 
 
 def magnitudes(samples: Array) -> Array:
-    """Of the forces of samples (m, 6)."""
+    """Magnitudes of the forces of samples (m, 6)."""
     found = np.empty(len(samples))
     _magnitudes(samples, found)
     return found
@@ -94,7 +94,7 @@ def _steps(times: Stamps, before_ns: int, intervals: Stamps) -> tuple[int, int]:
 
 @compiled("UniTuple(i8, 2)(i8[:], i8)")
 def longest_step(times: Stamps, before_ns: int) -> tuple[int, int]:
-    """The longest interval between `before_ns` and times (m,), m > 0, and the latest of them."""
+    """Longest interval between `before_ns` and times (m,), m > 0, and the latest of them."""
     longest, latest = times[0] - before_ns, before_ns
     for i in range(len(times)):
         longest, latest = max(longest, times[i] - before_ns), max(latest, times[i])
@@ -145,7 +145,7 @@ class ImuBuffer:
         self._gap_ns = round(gap_s * 1e9)
         self._configured_ns = self._period_ns = 1e9 / rate_hz
         self.hold_ns = self._hold()
-        """A sample may stand for this long at most; beyond it the covariance grows as for a gap."""
+        """Longest time that a sample represents; beyond it the covariance grows as for a gap."""
         self._head[HOLD] = self.hold_ns
         self._intervals: list[Stamps] = []
         self._unjudged = 0
@@ -154,7 +154,7 @@ class ImuBuffer:
         self._turn[:3, :3] = self._turn[3:, 3:] = sensor_to_body.T
 
     def _allocate(self, capacity: int) -> None:
-        """Room for so many rows, all arrays in one: `packed`, which a kernel takes for less."""
+        """Allocate so many rows, all arrays in one: `packed`, which a kernel takes at less cost."""
         self.packed: Array = np.zeros(HEAD_SIZE + ROW_SIZE * capacity)
         self._head: NDArray[np.int64] = self.packed[:HEAD_SIZE].view(np.int64)
         behind = self.packed[HEAD_SIZE:]
@@ -174,8 +174,8 @@ class ImuBuffer:
         return self.start + self.end
 
     def _hold(self) -> int:
-        """The slower of the configured rate and the one seen counts: a bus that hands over samples
-        in bursts does not make its sensor fast."""
+        """Set the hold time by the slower of the configured and the observed rate: a bus with
+        bursts does not make its sensor fast."""
         slower = max(self._period_ns, self._configured_ns)
         return min(self._gap_ns, round(HOLD_PERIODS * slower))
 

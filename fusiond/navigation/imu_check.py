@@ -106,7 +106,7 @@ def _begin(memory: Array, samples: Array, i: int) -> None:
 
 @compiled("void(f8[::1], f8[:, ::1], i8, f8)", forceinline=True)
 def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> None:
-    """Sample i against the one before it: which axes stand still, and for how long."""
+    """Count the repetitions of sample i on each axis, and their duration."""
     moved = 0
     small = True
     for j in range(6):
@@ -144,7 +144,7 @@ def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> Non
 
 @compiled("i8(f8[::1], f8[:, ::1], i8, f8, f8[::1])", forceinline=True)
 def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array) -> int:
-    """Code of sample i, `since_s` after the one before it, repetitions counted."""
+    """Code of sample i, `since_s` after the one before it, with counted repetitions."""
     rate_hz = limits[0]
     force = math.sqrt(samples[i, 3] ** 2 + samples[i, 4] ** 2 + samples[i, 5] ** 2)
     memory[_FREE_S] = memory[_FREE_S] + since_s if force < FREE_FALL_M_S2 else 0.0
@@ -175,7 +175,7 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
 
 @compiled("b1(f8[::1], f8[:, ::1], i8)", forceinline=True)
 def _jumps(memory: Array, samples: Array, i: int) -> bool:
-    """True if sample i may be a spike, if the next one is back."""
+    """True if sample i may be a spike, to be confirmed by the next one."""
     for j in range(6):
         least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
         if abs(samples[i, j] - memory[_GOOD + j]) > LEAP * max(least, memory[_LEAP + j]):
@@ -185,7 +185,7 @@ def _jumps(memory: Array, samples: Array, i: int) -> bool:
 
 @compiled("b1(f8[::1], f8[:, ::1], i8, i8)")
 def _comes_back(memory: Array, samples: Array, i: int, k: int) -> bool:
-    """True if a leap of sample i is taken back by sample k, the next."""
+    """True if sample k, the next, reverts a jump of sample i."""
     for j in range(6):
         least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
         leap = abs(samples[i, j] - memory[_GOOD + j])
@@ -197,7 +197,7 @@ def _comes_back(memory: Array, samples: Array, i: int, k: int) -> bool:
 
 @compiled("void(f8[::1], f8[:, ::1], i8)", forceinline=True)
 def _take(memory: Array, samples: Array, i: int) -> None:
-    """Sample i is the one that the next is compared with."""
+    """Store sample i for the comparison with the next."""
     for j in range(6):
         floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
         leap = abs(samples[i, j] - memory[_GOOD + j]) / (memory[_REFUSED] + 1.0)
@@ -267,7 +267,7 @@ def _check(
 
 
 class Checked(NamedTuple):
-    """Samples that are judged (m,) ns, (m, 6), and their codes (m,), into OUTCOMES."""
+    """Judged samples (m,) ns, (m, 6), and their codes (m,), into OUTCOMES."""
 
     times: Stamps
     samples: Array
@@ -275,7 +275,7 @@ class Checked(NamedTuple):
 
 
 class ImuCheck:
-    """Judges samples in sensor axes, whatever the chunks they come in.
+    """Check of samples in sensor axes, in chunks of any size.
 
     `rate_hz` as configured; `rate_range` (rad/s) and `force_range` (m/s^2) are the sensor's full
     scale, infinite where nobody knows. A sample after a pause, and one that leaps, wait for the one

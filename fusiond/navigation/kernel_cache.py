@@ -61,7 +61,7 @@ _host_features: Any = get_host_cpu_features
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
 _BITCODE = 3
-"""Place of the bitcode in what a file holds (`_kept`)."""
+"""Place of the bitcode in a file's contents (`_kept`)."""
 _libraries: WeakSet[_Linked] = WeakSet()
 
 
@@ -85,7 +85,7 @@ class Shipped(NamedTuple):
 
 
 def shipped_in(folder: Path) -> Shipped | None:
-    """The kernels in a folder of `folder` that this processor runs, None where there are none.
+    """Shipped kernels in a subfolder of `folder` for this processor; None without any.
 
     The folders are named after LLVM's names of processors; a kernel in them was compiled for that
     one with no feature besides (`tools.prebuilt`).
@@ -103,7 +103,7 @@ def shipped_in(folder: Path) -> Shipped | None:
 
 
 class KernelCache(NullCache):
-    """Interface to numba's dispatcher for its one signature; `name` is the kernel's alone.
+    """Cache for numba's dispatcher with its one signature; `name` is the kernel's alone.
 
     `shipped` is the file of the package's own that has it, None where none has.
     """
@@ -126,8 +126,8 @@ class KernelCache(NullCache):
         return str(self._folder)
 
     def load_overload(self, _signature: object, target: Any) -> Any:
-        """Code compiled for this processor, else that shipped for its level; None where there is
-        nothing sound."""
+        """Load code compiled for this processor, else that shipped for its level; None without
+        intact code."""
         _name_runtime()
         path = self._folder / self.file_name
         kept = _sound(path, _discard)
@@ -137,7 +137,7 @@ class KernelCache(NullCache):
         return None if kept is None else _linked(target, path, *pickle.loads(kept))
 
     def save_overload(self, _signature: object, data: Any) -> None:
-        """Write what was compiled; where that fails it is compiled again at the next start."""
+        """Write compiled code; after a failure the next start compiles again."""
         if data.library.has_dynamic_globals:
             return  # it holds addresses of this process
         payload: bytes = _dumps(_kept(data))
@@ -161,7 +161,7 @@ def _file_name(name: str, signature: str, *processor: str) -> str:
 
 
 def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | None:
-    """Contents of a file, if its digest is right."""
+    """Contents of a file with a correct digest."""
     try:
         data = memoryview(path.read_bytes())
     except FileNotFoundError:
@@ -191,7 +191,7 @@ def _name_runtime() -> None:
 
 @lru_cache
 def _processor(codegen: Any) -> tuple[str, str, str]:
-    """System, processor and features, which LLVM is asked for once."""
+    """System, processor and features, queried from LLVM once."""
     made_for: tuple[str, str, str] = codegen.magic_tuple()
     return made_for
 
@@ -214,8 +214,8 @@ def _kept(made: Any) -> tuple[Any, ...]:
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Any:
-    """It holds the constants that native code takes. Its globals are asked for by object mode
-    alone, which no kernel here is compiled in."""
+    """Environment with the constants of native code. Its globals serve object mode only, which no
+    kernel uses."""
     known = _known_environment(name)
     if known is None:
         imported = sys.modules.get(module)
@@ -227,7 +227,7 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
 
 
 class _Linked(_Library):  # type: ignore[misc]
-    """A kernel from its file: native code now, bitcode when one that is compiled calls it."""
+    """Kernel loaded from its file: native code now, bitcode when a compiled kernel calls it."""
 
     def __init__(self, codegen: Any, name: str, path: Path, native: bytes, bitcode: bytes) -> None:
         _initialise_library(self, codegen, name)
@@ -259,8 +259,8 @@ class _Linked(_Library):  # type: ignore[misc]
 
 
 def release_bitcode() -> None:
-    """Let go of the bitcode of all kernels that are linked, 7 MB: for a process that has linked
-    what it needs and compiles nothing more. One that does so reads it again."""
+    """Release the bitcode of all linked kernels, 7 MB, in a process that compiles no more. A later
+    compilation reads it again."""
     for library in _libraries:
         library.release()
 
@@ -309,7 +309,7 @@ def _linked(
 
 
 def can_keep(folder: Path) -> bool:
-    """True if what is compiled can be written there."""
+    """True if compiled code can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -318,8 +318,7 @@ def can_keep(folder: Path) -> bool:
 
 
 def kept_in(folder: Path) -> set[str]:
-    """Names of the files in `folder`, less those that processes left there which died while they
-    wrote: these are removed.
+    """Names of the files in `folder`, after removal of those that dead processes left unfinished.
 
     Where the folder is shared with other hosts, one may lose a file that it writes just now: it
     compiles that kernel again at its next start.

@@ -1,5 +1,5 @@
-"""Gauss-Newton of an attitude on the move, as compiled kernels; what is sought, and why, has
-fusiond.navigator.alignment.motion_fit.
+"""Gauss-Newton kernels for the attitude fit of fusiond.navigator.alignment.motion_fit, which
+defines the problem.
 
 A guess (19,) holds the attitude C_nb at the last fix by rows, biases of force and rate, the
 velocities' offset in time in its sigmas, the velocity at the first fix; a step (13,) moves it by a
@@ -38,7 +38,7 @@ BENT_RAD = 0.01
 
 @compiled("void(f8[::1], f8[::1], f8[::1])", allocates=True)
 def moved(guess: Array, step: Array, there: Array) -> None:
-    """Write a guess `there` (19,) that is by a step (13,) from another."""
+    """Write the guess `there` (19,) that differs from another by a step (13,)."""
     turn = np.empty((3, 3))
     turn_to_dcm(step[0], step[1], step[2], turn)
     for i in range(3):
@@ -70,7 +70,7 @@ def judge_guess(
     z: Array,
     rows: Array,
 ) -> None:
-    """Write a guess's residuals (3 k + 10,) and their slopes (3 k + 10, 13), in sigmas.
+    """Write a guess's residuals (3 k + 10,) and their derivatives (3 k + 10, 13), in sigmas.
 
     The slopes are by the steps of the guess; the rest as of `judge_sensed`."""
     k = t_s.shape[0]
@@ -134,8 +134,8 @@ def judge_guess(
 
 @compiled("b1(f8[:, ::1], f8[::1], f8[::1])", allocates=True)
 def least_squares(rows: Array, z: Array, step: Array) -> bool:
-    """Write the least squares (13,) of rows (m, 13) @ step = z, by Cholesky's factor of the normal
-    equations, each in its own sigmas; whether there is one."""
+    """Write the least-squares solution (13,) of rows (m, 13) @ step = z, by the Cholesky factor of
+    the scaled normal equations; True if there is one."""
     n = SOUGHT
     normal, scale = np.zeros((n, n)), np.empty(n)
     step[:] = 0.0
@@ -176,7 +176,7 @@ def least_squares(rows: Array, z: Array, step: Array) -> bool:
 
 @compiled("b1(f8[::1], f8[::1], f8)")
 def _bent(biases: Array, sensed: Array, seconds: float) -> bool:
-    """True if integrals over so long, with biases (6,) of theirs, must be made anew for others."""
+    """True if integrals with biases (6,) of theirs must be computed again for others."""
     force, rate = 0.0, 0.0
     for j in range(3):
         force = max(force, abs(biases[j] - sensed[j]))
@@ -209,8 +209,8 @@ def descend(
     z: Array,
     rows: Array,
 ) -> bool:
-    """Move a `guess` (19,) to where the fit is best, and write what it leaves there; whether that
-    has converged. A step that makes the fit worse is halved.
+    """Move a `guess` (19,) to the best fit and write its residuals; True if converged. A step that
+    makes the fit worse is halved.
 
     Of the stretch times (m + 1,) ns, samples (m, 6) and counts (k,), as of `integrate_sensed`; the
     rest as of `judge_guess`."""

@@ -1,5 +1,5 @@
-r"""Preintegrated gyro and accelerometer data since the first of some instants, as a compiled
- kernel.
+r"""Preintegrated gyro and accelerometer data from the first of several instants, as a compiled
+kernel.
 
 With C' = C [w - b_w]x the attitude's error, a rotation vector in the axes of the begin, is D db_w
 with D' = -C, and that of the velocity gained v = int C f dt is
@@ -107,7 +107,7 @@ def _side_by_side(
     first: int,
     lanes: Array,
 ) -> None:
-    """Integrate the intervals from `first` on, as many as there are lanes, each by itself."""
+    """Integrate the intervals from `first` on, one in each lane."""
     most, number = 0, min(LANES, counts.shape[0] - first)
     lanes[:] = 0.0
     lanes[_Q : _Q + LANES] = 1.0
@@ -140,8 +140,8 @@ def integrate_sensed(
     slopes: Array,
 ) -> None:
     """Integrate samples (m, 6) of rate and force less biases (6,) of force and rate in the axes of
-    their begin; write what they come to after `counts` (k,) of them, in order of size: the velocity
-    gained (k, 3), the attitude (k, 3, 3), the slopes of that velocity by the biases (k, 3, 6).
+    their start. After `counts` (k,) of them, ascending, write the gained velocity (k, 3), the
+    attitude (k, 3, 3), and the derivatives of that velocity by the biases (k, 3, 6).
 
     `times` (m + 1,) ns holds the begin before the first sample. Over tens of seconds: Earth rate,
     transport and Coriolis are left out, and so is gravity.

@@ -25,7 +25,7 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 @compiled("UniTuple(f8, 9)(f8[::1])")
 def dcm_elements(q: Array) -> Nine:
-    """C(q) of a unit quaternion (4,), its nine elements by rows."""
+    """Nine elements, by rows, of C(q) of a unit quaternion (4,)."""
     q0, q1, q2, q3 = q[0], q[1], q[2], q[3]
     return (
         q0 * q0 + q1 * q1 - q2 * q2 - q3 * q3,
@@ -148,5 +148,5 @@ def skew(v: Array) -> Array:
 
 
 def wrap_angle(angle: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """Angle wrapped to [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -1,4 +1,4 @@
-r"""Scale factors that a model has no states for: what of them is noise, while the vehicle turns.
+r"""Noise equivalent of unmodelled scale factors while the vehicle turns.
 
     e_i = s_i w_i,   d_i = k_i f_i,   s_i ~ N(0, s^2), k_i ~ N(0, k^2)
 
@@ -40,8 +40,8 @@ def _follow(
     mean: Array,
     out: Array,
 ) -> None:
-    """Add to `out` (m, 6) the density after each of `samples` (m, 6); `mean` (13,) goes on from
-    call to call: smoothed rates and forces, their means, and of how many samples they are."""
+    """Add to `out` (m, 6) the density after each of `samples` (m, 6). `mean` (13,) persists from
+    call to call: smoothed rates and forces, their means, and the number of samples."""
     for i in range(samples.shape[0]):
         mean[12] += 1.0
         fast, slow = max(gain, 1.0 / mean[12]), max(slow_gain, 1.0 / mean[12])

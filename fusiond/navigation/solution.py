@@ -1,4 +1,4 @@
-"""The navigation solution as it leaves the navigator: frozen, in SI units and radians."""
+"""Navigation solution as published by the navigator: frozen, in SI units and radians."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ HEIGHT_KNOWN_SD_M = 200.0
 are altitudes above the sea without a geoid (62 m) and pressures without the weather (85 m); what
 nothing has measured starts at 3,464 m, and gravity alone makes 700 m of that in minutes."""
 HELD_UNKNOWN_M = 0.5
-"""A model that holds the height holds 0, to within this, where its start knew none: what updates
-round off, and the way of the first step."""
+"""Tolerance of a held height of 0, for a start without height: rounding of updates, and the
+displacement of the first step."""
 _UNKNOWN: Vector3 = (nan, nan, nan)
 
 

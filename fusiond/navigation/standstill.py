@@ -62,8 +62,8 @@ class Window:
 
 @compiled("void(f8[:, ::1], i8, i8, f8[:, ::1])")
 def _moments(samples: Array, first: int, end: int, found: Array) -> None:
-    """Write to `found` (4, 3) means of rate and force of rows first ... end-1, and their standard
-    deviations."""
+    """Write to `found` (4, 3) means and standard deviations of rate and force of rows first ...
+    end-1."""
     count = end - first
     for part in range(2):
         j = 3 * part
@@ -87,9 +87,9 @@ def _moments(samples: Array, first: int, end: int, found: Array) -> None:
 
 @compiled("i8(f8[:, ::1], i8, f8[:], f8[:, ::1])")
 def _lengthen(rates: Array, run: int, rate: Array, found: Array) -> int:
-    """Put `rate` (3,) behind the first `run` of `rates` (LONGEST_RUN, 3), the oldest of which makes
-    room; returns how many there are. Write to `found` (2, 3) their mean and their variance, of two
-    or more."""
+    """Append `rate` (3,) to the first `run` of `rates` (LONGEST_RUN, 3), dropping the oldest if
+    full; returns their number. Write to `found` (2, 3) their mean and their variance, of two or
+    more."""
     if run == rates.shape[0]:
         for i in range(1, run):
             for j in range(3):
@@ -122,7 +122,8 @@ def next_cell(times: NDArray[np.int64], first: int, end: int, width_ns: int, cel
 
 
 class StandstillDetector:
-    """Cuts the stream of samples into windows on a fixed grid and judges each once."""
+    """Detector of standstills; it divides the samples into windows on a fixed grid and judges each
+    once."""
 
     def __init__(self, limits: QuietLimits) -> None:
         self.limits = limits

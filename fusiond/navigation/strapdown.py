@@ -167,8 +167,8 @@ def strapdown_step(
 
 
 def step_before(nav: Array) -> Array:
-    """Step (STEP_SIZE,) of a state (10,) before its first interval: it moves evenly. By no force it
-    would fall, and offsets in time would be told by that."""
+    """Step (STEP_SIZE,) of a state (10,) before its first interval, in uniform motion. Without
+    force the vehicle would fall, which would affect offsets in time."""
     step = np.zeros(STEP_SIZE)
     g = gravity(float(nav[LAT]), float(nav[HEIGHT]))
     step[STEP_FORCE_N + 2] = step[STEP_SMOOTH_N + 2] = -g

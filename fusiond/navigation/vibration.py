@@ -1,4 +1,4 @@
-r"""The noise of an inertial sensor on this vehicle, now: what engine and road shake into it.
+r"""Present noise of an inertial sensor from engine and road vibration.
 
 With means y_k of n samples, each over tau = n T, the Hadamard variance
 
@@ -93,7 +93,7 @@ def _follow(
     lately: Array,
     out: Array,
 ) -> None:
-    """Write the smallest noise density so far beyond the sheet's, `out` (m, 6).
+    """Write the smallest noise density so far beyond the data sheet's, `out` (m, 6).
 
     After each of `samples` (m, 6), beyond that of `sheet` (6,); 0 where it is not above it by
     EXCESS.

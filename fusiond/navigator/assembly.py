@@ -1,4 +1,4 @@
-"""From a vehicle's configuration to what its navigator is made of: model, estimator, IMU buffer.
+"""Assembly of a navigator from a configuration: model, estimator, IMU buffer.
 
 A new estimator is one module in `fusiond.estimators` and one case here; nothing else knows which
 one runs. Each is imported where it is asked for: loading its kernels takes a start's time.
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.si_units import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
@@ -56,12 +56,12 @@ def model_of(config: Config, *extra: Block) -> Model:
 
 
 def _skews(_: Config, block: Block) -> bool:
-    """True if a block is what two clocks part by."""
+    """True for the block of a difference of two clocks' rates."""
     return block.name.startswith(CLOCK_SKEW)
 
 
 def _wanders(_: Config, block: Block) -> bool:
-    """True if a block is that of an error which fixes share for seconds."""
+    """True for the block of an error that fixes share for seconds."""
     return block.name.startswith(FIX_MARKOV)
 
 
@@ -71,7 +71,7 @@ def _carriers(_: Config, block: Block) -> bool:
 
 
 def _unasked(config: Config, block: Block) -> bool:
-    """True if a block is that of a lever arm of which the configuration says nothing."""
+    """True for the block of a lever arm that the configuration omits."""
     receivers = [each for each in config.aiding.values() if isinstance(each, GnssAiding)]
     silent = all(each.lever_arm_sd_m is None for each in receivers)
     return silent and block.name.startswith(ANTENNA_LEVER)
@@ -84,7 +84,7 @@ def kinds_of_config(config: Config, model: Model) -> list[Kind]:
 
 
 def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Estimator:
-    """The estimator that `[estimator] filter` names, with a bank of the `kinds` where it can."""
+    """Estimator named by `[estimator] filter`, with a bank of the `kinds` if it supports one."""
     match config.estimator.filter:
         case "kalman":
             if config.integrity.watched:
@@ -107,7 +107,7 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
 
 
 def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
-    """The buffer of IMU samples, with the noise that they show.
+    """Buffer of IMU samples, with their observed noise.
 
     That is of vibration, of axes out of square, and of scale factors that the model has no states
     for."""
@@ -128,7 +128,7 @@ def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
 
 
 def verdicts_of(config: Config, model: Model, on_event: Callable[[str, str], None]) -> Verdicts:
-    """The verdicts on each source's sigma, told as they change."""
+    """Verdicts on each source's sigma; changes are reported."""
     test = config.consistency
     return Verdicts(
         test.window, test.alpha, model, lambda s, v: on_event(f"verdict_{v}", f"innovations of {s}")

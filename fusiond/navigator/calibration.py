@@ -64,7 +64,7 @@ CALIBRATED = (
 )
 """Blocks that are a calibration; a source's own has its name behind it (`wheel_scale_rear`)."""
 WANDERING = (WHEEL_LATENCY, FIX_TIME, VELOCITY_TIME, BAROMETER_OFFSET, BAROMETER_SCALE)
-"""Those that are no constants: two clocks drift, and so does the weather."""
+"""Parameters that are not constant: clocks drift, and so does the weather."""
 UNIT_SUFFIX = {"rad": "_deg", "m": "_m", "s": "_s", "1": ""}
 
 NOT_OBSERVED_SHARE = 0.9
@@ -112,7 +112,7 @@ class Slot:
 
 @immutable()
 class Parameter:
-    """A parameter beyond its configured value, in published units: value, one sigma, and the
+    """Parameter beyond its configured value, in published units: value, one sigma, and the
     configured sigma."""
 
     name: str
@@ -125,7 +125,7 @@ class Parameter:
 
 
 def kind_of(block: str) -> str | None:
-    """Calibration kind of a block, None for one that is none."""
+    """Calibration kind of a block; None for another block."""
     for kind in CALIBRATED:
         if block == kind or block.startswith(f"{kind}_"):
             return kind
@@ -133,7 +133,7 @@ def kind_of(block: str) -> str | None:
 
 
 def calibration_slots(model: Model) -> list[Slot]:
-    """The parameters of a model that are a calibration, in the order of its blocks."""
+    """Calibration parameters of a model, in the order of its blocks."""
     found = []
     for block in model.blocks:
         kind = kind_of(block.name)
@@ -183,10 +183,10 @@ class CalibrationWatch:
         self.restart()
 
     def restart(self) -> None:
-        """The filter has been started anew."""
+        """Restart with the filter."""
         self._cell = self._turn_cell = -1
         self.due_ns = 0
-        """Before that instant of the filter there is nothing to look at."""
+        """Instant of the filter at which the next look is due."""
         self._past: deque[tuple[int, Array]] = deque()
         self._learned, self._variance = np.zeros((2, len(self._yaws)))
         self._looked_ns = np.full(TURN_LOOKS, NEVER_NS)
@@ -196,11 +196,11 @@ class CalibrationWatch:
         self.turned: str | None = None
         """Set once the IMU has turned in the vehicle: why nothing before counts any more."""
         self.parameters: tuple[Parameter, ...] = ()
-        """As last looked at; empty before the filter has run."""
+        """Parameters at the last look; empty before the filter has run."""
 
     def corrected(self) -> None:
-        """A fault was taken out of the state, mounting angles with it: what they were before says
-        nothing of a turn."""
+        """Note a correction of the state for a fault: earlier mounting angles no longer show a
+        turn."""
         self._known[:] = False
         self.turned = None
 
@@ -212,8 +212,7 @@ class CalibrationWatch:
         )
 
     def look(self, t_ns: int, xi: Array, covariance: Array) -> bool:
-        """The filter has come to `t_ns` with parameters (n,) and P (n, n); whether that was looked
-        at, which happens each `LOOK_NS`."""
+        """Look at parameters (n,) and P (n, n) at `t_ns` if due, each `LOOK_NS`; True if so."""
         turn_cell, cell = t_ns // TURN_LOOK_NS, t_ns // LOOK_NS
         if turn_cell == self._turn_cell or not self._slots:
             return False
@@ -238,7 +237,7 @@ class CalibrationWatch:
         return True
 
     def _compare(self, t_ns: int, now: Array, variance: Array) -> None:
-        """True if the mounting's yaw has moved by more than what was learned of it since a look."""
+        """Detect a mounting yaw that has moved beyond the information gained since a look."""
         if not self._yaws:
             return
         yaws = list(self._yaws)
@@ -280,7 +279,7 @@ def _label(p: Parameter) -> str:
 
 
 def _parameter(s: Slot, value: float, sd: float, before: float | None) -> Parameter:
-    """One parameter of SI values, `before` a minute ago; None where the filter is younger."""
+    """Parameter from SI values, `before` a minute ago; None while the filter is younger."""
     value, sd = value * s.factor, sd * s.factor
     state = CalibrationState.OBSERVED
     if sd > NOT_OBSERVED_SHARE * s.prior_sd:

@@ -1,4 +1,4 @@
-r"""Levels of typed drifts: side drift, wheel drift, disturbance of a compass.
+r"""Magnitudes of configured drifts: side slip, wheel drift, compass disturbance.
 
 No device states them, and a configuration has what fits any vehicle. Each is a Markov state x of
 typed sigma s, of which c x counts in its measurement. By x^ and P as the filter has them the
@@ -47,28 +47,28 @@ Array = NDArray[np.float64]
 TYPED = (SIDE_DRIFT, WHEEL_DRIFT, DISTURBANCE)
 """Beginnings of the names of their blocks."""
 GRID: Final = 4.0 ** np.arange(-3.0, 0.1, 0.25)
-"""Levels: all of the variance, down to an eighth of the sigma."""
+"""Levels: the full variance, down to an eighth of the sigma."""
 FIRST = 6.0
-"""Instants, a minute of them, that it counts that all of it is there: a filter that has once been
-too sure of its course stays so, and slip comes with bends, of which a street has one a minute. With
-two a calibrated `drive_0708` had one false isolation more, just before an outage."""
+"""Prior weight of the full variance, in instants (a minute): a filter that was too sure of its
+course once stays so, and slip comes with bends, of which a street has one a minute. With two a
+calibrated `drive_0708` had one false isolation more, just before an outage."""
 FORGETS = 180.0
-"""Instants, half an hour of them: loads, tyres and roads change."""
+"""Instants after which old ones are forgotten, half an hour: loads, tyres and roads change."""
 MOVES_M_S = 2.0
-"""As no slip is asked for."""
+"""Least speed (m/s) of the slip constraint."""
 
 
 @dataclass(slots=True)
 class _Drift:
     slot: int
     variance: float
-    """As typed, s^2."""
+    """Configured variance s^2."""
     weight: float
-    """Of an instant, by how long it lasts."""
+    """Weight of an instant, by the duration of its error."""
     log: Array = field(default_factory=lambda: np.zeros(len(GRID)))
     count: float = 0.0
     counted: list[tuple[int, float]] = field(default_factory=lambda: [(0, 1.0)])
-    """From when on (ns) which c counts."""
+    """Start (ns) of each c's validity."""
 
     def at(self, t_ns: int) -> float:
         return next((c for since, c in reversed(self.counted) if since <= t_ns), 1.0)
@@ -81,7 +81,7 @@ class _Drift:
 
 
 class DriftLevels:
-    """Of one vehicle, by the names of the blocks of its model."""
+    """Drift levels of one vehicle, by names of blocks of its model."""
 
     def __init__(self, model: Model) -> None:
         self._drifts: dict[str, _Drift] = {}
@@ -99,7 +99,7 @@ class DriftLevels:
         }
 
     def take_up(self, shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Begin with what another drive has shown."""
+        """Resume with the levels of another drive."""
         for name in self._drifts.keys() & shown.keys():
             drift = self._drifts[name]
             drift.count, drift.log = max(shown[name][0], 0.0), np.array(shown[name][1:])
@@ -111,8 +111,8 @@ class DriftLevels:
         return 1.0 if drift is None else drift.at(t_ns)
 
     def look(self, e: Estimator) -> None:
-        """The filter as it was at an instant of the grid, when nothing comes any more that is
-        earlier."""
+        """Evaluate the filter's state at an instant of the grid, once nothing earlier can
+        arrive."""
         if speed_of(e.nav) < MOVES_M_S:
             return
         for drift in self._drifts.values():

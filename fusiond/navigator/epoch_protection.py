@@ -1,4 +1,4 @@
-r"""Protection levels by raw epochs: advanced RAIM of each, and the way to it.
+r"""Protection levels from raw epochs, each by advanced RAIM.
 
 The position x_e of an epoch's ranges alone has levels PL_e that hold whatever one satellite or
 constellation does (fusiond.integrity.araim). With x_0 the published solution after the epoch
@@ -38,20 +38,20 @@ from fusiond.navigator.raw_gnss import RawEpochMeasurement
 Array = NDArray[np.float64]
 
 SATELLITE_FAULT, CONSTELLATION_FAULT = 1e-5, 1e-4
-"""In an hour: GPS SPS Performance Standard, 5th ed., 2020, section 3.5.1; Working Group C ARAIM,
-Milestone 3 report, 2016."""
+"""Fault rates an hour: GPS SPS Performance Standard, 5th ed., 2020, section 3.5.1; Working Group C
+ARAIM, Milestone 3 report, 2016."""
 NOMINAL_BIAS_M = 0.75
-"""Of a range that is not at fault (signal deformation, antenna): Blanch et al., IEEE Trans. AES 51
+"""Bias of a fault-free range (signal deformation, antenna): Blanch et al., IEEE Trans. AES 51
 (2015), 713."""
 UNMONITORED = LPV_200.unmonitored_risk / (LPV_200.vertical_risk + LPV_200.horizontal_risk)
-"""Part of the risk that faults nobody looks for may have, as in the reference."""
+"""Share of the risk for unmonitored faults, as in the reference."""
 HOLDS_NS = 2_000_000_000
 """An epoch speaks for the solution for so long: of a receiver that sends each second one may be
 lost."""
 
 
 def requirement(risk: float, false_alarm: float) -> Requirement:
-    """Of an hour: half of either to the vertical, half to the horizontal."""
+    """Requirement from risk and false alarms an hour: half of each vertical, half horizontal."""
     return Requirement(
         vertical_risk=0.5 * risk,
         horizontal_risk=0.5 * risk,
@@ -65,8 +65,8 @@ def requirement(risk: float, false_alarm: float) -> Requirement:
 
 
 class EpochLevel(NamedTuple):
-    """Levels (m) of the solution at the epoch's instant, infinite where nothing bounds it, and the
-    satellites that do not fit the others."""
+    """Levels (m) of the solution at the epoch's instant, infinite without a bound, and the
+    inconsistent satellites."""
 
     hpl_m: float
     vpl_m: float
@@ -90,7 +90,7 @@ class _Received:
 
 
 class EpochProtection:
-    """Levels from raw epochs, at a `risk` and a rate of `false_alarm`s, each an hour."""
+    """Protection levels from raw epochs, at a `risk` and a rate of `false_alarm`s, each an hour."""
 
     def __init__(self, risk: float, false_alarm: float) -> None:
         self._requirement = requirement(risk, false_alarm)
@@ -99,15 +99,15 @@ class EpochProtection:
 
     @cached_property
     def _quantile(self) -> float:
-        """Of the Gaussian law: what one position exceeds with half the risk."""
+        """Quantile of the Gaussian law that one position exceeds with half the risk."""
         return -gaussian_quantile(0.5 * self._risk / INDEPENDENT_PER_HOUR)
 
     def clear(self) -> None:
-        """The solution has begun anew."""
+        """Restart with the solution."""
         self._received.clear()
 
     def look(self, measurement: RawEpochMeasurement, state: State) -> None:
-        """An epoch, and the filter's state at its instant when it has been looked at."""
+        """Compute the levels of an epoch from the filter's state at its instant."""
         self._received.pop(measurement.source, None)
         corrected = measurement.memory.corrected
         if corrected is None:
@@ -138,7 +138,7 @@ class EpochProtection:
         self._received[measurement.source] = _Received(measurement.t_ns, names, epoch, z, shared)
 
     def level(self, source: str, estimator: Estimator) -> EpochLevel:
-        """Of the estimator's present state, by the last epoch of a receiver."""
+        """Level of the estimator's present state, by the last epoch of a receiver."""
         received = self._received.get(source)
         if received is None or not 0 <= estimator.t_ns - received.t_ns <= HOLDS_NS:
             return NO_BOUND

@@ -1,4 +1,4 @@
-"""Unexpected failures: a measurement that raises, a filter of no numbers.
+"""Unexpected failures: a measurement that raises, a filter with values that are not finite.
 
 An exception costs the measurement that raised it, never the tick. A filter that has lost its
 numbers never gets them back: it is started anew.
@@ -17,7 +17,7 @@ RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
 
 
 def broken(estimator: Estimator) -> str:
-    """Part of the filter's state that is not finite, in words, where `first_not_finite` finds it.
+    """Name of the first part of the filter's state that is not finite.
 
     An update carries a covariance that is none to its diagonal.
     """
@@ -26,7 +26,7 @@ def broken(estimator: Estimator) -> str:
 
 
 class FailedMeasurements:
-    """Tells once of each source of which a measurement raised."""
+    """Reporter of sources with a measurement that raised an exception, once each."""
 
     def __init__(self, report: Callable[[str, str], None]) -> None:
         self._report = report

@@ -1,4 +1,4 @@
-"""The filter's state, and what is published of it, when another inertial unit goes on."""
+"""State and published solution of the filter at a change of the inertial unit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
@@ -24,7 +24,7 @@ def publish_by_axes(estimator: Estimator, imu: Imu, spare: bool = False) -> None
 
 
 def published_of_spare(estimator: Estimator, imu: Imu) -> bool:
-    """True if what is published is known no better than the spare sits."""
+    """True if sigma is published as of the spare, which its mounting limits."""
     return estimator.published.axes_sd_rad > imu.misalignment_deg * DEG
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import ImuSample
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 
 Array = NDArray[np.float64]
 Row = tuple[int, tuple[float, ...]]
@@ -37,7 +37,7 @@ class ImuChoice:
         self._spare, self._gap_ns = imu.spare, round(imu.gap_s * 1e9)
         self._event = on_event
         self.used: str | None = None
-        """The source whose samples count; None before the first."""
+        """Source whose samples are used; None before the first."""
         self.counters: Counter[str] = Counter()
         self._waiting: deque[Row] = deque(maxlen=IMU_QUEUE)
         self._standby: deque[Row] = deque(maxlen=IMU_QUEUE)
@@ -68,7 +68,7 @@ class ImuChoice:
         self._waiting.append(row)
 
     def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:
-        """From the spare's axes to those of the first unit."""
+        """Rotate a sample from the spare's axes to those of the first unit."""
         both = np.reshape(sample, (2, 3)) @ self._turn.T
         return tuple(both.ravel().tolist())
 
@@ -104,7 +104,7 @@ class ImuChoice:
         return True
 
     def samples(self) -> tuple[NDArray[np.int64], Array] | None:
-        """Those since the last call, (m,) ns and (m, 6); None if there are none."""
+        """Samples since the last call, (m,) ns and (m, 6); None without any."""
         if not self._waiting:
             return None
         times, samples = zip(*self._waiting, strict=True)

@@ -1,4 +1,4 @@
-"""Noise of an inertial unit as its navigation shows it.
+"""Noise of an inertial unit as observed in navigation.
 
 Which share of what the samples show is noise (fusiond.navigator.noise_share), and how good the unit
 is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was
@@ -14,7 +14,7 @@ import numpy as np
 
 from fusiond.aiding.fix_errors import SETTLES_NS
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
@@ -25,7 +25,7 @@ from fusiond.navigator.timeline import Timeline
 from fusiond.navigator.unit_grade import UnitGrade
 
 STEP_NS = 1_000_000_000
-"""A prediction is carried on by so much at a time: no tick carries the whole of it."""
+"""Step of a prediction's propagation, so that no tick carries all of it."""
 
 
 class ImuNoise:
@@ -37,25 +37,25 @@ class ImuNoise:
         of_class = imu.sensor_class is not None and imu.misalignment_deg > 0.0
         self._unit = UnitGrade(model) if of_class else None
         self._grade = self._unit
-        """None where nothing shows the unit's quality."""
+        """Grade of the unit; None without evidence of its quality."""
         self._axes_sd_rad = imu.misalignment_deg * DEG
         self._cell = self._at_ns = -1
 
     @property
     def shown(self) -> tuple[float, tuple[float, ...]]:
-        """For the next start."""
+        """Observed noise, for the next start."""
         return self._shares.shown
 
     def take_up(
         self, imu: ImuBuffer, predictions: float, log_likelihoods: tuple[float, ...]
     ) -> None:
-        """Begin with what another drive has shown, before any sample has come."""
+        """Resume with the observed noise of another drive, before any sample."""
         shares = self._shares.take_up(predictions, log_likelihoods)
         if imu.vibration is not None:
             imu.vibration.shares.add(0, shares)
 
     def restart(self) -> None:
-        """The filter has been started anew."""
+        """Restart with the filter."""
         self._shares.restart()
         self._cell = self._at_ns = -1
         self._grade = self._unit

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_range
+from fusiond.configuration.si_units import imu_range
 from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
@@ -105,7 +105,7 @@ class ImuScreening:
     def admit(
         self, times: Stamps, samples: Array, imu: ImuBuffer, navigating: bool
     ) -> Iterator[Run]:
-        """Samples to append to `imu`, in runs between gaps that cannot be borne.
+        """Select the samples for `imu`, in runs between gaps too long for navigation.
 
         Refusals are counted in `imu.counters`. Before navigation nothing is known of what the
         vehicle did in a gap: any beyond `gap_s` ends what the alignment has collected.
@@ -142,7 +142,7 @@ class ImuScreening:
     def _split_at_gaps(
         self, times: Stamps, samples: Array, before: int, most_s: float, imu: ImuBuffer
     ) -> Iterator[Run]:
-        """Samples with gaps that cannot be borne between them, or before them."""
+        """Split samples at gaps too long for navigation."""
         intervals = np.diff(times, prepend=before) * 1e-9
         breaks = np.flatnonzero(intervals > most_s).tolist()
         for begin, end in pairwise(sorted({0, *breaks, len(times)})):
@@ -155,7 +155,7 @@ class ImuScreening:
             yield Run(times[begin:end], samples[begin:end], ends)
 
     def _refuse(self, checked: Checked, imu: ImuBuffer) -> str:
-        """Count what is not taken; why navigation ends, if it does."""
+        """Count rejected samples; the reason if navigation ends."""
         ends = ""
         for code in np.unique(checked.codes).tolist():
             if code == TAKEN:

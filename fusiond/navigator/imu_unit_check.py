@@ -1,4 +1,4 @@
-r"""Check of the IMU's units, of a file as of a running vehicle.
+r"""Check of the IMU's units, in a file as in a running vehicle.
 
 Specific force. Its magnitude is that of gravity in the median, whatever the vehicle does; another
 unit shows as its factor. Rates are held against the course of the fixes: between two fixes of a
@@ -53,7 +53,7 @@ SHEET_SIGMAS = 4.0
 
 
 def force_unit(magnitude: float) -> str | None:
-    """Text on forces of this magnitude in the median; None where they can be m/s^2."""
+    """Text on forces of this median magnitude; None if they can be m/s^2."""
     if FORCE_RANGE[0] <= magnitude / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
         return None
     unit = other_unit(magnitude)
@@ -64,7 +64,7 @@ def force_unit(magnitude: float) -> str | None:
 
 
 def other_unit(magnitude: float) -> tuple[str, float] | None:
-    """The unit in which forces of this magnitude are gravity's, and its size in m/s^2."""
+    """Unit in which forces of this magnitude are gravity, and its size in m/s^2."""
     for name, factor in FORCE_UNITS.items():
         if FORCE_RANGE[0] <= magnitude * factor / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
             return name, factor
@@ -72,7 +72,7 @@ def other_unit(magnitude: float) -> tuple[str, float] | None:
 
 
 def rms_unit(rms_rad_s: float) -> str | None:
-    """Text on rates of this RMS; None where a vehicle can turn with them."""
+    """Text on rates of this RMS; None if a vehicle can turn so."""
     if rms_rad_s <= MOST_RATE_RAD_S:
         return None
     return reason("rate_size", size=rms_rad_s)
@@ -84,7 +84,7 @@ class CourseTurns:
     def __init__(self) -> None:
         self._last: tuple[int, float] | None = None
         self.next_ns = NEVER_NS
-        """Before then no velocity says more."""
+        """Instant before which no velocity adds information."""
         self._product = self._square = self._turn = 0.0
 
     def fix(self, t_ns: int, v_ned: tuple[float, ...], turned: Callable[[int, int], float]) -> None:
@@ -110,7 +110,7 @@ class CourseTurns:
 
     @property
     def decided(self) -> bool:
-        """True if the course has turned enough to tell."""
+        """True if the course has turned enough for a decision."""
         return self._turn >= LEAST_TURN_RAD
 
     @property
@@ -144,7 +144,7 @@ class RateUnits:
     def __init__(self, bias_sd: float, on_event: Callable[[str, str], None]) -> None:
         self._bias_sd, self._event = bias_sd, on_event
         self._first: tuple[Model, list[tuple[int, int]]] | None = None
-        """Columns and slots of the first bias of each gyro and accelerometer, of the filter's
+        """Columns and slots of the first bias of each gyro and accelerometer, in the filter's
         model."""
         self.change()
 
@@ -155,13 +155,13 @@ class RateUnits:
         """True if the rates are known to be in rad/s."""
         self._turns: dict[str, CourseTurns] = {}
         self.due_ns: dict[str, int] = {}
-        """By receiver with velocities, the instant before which its next one says nothing more."""
+        """Instant before which a receiver's next velocity adds no information."""
         self._ways: dict[str, WayTurns] = {}
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
     def unproven(self, estimator: Estimator) -> str | None:
-        """Reason why a solution with these biases is not vouched for before the course has turned:
-        one that the data sheet does not allow; None where they are like it."""
+        """Reason why a solution with biases outside the data sheet is unproven before the course
+        has turned; None for normal biases."""
         if self.fits:
             return None
         model = estimator.model
@@ -199,8 +199,8 @@ class RateUnits:
     def fix(
         self, m: object, t_ns: int, imu: ImuBuffer, measurements: Sequence[AidingMeasurement]
     ) -> None:
-        """A measurement, valid at `t_ns`, as the measurements it stands for: velocities count, and
-        positions of a source that gives none."""
+        """Add a measurement valid at `t_ns`, as its aiding measurements: velocities count, and
+        positions of a source without velocities."""
         if not isinstance(m, PositionFix) or m.v_ned_m_s is None:
             for measurement in () if self.fits else measurements:
                 for candidate in measurement.candidates():

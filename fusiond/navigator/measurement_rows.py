@@ -1,4 +1,4 @@
-"""Measurements of a timeline as rows of numbers, for runs of an estimator over many of them."""
+"""Timeline measurements as packed rows, for batches of an estimator."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZE - BODY) + 1)]
-"""By the length of a body: what makes a row of it."""
+"""Padding by length of a body."""
 
 
 @dataclass(slots=True, eq=False)
@@ -55,14 +55,14 @@ class MeasurementRows:
         self._model = estimator.model
         self._noise = np.zeros((0, NOISE_SIZE))
         self._known: dict[str, Span] = {}
-        """By source."""
+        """Known spans by source."""
         self._batch = 0
         self._spans: list[Span] = []
-        """Those of a batch."""
+        """Spans of a batch."""
 
     def packed(self, measurement: AidingMeasurement) -> tuple[bytes, object, Span | None]:
-        """A measurement's row, what a frozen sensor would repeat of it, and the span of its source;
-        none of one that has no row."""
+        """Row of a measurement, the value that a frozen sensor would repeat, and the span of its
+        source; empty for a measurement without a row."""
         bank = None if measurement.robust else self._bank
         packed = None if bank is None else measurement.packed(self._model)
         if bank is None or packed is None:
@@ -75,7 +75,7 @@ class MeasurementRows:
         return row + body + _PADDING[len(body)], value, span
 
     def _new(self, measurement: AidingMeasurement, bank: Hypotheses) -> Span:
-        """Span of a source that has not been heard."""
+        """Span of a new source."""
         number, asked = len(self._known), 0
         self._noise = np.zeros((number + 1, NOISE_SIZE))
         if not measurement.constraint:
@@ -86,9 +86,9 @@ class MeasurementRows:
     def batch(
         self, entries: Sequence[Entry], which: range, diagnosis: Diagnosis, until_ns: int
     ) -> tuple[Array, Array] | None:
-        """The first `which` of entries up to one that has no row, or of which more is to be judged:
-        a series that is not nominal, a value that repeats itself; or that is not before `until_ns`.
-        Rows (k, SIZE), and the noise scales of all series (s, .); None of none."""
+        """First of `which` entries that can run as one batch: before `until_ns`, with rows, nominal
+        series and no repeated values. Rows (k, SIZE), and the noise scales of all series (s, .);
+        None for an empty batch."""
         rows, spans = [], self._spans
         spans.clear()
         self._batch = number = self._batch + 1
@@ -117,8 +117,7 @@ class MeasurementRows:
         return np.frombuffer(bytearray().join(rows)).reshape(-1, SIZE), self._noise
 
     def went_on(self, entries: Sequence[Entry], results: Array) -> list[Outcome]:
-        """Tell the series of a batch that so many of its measurements have come, with these
-        results; their outcomes."""
+        """Update the series of a batch with its results; the outcomes."""
         outcomes = []
         for entry, result in zip(entries, results[:, :INNOVATION].tolist(), strict=True):
             became, nis, moves, count, *whitened = result
@@ -137,7 +136,7 @@ class MeasurementRows:
 
 
 def raw_of(result: Sequence[float], degrees: int) -> RawInnovation | None:
-    """Raw innovation of one, by what a run has made of it; None where it did not apply."""
+    """Raw innovation of a result of a batch; None if not applied."""
     if degrees == 0:
         return None
     columns = [list(result[at : at + 6]) for at in range(OF_STATE, OF_STATE + 6 * degrees, 6)]

@@ -10,7 +10,7 @@ from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.aiding.standstill import Rest, ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.configuration.constraints import Constraints, NonHolonomic
-from fusiond.configuration.settings import DEG, quiet_limits
+from fusiond.configuration.si_units import DEG, quiet_limits
 from fusiond.models.blocks import Block, ImuNoise
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -43,7 +43,7 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
 
 
 class ConstraintMaker:
-    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
+    """Maker of the constraints of `[constraints]` from samples in chunks of any size.
 
     `noise` is the IMU's; `rest_evidence` hears of what is measured; `drifts` say how much of the
     typed side drift counts.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.measurements import Measurement
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.finite_check import first_not_finite
 from fusiond.estimators.invariant import InvariantFilter
@@ -126,7 +126,7 @@ class Navigator:
         self.started: Start | None = None
         self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
-        """A start to be tried before any alignment, and its trial."""
+        """Warm start on trial, attempted before any alignment."""
         self._calibration: SavedCalibration | None = None
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._latency = LatencySearch(
@@ -145,7 +145,7 @@ class Navigator:
 
     @property
     def calibration(self) -> SavedCalibration | None:
-        """Calibration of an earlier drive, taken up by each alignment until it is refuted."""
+        """Calibration of an earlier drive, restored by each alignment until refuted."""
         return self._calibration
 
     @calibration.setter
@@ -157,7 +157,7 @@ class Navigator:
             self._drifts.take_up(noise.drifts)
 
     def shown_noise(self, utc_s: float | None) -> SavedNoise:
-        """Noise of receivers, inertial unit and vehicle as shown until that time (POSIX)."""
+        """Observed noise of receivers, inertial unit and vehicle until that time (POSIX)."""
         of_samples = self._imu_noise.shown
         return SavedNoise(utc_s, self._intake.fixes_shown, *of_samples, self._drifts.shown)
 
@@ -167,7 +167,8 @@ class Navigator:
         self.verdicts = verdicts_of(self.config, self.model, self._event)
 
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
-        """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.
+        """Add IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; returns the
+        number used.
 
         What cannot be true is refused by name; what leaves too much unknown ends the navigation:
         alignment begins anew (fusiond.navigator.imu_screening).
@@ -195,7 +196,7 @@ class Navigator:
         return self._restart(reason("imu_spare"))
 
     def _restart(self, why: str) -> None:
-        """Nothing that the samples so far have told counts any more."""
+        """Discard the evidence of all earlier samples."""
         saved = self._saved if self.started is None else None
         self.imu.restart()
         self.reset(why, saved)
@@ -245,7 +246,7 @@ class Navigator:
         return "accepted"
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
-        """Forget the solution and align anew, with a saved state if it still holds."""
+        """Discard the solution and align again, with a saved state if still valid."""
         self._latency.stop()
         self.timeline.clear()
         self._protection.restart()
@@ -257,9 +258,9 @@ class Navigator:
     def set_position(
         self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float, t_ns: int
     ) -> str:
-        """An operator's position at `t_ns`, which is now: the fix to align by (`aligning`), or to
-        begin by where there is no inertial unit (`beginning`), or a fix like any other, whose
-        outcome is returned."""
+        """Apply an operator's position at the present `t_ns`: as the fix for alignment
+        (`aligning`), as the start without an inertial unit (`beginning`), or as an ordinary fix,
+        whose outcome is returned."""
         where, without = (lat_rad, lon_rad, height_m), self.without_imu
         if without.takes_over(t_ns, self.imu):
             return without.take_position(operator_position(t_ns, where, sd_m), t_ns) or "beginning"
@@ -275,13 +276,12 @@ class Navigator:
     # ------------------------------------------------------------------ running
 
     def tick(self, t_ns: int) -> None:
-        """It is `t_ns`: `advance`, and navigate by what there is where no inertial unit says
-        anything."""
+        """Advance to `t_ns`, without an inertial unit if none delivers samples."""
         self.advance()
         self.without_imu.tick(t_ns, self.imu, self.started is not None)
 
     def advance(self, record: bool = False) -> None:
-        """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
+        """Run up to the last IMU sample. `record` stores the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
             if (
@@ -373,7 +373,7 @@ class Navigator:
         return True
 
     def _warm_start(self) -> Start | None:
-        """The start from the state of the last run, at the first sample; there is one attempt."""
+        """Start from the last run's state at the first sample, once."""
         if self.warm is None or not self.imu.end:
             return None
         try:
@@ -385,13 +385,12 @@ class Navigator:
 
     @property
     def on_trial(self) -> bool:
-        """Started from the state of the last run, and no position measurement has confirmed it
-        yet."""
+        """True after a warm start that no position measurement has confirmed yet."""
         return self.warm is not None and self.warm.on_trial
 
     @property
     def unconfirmed(self) -> str:
-        """Condition of the heading that nothing has shown, in words; empty where it does not."""
+        """Unproven condition of the heading, as text; empty without one."""
         if self.warm is not None and self.warm.on_trial:
             return reason("not_confirmed_by_fix")
         return self._start_check.unconfirmed if self._start_check else ""
@@ -432,7 +431,7 @@ class Navigator:
 
     @property
     def active_filter(self) -> Estimator:
-        """The estimator of which the solution is."""
+        """Estimator of the solution."""
         return self.without_imu.estimator or self.estimator
 
     def outcomes(self) -> dict[str, Counter[str]]:

@@ -1,4 +1,4 @@
-r"""Share of the noise in IMU samples that attitude and velocity integrate: predictions, judged.
+r"""Share of the IMU noise that integrates into attitude and velocity, estimated from predictions.
 
 What engine and road shake into the samples bounds the noise of a sensor (fusiond.navigation.
 vibration). A part of it is motion that the sensors measure, and vibration that averages out later
@@ -46,28 +46,28 @@ EVERY_NS = 10_000_000_000
 """Length of a prediction. After ten seconds the noise of a shaken gyro is most of what a velocity
 is wrong by."""
 COUNTS_NS = SETTLES_NS + EVERY_NS
-"""From so long after a prediction ends what it has shown counts for the samples: when it is judged
-many of them may have come, and one share counts for the whole of another prediction."""
+"""Delay after a prediction's end from which its result counts for samples: many of them may have
+arrived when it is judged, and another prediction needs one share throughout."""
 GRID: Final = 2.0 ** -np.arange(0.0, 10.5, 0.5)
 """Shares of the density: all of it, down to a thirtieth of the sigma."""
 KNOWN = 0.25
 """Share of a predicted variance: no more may be left of the velocity's with measurements."""
 HEADING_SD_RAD = math.radians(5.0)
-"""Beyond it what a velocity is wrong by is no linear function of the heading."""
+"""Largest heading sigma for which velocity errors are linear in the heading."""
 FORGETS = 60.0
-"""Predictions, ten minutes of them: streets and loads change."""
+"""Predictions after which old ones are forgotten, ten minutes: streets and loads change."""
 FIRST = 2.0
-"""Predictions that it counts that all is noise, before any has been judged: a filter that has once
-been too sure of its tilt stays so."""
+"""Prior weight of full noise, in predictions: a filter that was too sure of its tilt once stays so.
+"""
 RARE = 25.0
 """Five sigma: what is beyond is no noise."""
 _NOTHING = 1e18
-"""Share of a filter whose noise counts nothing."""
+"""Share of negligible noise."""
 _VELOCITY = slice(DV, DV + 3)
 _SHOWN_BY = ((0, 1), (1, 0), (5, 2))
-"""Sensor (of rates and forces) and the axis of a velocity, forward, right or down, that shows its
-noise: gravity goes forward with a pitch and to the right with a roll. Noise of the others is small
-beside it, and tells nothing: all of it counts."""
+"""Sensor (of rates and forces) and velocity axis, forward, right or down, that reveal its noise:
+gravity acts forward with a pitch and to the right with a roll. Other sensors' noise is small beside
+it and keeps its full value."""
 
 
 class _Predictor(KalmanEstimator):
@@ -77,7 +77,7 @@ class _Predictor(KalmanEstimator):
         super().__init__(model, gap_s, (_NOTHING, 1.0))
 
     def begin(self, e: Estimator) -> None:
-        """From another's state on."""
+        """Start from another estimator's state."""
         self.initialise(e.t_ns, e.sample, e.nav, e.xi, e.covariance)
         self.step[:] = e.state.step
         n = self.model.size
@@ -90,14 +90,14 @@ class _Predictor(KalmanEstimator):
 
 
 class NoiseShares:
-    """Of one unit, prediction by prediction; each lasts `EVERY_NS`."""
+    """Noise shares of one unit, by predictions of `EVERY_NS`."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         self._predictor = _Predictor(model, gap_s)
         self._log = np.zeros((3, len(GRID)))
         self._count = 0.0
         self._counted = [(0, np.ones(3))]
-        """From when on (ns) which shares count, those that a prediction may still be made of."""
+        """Start (ns) of each share's validity, while predictions may need it."""
         self._begins_ns = -1
         """Begin of the prediction that is under way; -1 where none is."""
 
@@ -108,7 +108,7 @@ class NoiseShares:
         return self._count, tuple(log.ravel().tolist())
 
     def take_up(self, predictions: float, log_likelihoods: tuple[float, ...]) -> Array:
-        """Begin with what another drive has shown; the shares (6,) that count."""
+        """Resume with another drive's result; the shares (6,) in force."""
         self._count = predictions
         self._log = np.array(log_likelihoods).reshape(3, -1)
         shares = self._shares()
@@ -116,11 +116,11 @@ class NoiseShares:
         return _of_sensors(shares)
 
     def restart(self) -> None:
-        """The filter has been started anew: a prediction that is under way has no end."""
+        """Restart with the filter; the present prediction is dropped."""
         self._begins_ns = -1
 
     def begin(self, e: Estimator) -> None:
-        """A prediction from the filter's state on, where its heading is known."""
+        """Start a prediction from the filter's state, if the heading is known."""
         known = bool(e.covariance[PHI + 2, PHI + 2] < HEADING_SD_RAD**2)
         self._begins_ns = e.t_ns if known else -1
         if known:
@@ -132,8 +132,8 @@ class NoiseShares:
             self._predictor.propagate(imu, t_ns)
 
     def end(self, e: Estimator) -> Array | None:
-        """Judge the prediction by the filter's state at its end; the shares (6,) that count after
-        `COUNTS_NS`, None where it has told nothing."""
+        """Judge the prediction by the filter's state at its end; the shares (6,) valid after
+        `COUNTS_NS`, None without a result."""
         p, since_ns = self._predictor, self._begins_ns
         self._begins_ns = -1
         if since_ns < 0 or e.t_ns - since_ns != EVERY_NS or p.t_ns != e.t_ns:
@@ -160,7 +160,7 @@ class NoiseShares:
         return _of_sensors(shares)
 
     def _shares(self) -> Array:
-        """Of noise that shows forward, to the right and down."""
+        """Shares of noise that acts forward, to the right and down."""
         weight = np.exp(self._log - self._log.max(axis=1, keepdims=True))
         mean = weight @ GRID / weight.sum(axis=1)
         found: Array = (self._count * mean + FIRST) / (self._count + FIRST)
@@ -168,7 +168,7 @@ class NoiseShares:
 
 
 def _of_sensors(shares: Array) -> Array:
-    """Of rates and forces (6,)."""
+    """Shares of rates and forces (6,)."""
     found = np.ones(6)
     for sensor, axis in _SHOWN_BY:
         found[sensor] = shares[axis]

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from fusiond.navigator.protection_levels import Level, Levels
 
 RETURN_NS = 5_000_000_000
-"""The levels must have been inside the limits for this long before the alarm ends: a level that
-moves about its limit is one alarm. An alarm begins at once."""
+"""Time inside the limits that ends an alarm, so that a level near its limit gives a single alarm.
+An alarm begins at once."""
 
 
 NO_BOUND = Bound(BoundState.OFF)
@@ -45,7 +45,7 @@ class ProtectionWatch:
 
             self._levels = Levels(config, estimator)
         self.watches = self._levels is not None
-        """True if there are levels."""
+        """True if levels are computed."""
         self._event = on_event
         self._limits = options.horizontal_alert_limit_m, options.vertical_alert_limit_m
         self._beyond = False
@@ -58,17 +58,17 @@ class ProtectionWatch:
             self._levels.look(measurement)
 
     def restart(self) -> None:
-        """The solution begins anew: what was heard said nothing of it."""
+        """Restart with the solution, without earlier data."""
         if self._levels is not None:
             self._levels.restart()
         self._last = None
 
     def unknown(self) -> Bound:
-        """Without a solution."""
+        """Levels without a solution."""
         return Bound(BoundState.OFF if self._levels is None else BoundState.UNKNOWN)
 
     def bound(self) -> Bound:
-        """Of the estimator's state."""
+        """Levels of the estimator's state."""
         if self._levels is None:
             return Bound(BoundState.OFF)
         last = self._last
@@ -78,7 +78,7 @@ class ProtectionWatch:
         return Bound(state, found.hpl_m, vertical)
 
     def report(self) -> None:
-        """Compute the levels of the estimator's present state, with events where they pass."""
+        """Compute the levels of the estimator's present state; events where they pass a limit."""
         if self._levels is None:
             return
         t_ns, found = self._levels.t_ns, self._levels.now()

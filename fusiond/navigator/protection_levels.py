@@ -33,7 +33,7 @@ class Level(NamedTuple):
 
 
 class Levels:
-    """Of an estimator's present state."""
+    """Levels of an estimator's present state."""
 
     def __init__(self, config: Config, estimator: SeparatedEstimator) -> None:
         options = config.integrity
@@ -63,7 +63,7 @@ class Levels:
             self._epochs.look(measurement, self._estimator.state)
 
     def restart(self) -> None:
-        """The solution begins anew: what was heard said nothing of it."""
+        """Restart with the solution, without earlier data."""
         self._epochs.clear()
 
     def now(self) -> Level:

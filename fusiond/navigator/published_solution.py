@@ -1,4 +1,4 @@
-"""The estimator's state as a solution, at its own instant or later.
+"""Solution from the estimator's state, at its own instant or later.
 
 Once the inertial unit is silent for longer than a solution is carried ahead by its last sample
 nobody knows what the vehicle does. For each second of that, one sigma is that what it did last goes
@@ -25,7 +25,7 @@ from fusiond.navigation.strapdown import NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RA
 
 _SIZE = NAV_SIZE + 3
 SLOW_M_S = 5.0
-"""A car turns by its steering, not faster the slower it is: 0.75 m/s^2 are 9 deg/s then."""
+"""Speed below which a car's turn rate is limited by its steering: 0.75 m/s^2 are 9 deg/s."""
 
 
 def solution_of(
@@ -77,7 +77,7 @@ def solution_of(
 
 
 def _widen_by_silence(sd: list[float], v: Vector3, e: Estimator, s: float, drives: Vector3) -> None:
-    """Add to sigma (9,) what the vehicle may have done for `s` seconds."""
+    """Add the possible motion of `s` seconds to sigma (9,)."""
     step, (north, east, down), (level, vertical, lasts_s) = e.step, v, drives
     pull = math.hypot(step.item(STEP_SMOOTH_N), step.item(STEP_SMOOTH_N + 1)) + level
     banked = min(s / lasts_s, 1.0) * pull / STANDARD_GRAVITY_M_S2
@@ -90,8 +90,8 @@ def _widen_by_silence(sd: list[float], v: Vector3, e: Estimator, s: float, drive
 
 
 def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:
-    """A receiver's clock has shown to be none to publish by: from the next start on it is the
-    filter's own, the IMU's.
+    """Publish by the filter's own clock, the IMU's, from the next start on, since the receiver's
+    clock is unusable.
 
     That is known as well as what lies between it and the clock of a receiver that is on time: what
     the model takes for granted of that before anything shows it, or `sd_s`, one sigma of how late

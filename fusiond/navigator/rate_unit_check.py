@@ -71,9 +71,9 @@ DIRECTED_RAD = 0.25 * math.pi
 
 
 class _Chord(NamedTuple):
-    """From one fix to the next: the middle of its time (s), its direction (rad), sigmas of the
-    direction by either end (rad), whether it begins where the one before ended, and for each of
-    `UNITS` the direction by the gyro and its sigma (rad)."""
+    """Chord between fixes: middle (s), direction (rad), sigmas of the direction by either end
+    (rad), contiguity with the chord before, and for each of `UNITS` the direction by the gyro and
+    its sigma (rad)."""
 
     middle_s: float
     course: float
@@ -84,7 +84,7 @@ class _Chord(NamedTuple):
 
 
 class WayTurns:
-    """Turns by the gyro against those of the way; `bias_sd` (rad/s) is that of the data sheet."""
+    """Turns by the gyro against those of the track; `bias_sd` (rad/s) is the data sheet's."""
 
     def __init__(self, bias_sd: float) -> None:
         self._bias_sd = bias_sd
@@ -127,8 +127,7 @@ class WayTurns:
             self._waiting.append(position)
 
     def log_odds(self) -> float:
-        """2 ln (L_1 / L_57) where the likelier of the two fits, of all that is remembered; 0 where
-        neither does."""
+        """Log odds 2 ln (L_1 / L_57) where the likelier unit fits; 0 where neither does."""
         if len(self._chords) < 3:
             return 0.0
         costs = [self._likelihood(unit) for unit in range(len(UNITS))]
@@ -146,7 +145,7 @@ class WayTurns:
         self._chords.clear()
 
     def _reach(self, position: PositionCandidate) -> None:
-        """The samples reach as far as a fix: a chord ends with it, if it is far enough away."""
+        """End a chord at a fix that the samples have reached, if it is far enough away."""
         last = self._last
         if last is None or position.t_ns - last.t_ns > LONGEST_NS or last.t_ns < self._times[0]:
             self._begin(position, follows=False)
@@ -177,7 +176,7 @@ class WayTurns:
         del self._times[:old], self._turned[:old]
 
     def _likelihood(self, unit: int) -> tuple[float, bool]:
-        """-2 ln L of a unit, but for what both have in common, and whether it fits."""
+        """Value -2 ln L of a unit, without common terms, and True if it fits."""
         chords, n = self._chords, len(self._chords)
         since_s = chords[0].middle_s
         t = np.array([chord.middle_s - since_s for chord in chords])
@@ -215,7 +214,7 @@ def _directions(faced: Array) -> tuple[float, float]:
 
 
 def _unwound(angles: Sequence[float], sds: Array) -> Array:
-    """Angles (n,) without the turns between them: each by the last one that is known well."""
+    """Unwrap angles (n,), each by the last well-known one."""
     found, reference = np.empty(len(angles)), 0.0
     for i, angle in enumerate(angles):
         found[i] = reference + math.remainder(angle - reference, 2.0 * math.pi)

@@ -50,14 +50,14 @@ from fusiond.gnss.store import EphemerisStore
 Array = NDArray[np.float64]
 
 REMEMBERED_NS = 12_000_000_000
-"""Epochs older than that are too old for the timeline, which goes back by ten seconds."""
+"""Age beyond which epochs are too old for the timeline, which rewinds by ten seconds."""
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """Names of screened rows in `health`; everything else is `gated`."""
 
 
 NOTHING = np.zeros((3, 3))
 NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING)
-"""Of an epoch without satellites."""
+"""Rows of an epoch without satellites."""
 
 
 class Seen(NamedTuple):
@@ -82,7 +82,7 @@ class Sky:
 
 
 class _Corrected(NamedTuple):
-    """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
+    """Corrected epoch for a vehicle near `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
 
     place: tuple[float, float, float]
     followed: Followed
@@ -93,10 +93,9 @@ class _Corrected(NamedTuple):
 
 @dataclass(slots=True)
 class _Memory:
-    """Result of an epoch, and whether its refused satellites have been counted. `left` is
-    what the filter's last run over it leaves to the next. `followed` is the epoch after the one
-    whose `kept` is `after`, and `kept` what is known of carriers then; `displacement` and
-    `levels` are those of its sky, once it has been corrected."""
+    """Cached results of an epoch. `left` is the output of the filter's last run for the next epoch.
+    `followed` is the epoch after the one whose `kept` is `after`, and `kept` its carriers' state;
+    `displacement` and `levels` belong to its sky, once corrected."""
 
     corrected: _Corrected | None = None
     counted: bool = False
@@ -109,13 +108,13 @@ class _Memory:
     levels: Levels | None = None
 
     def is_after(self, before: _Memory) -> bool:
-        """True if the epoch has been followed from that one."""
+        """True if the epoch was followed from that one."""
         return self.followed is not None and self.after is before.kept
 
 
 @immutable(eq=False)
 class RawEpochMeasurement(AidingMeasurement):
-    """An epoch whose signals have been chosen, to be corrected where the filter is at its instant.
+    """Epoch with chosen signals, corrected for the filter's position at its instant.
 
     So the order of arrival leaves no trace: what an epoch comes to depends on the state at its own
     instant, not on how far the filter had got when the epoch came in.
@@ -135,7 +134,7 @@ class RawEpochMeasurement(AidingMeasurement):
         return RANGE_BIAS
 
     def at(self, nav: Array) -> PseudorangeMeasurement:
-        """The epoch's ranges for a vehicle there; it may have no satellites left."""
+        """Ranges of the epoch for a vehicle at `nav`; possibly without satellites."""
         lat, lon, height = nav[:3].tolist()
         followed = self.receiver.followed(self)
         found, key = self.memory.corrected, (lat, lon, height)
@@ -166,7 +165,7 @@ class RawEpochMeasurement(AidingMeasurement):
 
 @immutable(eq=False)
 class LevelEpoch(AidingMeasurement):
-    """An epoch for a vehicle whose attitude nobody knows (`AidingMeasurement.without_attitude`)."""
+    """Epoch for a vehicle of unknown attitude (`AidingMeasurement.without_attitude`)."""
 
     screened: ClassVar[bool] = True
     locates: ClassVar[bool] = True
@@ -180,7 +179,7 @@ class LevelEpoch(AidingMeasurement):
         return RANGE_BIAS
 
     def at(self, nav: Array) -> PseudorangeMeasurement:
-        """The epoch's ranges for a vehicle there."""
+        """Ranges of the epoch for a vehicle at `nav`."""
         return self.epoch.at(nav).without_attitude(self.way)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -194,8 +193,8 @@ class LevelEpoch(AidingMeasurement):
 
 
 class RawGnss:
-    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`; `recent` are its
-    last epochs in the order of time."""
+    """Raw data of one receiver. `refused` counts satellites by reason, `<system>_<reason>`;
+    `recent` are its last epochs in order of time."""
 
     def __init__(self, source: str, section: RawAiding) -> None:
         self.source = source
@@ -214,18 +213,18 @@ class RawGnss:
         self._counted_ns = -1
         self.recent: list[RawEpochMeasurement] = []
         self._forgotten: tuple[Displacement | None, Levels | None] = None, None
-        """Those of the last sky before them."""
+        """Levels of the last sky before the recent epochs."""
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
-        """Keep what a satellite has said."""
+        """Store a satellite's message."""
         replaced = self._store.replaced
         self._store.add(message)
         if self._store.replaced > replaced and isinstance(message, Ephemeris):
             self.refused[f"{message.system}_number_of_another"] += 1
 
     def measurement(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochMeasurement:
-        """The epoch as a measurement, with the ephemerides that are known by now."""
+        """Make a measurement of an epoch, with the present ephemerides."""
         picked = self._model.pick(epoch)
         measurement = RawEpochMeasurement(self.source, t_ns, self.gate, self, epoch, picked)
         insort(self.recent, measurement, key=_instant)
@@ -239,8 +238,8 @@ class RawGnss:
         return measurement
 
     def followed(self, measurement: RawEpochMeasurement) -> Followed:
-        """The epoch after all that are known by now to be before it, in whatever order they came:
-        one that came late changes those behind it."""
+        """Epoch followed through all earlier ones, in any order of arrival: a delayed epoch changes
+        later ones."""
         recent = self.recent
         at = bisect_left(recent, measurement.t_ns, key=_instant)
         while (
@@ -291,8 +290,7 @@ class RawGnss:
     def correct(
         self, measurement: RawEpochMeasurement, followed: Followed, guess: Array
     ) -> tuple[Rows, PseudorangeMeasurement]:
-        """An epoch's rows for a vehicle at about `guess` (ECEF, m), and what they are as a
-        measurement."""
+        """Rows of an epoch for a vehicle near `guess` (ECEF, m), and their measurement."""
         rows = self._model.evaluate(followed, guess)
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
@@ -340,7 +338,8 @@ class RawGnss:
         levels: Levels,
         before: Displacement | None,
     ) -> tuple[Displacement, tuple[Array, Array] | None]:
-        """Displacement by the sky of an epoch, and what of it the epoch before had; None: all."""
+        """Displacement by an epoch's sky, and the part carried over from the epoch before; None:
+        all."""
         if not rows.satellites:
             return NOWHERE, None
         memory, t_s = measurement.memory, levels.t_s

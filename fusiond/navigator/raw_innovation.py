@@ -24,9 +24,9 @@ from fusiond.aiding.base import Linearised, NotApplicable, State
 from fusiond.estimators.base import Estimator
 
 PARTS: tuple[tuple[int, Literal["m", "m/s"]], ...] = ((3, "m"), (0, "m/s"))
-"""First of the columns of velocity and position that are the position's, and the velocity's."""
+"""First columns of position and of velocity."""
 VELOCITY_AND_POSITION = slice(3, 9)
-"""Those columns in the error state."""
+"""Columns of velocity and position in the error state."""
 
 
 class RawInnovation(NamedTuple):
@@ -39,7 +39,8 @@ class RawInnovation(NamedTuple):
 
 
 def raw_innovation(measurement: Linearised, estimator: Estimator) -> RawInnovation | None:
-    """Of a measurement that is about to be applied; None where it measures neither."""
+    """Raw innovation of a measurement before its update; None if it measures neither position nor
+    velocity."""
     if measurement.screened or math.isfinite(measurement.period):
         return None
     e = estimator
@@ -50,7 +51,7 @@ def raw_innovation(measurement: Linearised, estimator: Estimator) -> RawInnovati
 
 
 def of_rows(z: list[float], of_state: list[list[float]]) -> RawInnovation | None:
-    """Of an innovation (m,) and what its rows have of velocity and position (m, 6)."""
+    """Raw innovation from an innovation (m,) and its rows for velocity and position (m, 6)."""
     for first, unit in PARTS:
         h = [row[first : first + 3] for row in of_state]
         axes = [k for k in range(3) if any(row[k] for row in h)]

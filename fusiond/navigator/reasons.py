@@ -17,7 +17,7 @@ JOIN = "; "
 
 
 class Reason(NamedTuple):
-    """One reason: a template of its text, and the operator's next step."""
+    """Reason of a mode: a template of its text, and the operator's next step."""
 
     weight: Weight
     text: str

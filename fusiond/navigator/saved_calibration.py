@@ -81,9 +81,8 @@ Sigma = Annotated[float, Field(gt=0.0, le=1e3)]
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedCalibration:
-    """Value and one sigma of each observed parameter by its published name; `configuration` is the
-    digest of what they lie beyond; and what was shown of noise. Raises pydantic's `ValidationError`
-    for what is none."""
+    """Value and one sigma of each observed parameter by published name, with the observed noise;
+    `configuration` is the digest of the configured values. Raises pydantic's `ValidationError`."""
 
     configuration: Annotated[str, Field(max_length=64)]
     values: Annotated[dict[Name, tuple[Value, Sigma]], Field(max_length=64)]
@@ -92,12 +91,12 @@ class SavedCalibration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters, and fixes whose errors are known."""
+        """Names of parameters, and of fixes with known errors."""
         return (*self.values, *(self.noise.fixes if self.noise is not None else ()))
 
     def taken_up(self, start: Start, model: Model) -> Start:
-        """The start with these parameters: their sigma is that of then and what may have
-        changed, at most that of the configuration."""
+        """Start with these parameters: their saved sigma grown by the possible change, at most the
+        configured one."""
         xi, p = start.xi.copy(), start.covariance.copy()
         for s in calibration_slots(model):
             if s.name not in self.values:
@@ -110,9 +109,9 @@ class SavedCalibration:
         return replace(start, xi=xi, covariance=p)
 
     def refuted(self, parameters: Iterable[Parameter]) -> str | None:
-        """Contradiction of a saved calibration once it was taken up: a value that has left it by
-        four sigma of what may have changed, one time in 16,000 by chance. An offset in time may
-        wander anywhere on a long drive. None where nothing does."""
+        """Contradiction of a restored calibration: a value beyond four sigma of the possible
+        change, by chance one time in 16,000. Offsets in time may wander on a long drive. None
+        without one."""
         for p in parameters:
             if p.name in self.values and p.kind not in WANDERING:
                 value, sd = self.values[p.name]
@@ -126,7 +125,7 @@ _SAVED = TypeAdapter(SavedCalibration)
 
 
 def mounting_digest(config: Config) -> str:
-    """Twelve hexadecimal digits that change with any value that a calibration lies beyond."""
+    """Digest of twelve hexadecimal digits over the values to which a calibration refers."""
     imu, slip = config.imu, config.constraints.non_holonomic
     about: dict[str, Any] = {
         "axes": imu.axes,
@@ -161,7 +160,7 @@ def save_calibration(path: Path, saved: SavedCalibration) -> None:
 
 
 def load_calibration(path: Path, model: Model, digest: str) -> SavedCalibration | None:
-    """The saved calibration, None if there is none.
+    """Saved calibration; None without a valid one.
 
     Raises `DamagedStateError` for what is none, `RefusedStateError` for one of another mounting.
     """

@@ -1,4 +1,4 @@
-"""Noise that a drive has shown, for the next start: it counts less then, and less with age.
+"""Saved noise estimates for the next start, with less weight, and less with age.
 
 Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
 divide (fusiond.aiding.fix_errors), which share of what the samples show is noise

@@ -1,4 +1,4 @@
-"""The last solution on disk, so that a restart at the same place needs no new heading."""
+"""Last solution on disk, so that a restart at the same place needs no new heading."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedState:
     """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s); no
-    height where it is not known.
+    height if unknown.
 
     Raises pydantic's `ValidationError` for what no vehicle can have.
     """
@@ -42,9 +42,9 @@ class SavedState:
     yaw_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)]
     sd_yaw_rad: Annotated[float, Field(gt=0.0, le=2.0 * math.pi)]
     confirmed: bool = True
-    """True if anything has shown the heading but the claim that it was configured with."""
+    """True if a measurement has confirmed the heading, beside its configuration."""
     version: Literal[1] = 1
-    """Of this layout; files of before it was written have none and are the same."""
+    """Version of the layout; older files without it have the same one."""
 
 
 _SAVED = TypeAdapter(SavedState)
@@ -56,7 +56,7 @@ def save_state(path: Path, state: SavedState) -> None:
 
 
 def load_state(path: Path, now_utc_s: float | None, max_age_s: float) -> SavedState | None:
-    """The saved state, None if there is none.
+    """Saved state; None without a valid one.
 
     Raises `DamagedStateError` for what is none, `RefusedStateError` for one of the wrong time, or
     while the time (`now_utc_s`, POSIX) is not known.

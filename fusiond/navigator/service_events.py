@@ -15,9 +15,9 @@ class ServiceEvents:
         self._timeline, self._event = timeline, on_event
         self._isolates = timeline.estimator.isolates
         self._out: dict[str, str] = {}
-        """Told to be left out, and why."""
+        """Excluded series as reported, with reasons."""
         self._found_ns: dict[tuple[str, str], int] = {}
-        """By kind and device: the last finding that was seen."""
+        """Instant of the last finding by kind and device."""
 
     def report(self) -> bool:
         """Report changes of service; True if there are new findings.

@@ -1,4 +1,4 @@
-"""Faults that are not over, and the service of each source, as people are told.
+"""Active faults and the service of each source, for publication.
 
 A fault of a source lasts from its finding until every series that it spoils is nominal again: while
 one of them is out of service or on probation, and has been since that finding or before. A fault
@@ -16,19 +16,20 @@ from fusiond.integrity.service import Series, Service
 from fusiond.navigator.timeline import Timeline
 
 CORRECTED_SHOWN_NS = 60_000_000_000
-"""The longest usual interval of those who ask: Prometheus scrapes each minute by default."""
+"""Time for which a correction is shown: the longest usual polling interval, Prometheus's default of
+a minute."""
 WORST_FIRST = (Service.OUT, Service.PROBATION, Service.SUSPECTED, Service.NOMINAL)
 
 
 class Fault(NamedTuple):
-    """A finding that is not over, and the series that are out or on probation by it."""
+    """Active finding, and the series that it excludes or has on probation."""
 
     finding: Finding
     series: tuple[str, ...]
 
 
 class SourceService:
-    """Looks at what timeline and estimator leave out, and changes nothing of it.
+    """Service state of sources, read from timeline and estimator without a change.
 
     `names`: the estimator's own sources, of which a name may stand for several series.
     """
@@ -37,7 +38,7 @@ class SourceService:
         self._timeline, self._names = timeline, names
 
     def faults(self, t_ns: int) -> list[Fault]:
-        """Those that are not over at `t_ns`, the latest at the end."""
+        """Active faults at `t_ns`, the latest last."""
         diagnosis, found = self._timeline.diagnosis, []
         for finding in diagnosis.findings:
             if finding.kind.corrected:
@@ -76,7 +77,7 @@ def worst(states: Iterable[Service]) -> Service | None:
 
 
 def _suffers(finding: Finding, one: Series) -> bool:
-    """True if a series is out or on probation, and was out when that was found."""
+    """True if a series is out or on probation, and was out at the finding."""
     if one.state not in (Service.OUT, Service.PROBATION):
         return False
     spoils = finding.kind.spoils(one.device, one.locates, one.moves)

@@ -39,7 +39,7 @@ class RefusedStateError(Exception):
 
 
 def read_state(path: Path, kind: TypeAdapter[State]) -> State | None:
-    """The state at `path`, None where nothing is. Raises `DamagedStateError` for all else."""
+    """State at `path`, None without a file. Raises `DamagedStateError` for invalid contents."""
     try:
         # A pipe without a writer would hold up the start.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -65,7 +65,7 @@ def read_state(path: Path, kind: TypeAdapter[State]) -> State | None:
 
 
 def _checked(text: bytes) -> bytes:
-    """The text without its check, which is the right one. Raises `DamagedStateError`."""
+    """Text without its verified checksum. Raises `DamagedStateError`."""
     if not text.startswith(CHECK_BEGINS):
         return text
     state = b"{" + text[CHECK_SIZE:]
@@ -75,7 +75,7 @@ def _checked(text: bytes) -> bytes:
 
 
 def write_state(path: Path, text: bytes, durable: bool) -> None:
-    """Write `text`, a JSON object, with its check.
+    """Write `text`, a JSON object, with its checksum.
 
     Whole: whenever the process dies, the old file or the new one is there. OSError passes.
 
@@ -102,7 +102,7 @@ def write_state(path: Path, text: bytes, durable: bool) -> None:
 
 
 def set_aside(path: Path) -> str:
-    """Rename what lies at `path`, so that the next start does not meet it; what became of it.
+    """Rename an unusable file so that the next start ignores it; a description.
 
     What was put aside before gives way.
     """

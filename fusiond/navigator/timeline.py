@@ -40,11 +40,10 @@ MOST_WAITING = 4096
 
 @dataclass(slots=True)
 class Entry:
-    """A measurement on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been told a verdict of: a rewind applies it again. `error` is
-    what made it `failed`; `raw` is kept where the timeline `keeps_raw`. `row` is the measurement as
-    a row of numbers, empty where it has none, `value` what a frozen sensor would repeat and `span`
-    what is the same of all such rows of a source."""
+    """Measurement on the timeline with its latest outcome. `serial` distinguishes equal sources;
+    `judged`: a verdict has used its innovation, which a rewind computes again. `error` is the cause
+    of `failed`; `raw` is stored if `keeps_raw`. `row` is the packed measurement, empty without one,
+    `value` what a frozen sensor would repeat and `span` the constants of a source's rows."""
 
     key: Key
     measurement: AidingMeasurement
@@ -96,8 +95,8 @@ class Timeline:
         """True if entries are to have their raw innovation: a log wants it, at 10 us a
         measurement."""
         self.decided = True
-        """True if anything was decided since somebody set this to False: more than that
-        measurements that are in service were fused."""
+        """True after any decision since the last reset to False, beyond fusing measurements in
+        service."""
         self._keep_ns = round(keep_s * 1e9)
         self._checkpoint_ns = round(checkpoint_s * 1e9)
         self._on_outcome = on_outcome
@@ -127,7 +126,7 @@ class Timeline:
         self.imu.needed = self.estimator.sample
 
     def clear(self) -> None:
-        """Forget all that waits (the estimator is about to be started anew)."""
+        """Drop all waiting measurements, before a restart of the estimator."""
         del self._entries[: self._next], self._keys[: self._next]
         self._next = 0
         self._give_up(len(self._entries), "no_alignment")
@@ -145,7 +144,7 @@ class Timeline:
         return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
 
     def insert(self, measurement: AidingMeasurement, serial: int = 0) -> Entry:
-        """Put a measurement in its place; refused at once as `too_old` or `duplicate`."""
+        """Insert a measurement by validity; refused at once as `too_old` or `duplicate`."""
         # What is due to be fed back is fed back before anything of the same instant is applied: the
         # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
         # Of one instant, velocities come first: after an outage a false position passes its gate by
@@ -203,8 +202,8 @@ class Timeline:
 
     @contextmanager
     def past(self, t_ns: int) -> Iterator[None]:
-        """Within it the estimator is as it was at `t_ns`, from `oldest_ns` on, after every
-        measurement that was valid until then; afterwards it is as before, bit for bit.
+        """Context in which the estimator is as at `t_ns`, from `oldest_ns` on, after every
+        measurement valid until then; afterwards it is restored bit for bit.
 
         It is run from the checkpoint before, so it costs as much as a rewind to that instant, but
         not beyond it: nothing is counted and nobody is told.
@@ -230,8 +229,8 @@ class Timeline:
             self.diagnosis.restore(memory)
 
     def _run_rows(self, end: int, record: bool) -> bool:
-        """Run the estimator over the next entries, before `end`, that are rows of numbers of which
-        nothing is to be judged beyond gate and hypotheses; False where the next one is not."""
+        """Run the estimator over the next packed entries before `end` that need gate and hypotheses
+        only; False if the next one needs more."""
         runs, kept_ns = self.estimator.runs, self._checkpoints[-1].snapshot.t_ns
         if runs is None:
             return False
@@ -265,14 +264,14 @@ class Timeline:
         return outcome
 
     def _give_up(self, count: int, name: str) -> None:
-        """Drop the first `count` of those that wait."""
+        """Drop the first `count` waiting entries."""
         rows = slice(self._next, self._next + count)
         for entry in self._entries[rows]:
             self._count(entry, Outcome(name))
         del self._entries[rows], self._keys[rows]
 
     def _apply(self, entry: Entry) -> Outcome:
-        """An exception, wherever it comes from, costs the measurement."""
+        """Apply a measurement; an exception costs only that measurement."""
         estimator, diagnosis, self.decided = self.estimator, self.diagnosis, True
         try:
             if entry.feedback == "release":
@@ -343,7 +342,7 @@ class Timeline:
         return checkpoint.last_key is None or checkpoint.last_key < key
 
     def _forget(self, horizon_ns: int) -> None:
-        """Drop checkpoints and entries that nothing can need any more."""
+        """Drop checkpoints and entries that are no longer needed."""
         drop = 0
         while (
             drop + 1 < len(self._checkpoints)

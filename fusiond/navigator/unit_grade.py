@@ -1,4 +1,4 @@
-r"""Grade of an inertial unit within its class: by how much smaller its errors are.
+r"""Grade of an inertial unit within its class: the factor of its errors.
 
 A class is wide: sheets state limits, and a unit that somebody calls `consumer` may be ten times
 better. What a drive shows of biases and scale factors tells how good this one is. With b^ and P as
@@ -28,12 +28,12 @@ from fusiond.navigation.error_model import COLUMN_END, RATE_ERROR
 Array = NDArray[np.float64]
 
 GRID: Final = 4.0 ** np.arange(-4.0, 1.1, 0.25)
-"""Grades: a sixteenth of the sigmas of the class to twice those. The classes are six to ninety
-times apart from each other."""
+"""Grades: from a sixteenth to twice the sigmas of the class. Classes differ by factors of six to
+ninety."""
 
 
 class UnitGrade:
-    """Of a unit whose errors are states of `model`."""
+    """Grade of a unit whose errors are states of `model`."""
 
     def __init__(self, model: Model) -> None:
         slots = [s for column in range(RATE_ERROR, COLUMN_END) for s in model.parameters(column)]

@@ -1,4 +1,4 @@
-r"""A start from the state of a daemon that was killed moments ago: a gap of the IMU, no alignment.
+r"""Start from the state of a daemon killed moments ago: an IMU gap instead of an alignment.
 
 Over the gap T, from the snapshot's instant to the first IMU sample (exact, since both are of one
 monotonic clock), turn rate w and acceleration a of the vehicle are two Markov processes after
@@ -112,7 +112,7 @@ class WarmState:
 
 
 class WarmStart:
-    """The start from `state`, for a filter of `model`, and its trial.
+    """Start from `state` for a filter of `model`, and its trial.
 
     Raises `DamagedStateError` for a state that is none.
     """
@@ -121,9 +121,9 @@ class WarmStart:
         self._state, self._model = state, model
         self._covariance = _checked(state, model)
         self.on_trial = False
-        """Started by it, and no position measurement has confirmed it yet."""
+        """True after a warm start without confirmation by a position measurement."""
         self.refused_by: str | None = None
-        """The source of the position measurement that spoke against it."""
+        """Source of the position measurement that contradicted the state."""
 
     def start(self, t_ns: int) -> Start:
         """The start at `t_ns` (monotonic ns), the first IMU sample. Raises `RefusedStateError`."""
@@ -178,7 +178,7 @@ def warm_state(
 
 
 def same_run(state: WarmState, config: str, boot_id: str, asleep_ns: int) -> None:
-    """Raises `RefusedStateError` for a state whose clock or whose states are not of this run."""
+    """Check that a state belongs to this boot and configuration. Raises `RefusedStateError`."""
     if state.boot_id != boot_id:
         raise RefusedStateError("the computer was restarted since")
     if abs(state.asleep_ns - asleep_ns) > SUSPENDED_NS:
@@ -210,7 +210,7 @@ def _checked(state: WarmState, model: Model) -> Array:
 
 
 def _manoeuvre(estimator: Estimator, imu: ImuBuffer) -> tuple[float, float]:
-    """Rate of the heading (rad/s) and acceleration along the way (m/s^2), means of `MEAN_NS`."""
+    """Rate of the heading (rad/s) and longitudinal acceleration (m/s^2), means of `MEAN_NS`."""
     rows = slice(imu.index_after(estimator.t_ns - MEAN_NS), imu.index_after(estimator.t_ns))
     if rows.start == rows.stop:
         return 0.0, 0.0
@@ -223,7 +223,7 @@ def _manoeuvre(estimator: Estimator, imu: ImuBuffer) -> tuple[float, float]:
 
 
 def _gone_on(turn: float, push: float, t_s: float) -> tuple[float, float]:
-    """By how much heading (rad) and speed (m/s) have changed after `t_s`, most likely."""
+    """Most likely change of heading (rad) and speed (m/s) after `t_s`."""
     whole = MANOEUVRE_S * (1.0 - math.exp(-t_s / MANOEUVRE_S))
     return turn * whole, push * whole
 
@@ -251,7 +251,7 @@ def _after_gap(state: WarmState, model: Model, p: Array, t_ns: int, gap_s: float
 
 
 def _moved(state: WarmState, gap_s: float) -> tuple[Array, Array, float]:
-    """Velocity (3,) after the gap, the way until then (3,) in m, and how far it turned (rad)."""
+    """Velocity (3,) after the gap, displacement (3,) in m, and turn (rad)."""
     v = np.array(state.velocity)
     speed = float(np.hypot(*v[:2]))
     if speed <= SLOW_M_S:

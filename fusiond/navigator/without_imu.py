@@ -64,7 +64,7 @@ MOST_REMEMBERED = 128
 
 
 class _Received:
-    """A measurement that has come, and where the vehicle is by it alone, asked for once."""
+    """Received measurement, and the position that it alone gives, on demand."""
 
     __slots__ = ("_asked", "_position", "measurement")
 
@@ -75,7 +75,7 @@ class _Received:
 
     @property
     def position(self) -> PositionCandidate | None:
-        """Position by this measurement alone; None if it has none."""
+        """Position by this measurement alone; None without one."""
         if not self._asked:
             self._asked = True
             for candidate in self.measurement.candidates():
@@ -85,16 +85,16 @@ class _Received:
 
 
 def _slips_m_s(o: NonHolonomic) -> float:
-    """One sigma of the velocity across the vehicle's axis, where positions are measured; infinite
-    for one that may slide."""
+    """One sigma of the lateral velocity where positions are measured; infinite for a vehicle that
+    may slide."""
     forward, right, _ = o.lever_arm_m
     in_corners = CORNER_RAD_S * math.hypot(forward, right)
     return math.hypot(o.sd_m_s, o.drift_sd_m_s, in_corners) if o.enabled else math.inf
 
 
 class WithoutImu:
-    """Takes over where there is no inertial unit. `on_event(code, text)` hears of both changes,
-    `on_outcome` of each measurement; `last_fused_ns` by source is kept."""
+    """Navigation without an inertial unit. `on_event(code, text)` receives both changes,
+    `on_outcome` each measurement; `last_fused_ns` by source is kept."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class WithoutImu:
         self._event, self._on_outcome = on_event, on_outcome
         self._last_fused_ns = last_fused_ns
         self.estimator: Estimator | None = None
-        """Published solution, while this navigates."""
+        """Estimator of the published solution while active."""
         self._ended: dict[str, Counter[str]] = {}
         self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
         self._way = HeadingHistory(_slips_m_s(config.constraints.non_holonomic))
@@ -124,7 +124,7 @@ class WithoutImu:
 
     @property
     def active(self) -> bool:
-        """True if it navigates."""
+        """True while it navigates."""
         return self.estimator is not None
 
     def receive(self, measurements: Sequence[AidingMeasurement], seen_ns: int) -> None:
@@ -158,7 +158,8 @@ class WithoutImu:
         return None if entry is None or entry.outcome is None else entry.outcome.name
 
     def tick(self, t_ns: int, imu: ImuBuffer, navigating: bool) -> None:
-        """It is `t_ns`: begin, go on or end. `navigating`: inertial navigation has begun."""
+        """Start, continue or end navigation at `t_ns`. `navigating`: inertial navigation has
+        started."""
         since_ns = imu.latest_ns if imu.end else self._first_ns
         if since_ns is None:
             return
@@ -175,7 +176,7 @@ class WithoutImu:
             self._run(self.estimator, t_ns)
 
     def stop(self) -> None:
-        """Another navigates from now on, or all is to begin anew."""
+        """End, for a restart or another navigation."""
         self._ended, self.estimator = self.counted(), None
         self._recent.clear()
 
@@ -223,7 +224,7 @@ class WithoutImu:
     # ------------------------------------------------------------------ inside
 
     def _begin(self, since_ns: int) -> None:
-        """Start at the newest fix since the samples ended, if there is one."""
+        """Start at the newest fix since the samples ended, if any."""
         recent = [h for h in self._recent if h.measurement.t_ns > since_ns]
         newest_first = sorted(recent, key=lambda h: h.measurement.t_ns, reverse=True)
         fix = next((h.position for h in newest_first if h.position is not None), None)
@@ -305,7 +306,7 @@ def counted_together(
 
 
 def _sensed(nav: Array) -> Array:
-    """Rate and force (1, 6) of a vehicle in the state (10,) that keeps facing north, level, at its
+    """Rate and force (1, 6) of a level vehicle in the state (10,) that faces north at its
     velocity."""
     lat, height = float(nav[LAT]), float(nav[HEIGHT])
     north, east = float(nav[VN]), float(nav[VE])

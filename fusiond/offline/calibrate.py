@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import DEG, PER_ROOT_HOUR, imu_noise
+from fusiond.configuration.si_units import DEG, PER_ROOT_HOUR, imu_noise
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
@@ -53,8 +53,8 @@ from fusiond.offline.process import process
 
 Array = NDArray[np.float64]
 Pass = Callable[[Config, Callable[[Navigator], None]], dict[str, Any]]
-"""One run through the recorded drive with a configuration; the navigator is shown as it advances.
-Returns what `process` says."""
+"""Run through the recorded drive with a configuration, which shows the navigator as it advances;
+the report of `process`."""
 
 PASSES = 2
 # The solution is looked at this often (ns): a bend or a stop takes seconds.
@@ -88,8 +88,8 @@ SHOWN_BY = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A parameter as it should be configured: its value in published units under `key`, one sigma,
-    its state and what to say of it. `key` is empty where the configuration has none."""
+    """Recommended configuration of a parameter: its value in published units under `key`, one
+    sigma, state and text. `key` is empty where the configuration has none."""
 
     key: str
     value: float
@@ -112,7 +112,7 @@ class Calibration:
     result: dict[str, Any]
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Values for `--json`."""
         return {
             "parameters": {name: asdict(found) for name, found in self.findings.items()},
             "shown_s": self.shown_s,
@@ -268,14 +268,14 @@ class _Drive:
         return f"what was fused narrows its sigma by less than {share:.0f} %"
 
     def more(self, p: Parameter) -> str:
-        """Motion that would show more of it."""
+        """Motion that would determine it better."""
         shown = self.shown_s()
         said = ", ".join(f"{shown[what]:.0f} s of {what}" for what in SHOWN_BY[p.kind])
         return f"the drive has {said}: more is needed"
 
     def parameters(self) -> dict[str, Parameter]:
-        """By name, what is known at the end; of one that wanders (offsets in time) the mean over
-        the second half, and its spread. Roll beside the mounting's pitch and yaw."""
+        """Parameters by name at the end; of a varying one (offsets in time) the mean over the
+        second half, and its spread. Roll follows from the mounting's pitch and yaw."""
         if not self._history:
             return {}
         last_s = self._history[-1][0]
@@ -313,8 +313,8 @@ class _Drive:
         return Parameter(ROLL, MOUNTING, MOUNTING, value / DEG, sd / DEG, math.inf, state)
 
     def noise(self, imu: Imu) -> dict[str, tuple[float, float]]:
-        """Gyro (deg/sqrt(h)) and accelerometer (m/s/sqrt(h)), median of the rms of the axes, at
-        rest and while driving, where there is enough of it."""
+        """Gyro (deg/sqrt(h)) and accelerometer (m/s/sqrt(h)) noise, median of the rms of the axes,
+        at rest and while driving, where there is enough data."""
         speed, _, _, rows = self._table()
         sheet = imu_noise(imu)
         found = {}

@@ -3,7 +3,7 @@
 With C_vb the matrix of `imu.mounting_deg`, m the rest of the mounting that was found, rho the roll,
 and tau by how much fixes are later valid than their stamps say:
 
-    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.settings.sensor_to_body)
+    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.si_units.sensor_to_body)
     lever arm of an antenna <- C(rho) exp[m x] (l + dl), where dl was observed
     imu.time_offset_s <- time_offset_s - tau,   and all other sources against it:
     velocity_delay_s <- velocity_delay_s - tau_v + tau,   latency_s <- latency_s + tau_w + tau
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.aiding import Aiding, GnssAiding, WheelAiding, lever_sd_m
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
@@ -92,8 +92,8 @@ def calibrated(config: Config, found: Mapping[str, Parameter]) -> Config:
 
 
 def configured(config: Config, before: Config, p: Parameter) -> tuple[str, float]:
-    """Key and value of a parameter in a configuration that `calibrated` made of `before`; an empty
-    key and the parameter's own value where there is no key for it."""
+    """Key and value of a parameter in the configuration that `calibrated` made of `before`; an
+    empty key and the parameter's own value without a key."""
     imu = config.imu
     if p.kind == MOUNTING:
         axis = (ROLL, PITCH, YAW).index(p.name)
@@ -154,12 +154,12 @@ def fragment(
 
 
 def _axis(p: Parameter) -> str:
-    """Of a lever arm's parameter, whose name ends in `x_m`."""
+    """Axis of a lever arm's parameter, whose name ends in `x_m`."""
     return p.name.removesuffix("_m")[-1]
 
 
 def _first_receiver(config: Config) -> str:
-    """The receiver whose fixes say the time: the first that has an offset."""
+    """Reference receiver of the time: the first with an offset."""
     for name, section in config.aiding.items():
         if isinstance(section, GnssAiding) and section.time_offset_sd_s:
             return name

@@ -1,4 +1,4 @@
-"""Containers of a Vector BLF file, made whole for python-can's reader: damage costs what it hit.
+"""Repair of a damaged Vector BLF file's containers, so that python-can reads the intact part.
 
 A BLF file is a header and containers of some 128 kB, mostly zipped, with objects in them that may
 go on in the next one. Here containers are taken apart into objects, a piece that cannot be read is
@@ -24,7 +24,7 @@ _BASE = can.io.blf.OBJ_HEADER_BASE_STRUCT
 _CONTAINER = can.io.blf.LOG_CONTAINER_STRUCT
 _SIGNATURE = b"LOBJ"
 _V1, _V2 = 32, 40
-"""Bytes of the whole header of an object by its version, 1 and 2."""
+"""Bytes of an object's full header by version, 1 and 2."""
 _LEAST = {
     can.io.blf.CAN_MESSAGE: can.io.blf.CAN_MSG_STRUCT.size,
     can.io.blf.CAN_MESSAGE2: can.io.blf.CAN_MSG_STRUCT.size,
@@ -32,24 +32,25 @@ _LEAST = {
     can.io.blf.CAN_FD_MESSAGE: can.io.blf.CAN_FD_MSG_STRUCT.size,
     can.io.blf.CAN_FD_MESSAGE_64: can.io.blf.CAN_FD_MSG_64_STRUCT.size,
 }
-"""Bytes behind the header that an object of a frame has at least, by its type."""
+"""Least bytes behind the header of a frame's object, by type."""
 _LONGEST_OBJECT = 1 << 20
 """Largest size of an object: a frame, a comment or an Ethernet packet takes far less; a larger size
 is damage."""
 _LONGEST_CONTAINER = 1 << 26
 """Containers have some 128 kB (`BLFWriter.max_container_size`), unzipped."""
 _PADDING = 7
-"""At most so many bytes pad an object."""
+"""Most bytes of padding after an object."""
 _TIME_AT = 24
 """Offset of the stamp in an object."""
 DAY_S = 86_400
-"""By which stamps are moved: what a trigger keeps of before it are seconds to minutes."""
+"""Shift of the stamps, since a trigger keeps seconds to minutes of earlier data."""
 _DAY_TICKS = {True: DAY_S * 10**5, False: DAY_S * 10**9}
-"""In stamps of 10 microseconds, and of nanoseconds."""
+"""Day in stamps of 10 microseconds, and of nanoseconds."""
 
 
 class Containers:
-    """A BLF file as python-can's reader takes it: the header, then containers of whole objects.
+    """BLF file in the form that python-can's reader expects: the header, then containers of whole
+    objects.
 
     `refused(text)` hears of each piece that is lost.
     """
@@ -67,7 +68,7 @@ class Containers:
         """Cause of a premature end of the file."""
 
     def close(self) -> None:
-        """For the reader, which closes what it has read: whoever opened it does."""
+        """Keep the file open: the reader closes its input, and the opener closes the file."""
 
     def body(self) -> None:
         """The header has been read: containers follow."""
@@ -120,7 +121,7 @@ class Containers:
                 yield _container(objects)
 
     def _find_next(self, bad: bytes) -> int:
-        """Pass over what begins with no container, up to the next that may be one: how far."""
+        """Skip damaged data up to the next container; the number of bytes."""
         self._tail, self._lost = b"", True
         passed, window = 1, bad[1:]
         while True:

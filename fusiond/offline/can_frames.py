@@ -1,4 +1,4 @@
-"""Frames of a recorded CAN bus, by python-can's readers: what cannot be read costs itself.
+"""Frames of a recorded CAN bus, by python-can's readers; unreadable ones are skipped.
 
     .log   candump -L, -l, and its terminal form with stamps     .blf   Vector, binary
     .asc   Vector, text                                          .mf4   ASAM MDF 4 (asammdf)
@@ -43,8 +43,8 @@ _GZIP = b"\x1f\x8b"
 _MOST_NAMED = 20
 """Refusals that are kept in words; of the others the number."""
 _STRAY = 1000
-"""A channel with less than one of so many frames is damage in a name: what a device sends but once
-in a while, a bus of its own sends more often."""
+"""Least share of frames of a real channel; a smaller one is damage in a name, since a bus sends
+more often than a rare device."""
 _ZONES = {
     ".asc": "the dates of an ASC log have no zone: taken as local time of this computer, {zone}",
     ".blf": "the date of a BLF log has no zone: taken as UTC",
@@ -62,7 +62,7 @@ class Refusals:
         self._more = Counter[str]()
 
     def add(self, line: int, reason: str, detail: str) -> None:
-        """One more; `line` 0 where there are none."""
+        """Count a refusal; `line` is 0 where lines are unknown."""
         if len(self._named) < _MOST_NAMED:
             self._named.append(Rejection(line, reason, detail))
         else:
@@ -78,7 +78,7 @@ class Refusals:
         return str(self._named[0]) if self._named else ""
 
     def all(self) -> list[Rejection]:
-        """Of each reason the named ones and how many more there are."""
+        """Refusals by reason: named ones, and the number of others."""
         named = Counter(each.reason for each in self._named)
         more = [
             Rejection(0, name, f"{n} {'more' if named[name] else 'times'}", n)
@@ -93,7 +93,7 @@ def messages(
     refusals: Refusals | None = None,
     on_zone: Callable[[str, str], None] = lambda code, text: None,
 ) -> Iterator[can.Message]:
-    """The messages of a log in its order. `on_zone(code, text)` hears which zone its dates are of.
+    """Messages of a log in order. `on_zone(code, text)` receives the time zone of its dates.
 
     Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
     asammdf, OSError for a file that cannot be opened.
@@ -114,7 +114,7 @@ def messages(
 
 
 def channels(path: Path) -> set[Any]:
-    """The channels of a log, less those that damage has made. Raises as `messages` does."""
+    """Channels of a log, without those that damage has made. Raises as `messages` does."""
     frames: Counter[Any] = Counter(_channel_words(path))
     frames = frames or Counter(m.channel for m in messages(path))
     return {name for name, n in frames.items() if n * _STRAY >= frames.total()}
@@ -128,7 +128,7 @@ class _Log(NamedTuple):
     suffix: str
 
     def open(self) -> BinaryIO:
-        """Unpacked where it is a gzip file, whatever it is called."""
+        """Open a log, unpacked if it is a gzip file of any name."""
         with self.path.open("rb") as file:
             zipped = file.read(len(_GZIP)) == _GZIP
         opened = gzip.open if zipped else open
@@ -136,7 +136,7 @@ class _Log(NamedTuple):
 
 
 def _format(path: Path) -> _Log:
-    """By the name. Raises `TableError`."""
+    """Format by the name. Raises `TableError`."""
     suffixes = [s.lower() for s in path.suffixes]
     zipped = suffixes[-1:] == [".gz"]
     suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
@@ -161,7 +161,7 @@ def _channel_words(path: Path) -> Iterator[str | int]:
 def _text(
     log: _Log, lost: Refusals, stack: contextlib.ExitStack, on_zone: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
-    """Of a text log. A reader that a line has stopped goes on behind it."""
+    """Messages of a text log. After a line that stops a reader, reading continues behind it."""
     stream = stack.enter_context(log.open())
     asc = Asc()
     candump = Candump([])
@@ -251,7 +251,7 @@ def _mf4(
 
 
 def _report_zone(log: _Log, start: Any, on_zone: Callable[[str, str], None]) -> None:
-    """Report the time zone of the log's date, or that it has none."""
+    """Report the time zone of the log's date, or its absence."""
     if log.suffix in _ZONES and not start:
         on_zone("recorder_zone", _UNDATED)
     elif log.suffix in _ZONES:
@@ -260,7 +260,7 @@ def _report_zone(log: _Log, start: Any, on_zone: Callable[[str, str], None]) -> 
 
 
 def _zone(t_s: float | None) -> str:
-    """This computer's zone at an instant, such as "CEST (UTC+0200)"."""
+    """Time zone of this computer at an instant, such as "CEST (UTC+0200)"."""
     try:
         local = time.localtime(t_s)
     except (ValueError, OverflowError, OSError):
@@ -270,7 +270,7 @@ def _zone(t_s: float | None) -> str:
 
 @contextlib.contextmanager
 def _warned(call: Callable[[], None]) -> Iterator[None]:
-    """Hear of the lines that python-can only warns of, and keep that from the terminal."""
+    """Collect the lines of which python-can only warns, and keep the warnings from the terminal."""
     logger, handler = logging.getLogger("can.io"), _Forwarded(call)
     propagated, logger.propagate = logger.propagate, False
     logger.addHandler(handler)
@@ -283,7 +283,7 @@ def _warned(call: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deleted_in_silence() -> Iterator[None]:
-    """asammdf's file, where it could not be opened, fails once more as it is deleted."""
+    """Suppress the second error of asammdf's unopened file at its deletion."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
         yield

@@ -1,4 +1,4 @@
-"""A recorded CAN bus through the drivers that would serve it live: `fusiond process --can LOG`.
+"""Recorded CAN bus, read by the drivers that would serve it live: `fusiond process --can LOG`.
 
 Frames go to the very drivers that the configuration names, and their stamps to the daemon's own
 `Clock`, whose host lives by the log: the recorder's stamp of a frame is the instant at which it
@@ -36,9 +36,9 @@ from drivers.raw.messages import (
     SignalDelays,
 )
 from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
-from fusiond.clock import dates
-from fusiond.clock.clock import Clock
+from fusiond.clock import plausible_dates
 from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock, Slew
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
@@ -48,9 +48,11 @@ from fusiond.offline.measurement_files import Arrival
 from fusiond.offline.recorder_reports import Ahead, Reports, frame
 
 OFF_S = 1.0
-"""By so much a recorder's clock is as likely slow as wrong: receivers report UTC a second late."""
+"""Offset of a recorder's clock beyond which it is reported; receivers report UTC up to a second
+late."""
 PAUSE_NS = 60_000_000_000
-"""Of a shorter pause the solution says enough; no bus that is awake is silent for so long."""
+"""Shortest reported pause; no awake bus is silent for so long, and the solution shows shorter ones.
+"""
 REFUSALS = {
     "wrong_length",
     "undecodable",
@@ -65,7 +67,7 @@ REFUSALS = {
     "several_frames",
     "time_backward",
 }
-"""Counters of frames that were meant for a driver and made no measurement."""
+"""Counters of frames for a driver that gave no measurement."""
 
 
 class CanLog(NamedTuple):
@@ -85,8 +87,8 @@ class CanLog(NamedTuple):
 
 
 class _LogTime:
-    """A host whose clocks are the log's: real time is the recorder's stamp of the frame without its
-    slews, monotonic and boot time that without what the recorder's clock was set by."""
+    """Host whose clocks are the log's: real time is the recorder's stamp of the frame without
+    slews, monotonic and boot time the same without the steps of the recorder's clock."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -115,7 +117,7 @@ def read_can_log(path: Path, config: Config) -> CanLog:
 
 
 class _Replay:
-    """Drivers, clock and what came of them."""
+    """Drivers, clock and their results."""
 
     def __init__(self, path: Path, config: Config, slews: tuple[Slew, ...] = ()) -> None:
         self._path = path
@@ -221,7 +223,7 @@ class _Replay:
         self._on_refusal(code, f"{text}, at {self._recorder.stamp_ns * 1e-9:.3f} s of the log")
 
     def report_slews(self, source: str, slews: tuple[Slew, ...]) -> None:
-        """By how much the recorder's clock was slewed, and when."""
+        """Report rate and time of the slews of the recorder's clock."""
         largest = max(slews, key=lambda slew: abs(slew.rate))
         how = "fast" if largest.rate > 0.0 else "slow"
         times = f"in {len(slews)} stretches, at most " if len(slews) > 1 else ""
@@ -232,7 +234,7 @@ class _Replay:
         )
 
     def _report_pause(self, passed_ns: int) -> None:
-        """A step of the clock and a pause look alike where no device tells UTC."""
+        """Report a pause, which resembles a step of the clock where no device reports UTC."""
         if passed_ns > PAUSE_NS:
             text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
             if not self.reports:
@@ -240,16 +242,16 @@ class _Replay:
             self._on_refusal("recorder_paused", text)
 
     def _report_error(self) -> None:
-        """Offset of a recorder that knows the date against a receiver's UTC at the end: a wrong
-        zone shows so."""
+        """Report the final offset of a dated recorder from a receiver's UTC, which reveals a wrong
+        time zone."""
         status = self._clock.status()
         off_s = (status.system_error_s or 0.0) + self._recorder.slewed_ns * 1e-9
-        if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):
+        if abs(off_s) >= OFF_S and plausible_dates.plausible(self._host.stamp_ns):
             how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
             self._on_refusal("recorder_clock_off", f"the recorder's clock is off {how}")
 
     def _shift(self) -> None:
-        """Times by the recorder's clock as it was at the end."""
+        """Shift times to the recorder's clock at the end."""
         if not (by_ns := self._recorder.ahead_ns):
             return
         self._imu = [
@@ -260,7 +262,7 @@ class _Replay:
     # ------------------------------------------------------------------ what drivers make
 
     def _emit(self, item: Emitted) -> None:
-        """As `fusiond.live.sources` does, at the instant of the frame."""
+        """Emit an item as `fusiond.live.sources` does, at the instant of the frame."""
         match item:
             case DeviceEvent():
                 self._on_refusal(item.code, f"{item.source}: {item.text}")
@@ -284,7 +286,7 @@ class _Replay:
                 self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s, utc_ns))
 
     def _imu_table(self) -> ImuTable:
-        """IMU samples of the first source that sent any, as the daemon uses them."""
+        """IMU samples of the first source that sent any, as in the daemon."""
         spare = self._config.imu.spare
         spare_name = None if spare is None else spare.source
         first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)
@@ -299,14 +301,14 @@ class _Replay:
 
 
 def _on_a_bus(config: Config) -> dict[str, tuple[Any, Any]]:
-    """The class and the options of each driver of a source on a CAN bus."""
+    """Class and options of each driver of a source on a CAN bus."""
     points = driver_entry_points()
     made = ((name, points[s.driver].load(), s.options) for name, s in config.sources.items())
     return {n: (make, make.Options(**o)) for n, make, o in made if issubclass(make, CanDriver)}
 
 
 def _later(arrival: Arrival, by_ns: int) -> Arrival:
-    """The same, where all times are this much later."""
+    """Arrival with all times shifted by `by_ns`."""
     m: Any = arrival.measurement
     seen_ns = m.t_seen_ns + by_ns
     moved = replace(m, t_seen_ns=seen_ns, stamp=MonotonicStamp(m.stamp.t_ns + by_ns))

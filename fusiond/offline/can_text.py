@@ -1,4 +1,4 @@
-r"""Lines of a CAN log in text, made plain for the readers of python-can: a bad one costs itself.
+r"""Normalisation of text CAN logs for python-can's readers, which skips bad lines.
 
 A reader pulls line after line. Before it sees one, encoding and blocks of zeros (what a file system
 leaves where a logger lost its power) are dealt with here, and what the formats know beside what
@@ -29,7 +29,7 @@ LONGEST = 16_384
 """Bytes of a line. A frame of CAN XL, the longest there is, has 2048 bytes: 6144 characters in the
 terminal's form."""
 SHOWN = 60
-"""Characters of a refused line that are told."""
+"""Characters shown of a refused line."""
 _BOMS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _ERROR_FRAME = 0x2000_0000
 """CAN_ERR_FLAG of the identifier of an error frame (linux/can.h)."""
@@ -38,7 +38,7 @@ Plain = Callable[[str], str | None]
 
 
 class TextLines:
-    """The lines of a log, as a file that a reader of python-can iterates over.
+    """Lines of a log, as a file for a reader of python-can.
 
     `plain(line)` says a line in words that the reader knows; None: it holds no frame.
     `refused(line, text)` hears of what is lost, once a line.
@@ -52,7 +52,7 @@ class TextLines:
         self._line = ""
         self._again: str | None = None
         self.number = 0
-        """Of the line that was pulled last, from 1."""
+        """Number of the last line read, from 1."""
         self.damage: Exception | None = None
         """Cause of a premature end: a zipped one that is cut."""
 
@@ -73,7 +73,7 @@ class TextLines:
         raise StopIteration
 
     def close(self) -> None:
-        """For the reader, which closes what it has read: whoever opened it does."""
+        """Keep the file open: the reader closes its input, and the opener closes the file."""
 
     def refuse(self) -> None:
         """The line that was pulled last is not read."""
@@ -84,7 +84,7 @@ class TextLines:
             self._refused(self.number, cut if shown else "a block of zeros")
 
     def put_before(self, line: str) -> None:
-        """The next line that is pulled is this one, which is not of the file."""
+        """Insert a line, not of the file, before the next one."""
         self._again = line
 
     def _read(self) -> bytes:
@@ -107,7 +107,7 @@ class TextLines:
         return kept.rpartition(b"\0")[2] or b"\n" if b"\0" in raw else b"\n"
 
     def _text(self, raw: bytes) -> str:
-        """UTF-8, or what else a Windows of Western Europe writes."""
+        """Decode UTF-8, else a western European Windows code page."""
         if self.number == 1:
             raw = raw.removeprefix(codecs.BOM_UTF8)
         try:
@@ -117,8 +117,8 @@ class TextLines:
 
 
 def _decoded(stream: BinaryIO) -> BinaryIO:
-    """Bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`); with line feeds,
-    where it ends lines by carriage returns alone."""
+    """Convert UTF-16 with a mark (PowerShell's `>`) to UTF-8, and carriage returns alone to line
+    feeds."""
     try:
         first = stream.read(LONGEST)
         encoding = _BOMS.get(first[:2])
@@ -143,20 +143,20 @@ _TERMINAL = re.compile(
     r"(?P<rest>\s.*|$)"
 )
 _FIRST_LINES = 1000
-"""By so many lines it is judged whether stamps are differences: what is zero-based never falls."""
+"""Lines examined for relative stamps; zero-based stamps never fall."""
 _BEGINS = 1.0
-"""Seconds: a log whose first stamp is below counts from its beginning, and no clock says it."""
+"""Least absolute stamp (s): a log with a smaller first one counts from its beginning."""
 
 
 class Candump:
-    """Lines of candump as `candump -L` writes them. Its terminal form is told by the `[length]`."""
+    """Lines in the form of `candump -L`; the terminal's form is recognised by `[length]`."""
 
     def __init__(self, stamps: list[float]) -> None:
         """`stamps` of the first lines of the terminal's form."""
         self._differences = bool(stamps) and stamps[0] < _BEGINS and _fall_or_stand(stamps)
         self._sum_s = 0.0
         self.unstamped = False
-        """True if there was a frame without its time."""
+        """True if a frame without a time was found."""
 
     def plain(self, line: str) -> str:
         """The line in the form of a log."""
@@ -193,7 +193,7 @@ class Candump:
 
 
 def _with_error_flag(line: str, hash_at: int) -> str:
-    """Of an error frame's line, one that python-can knows for one: by CAN_ERR_BUSERROR."""
+    """Convert an error frame's line for python-can, which requires CAN_ERR_BUSERROR."""
     return f"{line[: hash_at - 8]}20000080{line[hash_at:]}"
 
 
@@ -215,7 +215,7 @@ def dated(stamp: str) -> bool:
 
 
 def first_stamps(stream: BinaryIO) -> list[str]:
-    """Of the first lines in the terminal's form."""
+    """Stamps of the first lines in the terminal's form."""
     lines = TextLines(stream, lambda line: line, lambda line, text: None)
     first = islice(lines, _FIRST_LINES)
     found = (_TERMINAL.fullmatch(_COLOUR.sub("", line).rstrip()) for line in first)
@@ -223,7 +223,7 @@ def first_stamps(stream: BinaryIO) -> list[str]:
 
 
 def candump_of(stamps: list[str]) -> Candump:
-    """The reader of lines for a log whose first stamps these are."""
+    """Reader for a log with these first stamps."""
     seconds = [stamp_s(stamp) for stamp in stamps]
     return Candump([s for s in seconds if s is not None])
 
@@ -244,23 +244,23 @@ _HEADER = re.compile(
 _HEADER_OVER = re.compile(r"\s*((no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE)
 _FD_EVENT = re.compile(r"\s*-?\d+[.,]\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
 HEADER_ENDS = "internal events logged"
-"""A line after which python-can's reader of ASC looks for frames."""
+"""Line after which python-can's ASC reader expects frames."""
 
 
 class Asc:
-    """Lines of an ASC file as python-can knows them."""
+    """Lines of an ASC file in python-can's form."""
 
     def __init__(self) -> None:
         self.in_frames = False
         """True if the header is over: stamped lines have come."""
         self.before_trigger_s = 0.0
-        """By how much the last line lies before the beginning of the measurement."""
+        """Time (s) of the last line before the start of the measurement."""
         self._relative = False
         self._sum_ns = 0
 
     def plain(self, line: str) -> str | None:
-        """The line with its stamp counted from the beginning and without sign; None for an event of
-        no channel."""
+        """Line with its stamp counted from the beginning, without sign; None for an event without
+        channel."""
         self.before_trigger_s = 0.0
         found = _STAMPED.match(line)
         if found is None:
@@ -293,7 +293,7 @@ class Asc:
 # --------------------------------------------------------------------------- PEAK's TRC
 
 TRC_VERSIONS = ("1.0", "1.1", "1.3", "2.0", "2.1")
-"""Those that python-can reads."""
+"""Versions of TRC that python-can reads."""
 _VERSION = re.compile(r";\$FILEVERSION=([\d.]+)")
 _COMMA = re.compile(r"(;\$STARTTIME=\d+|\s*\d+\)?\s+\d+),(\d+)(?=\s|$)")
 
@@ -305,7 +305,7 @@ class Trc:
         self.version = ""
 
     def plain(self, line: str) -> str:
-        """The line, with a point in its numbers."""
+        """Line with decimal points in its numbers."""
         if found := _VERSION.match(line):
             self.version = found[1]
         return _COMMA.sub(r"\1.\2", line, count=1) if "," in line else line

@@ -36,7 +36,7 @@ class NothingToCompareError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Solution minus truth at the n epochs `t_s` that both have, and the solution's sigma there.
+    """Solution minus truth at n common epochs `t_s`, and the solution's sigma.
 
     All (n, 3): `position` (m) and `velocity` (m/s) north, east, down, `attitude` (rad) roll, pitch,
     yaw; `sd_*` alike; NaN where a file does not say. `not_covered` epochs of the truth have no
@@ -54,7 +54,7 @@ class Errors:
 
 
 def errors_of(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 0.0) -> Errors:
-    """The errors at the truth's epochs that are later than `after_s` after the solution's first.
+    """Errors at the truth's epochs later than `after_s` after the solution's first.
 
     Raises `NothingToCompareError`.
     """
@@ -107,7 +107,7 @@ def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 
 
 
 def report_of(errors: Errors) -> Report:
-    """The statistics of errors, as `compare` gives them."""
+    """Statistics of errors, for `compare`."""
     position, velocity = errors.position, errors.velocity
     report: Report = {
         "epochs": len(errors.t_s),
@@ -151,7 +151,7 @@ class _Epochs:
         return np.interp(self._wanted, self._t, column[self._rows])
 
     def columns(self, table: Floats) -> Floats:
-        """The columns of a table (n, k) at the wanted epochs, each as `linear`."""
+        """Columns of a table (n, k) at the wanted epochs, each as `linear`."""
         return np.stack([self.linear(column) for column in table.T], axis=1)
 
     def angle(self, column: Floats) -> Floats:
@@ -174,7 +174,7 @@ def _span(t: Floats) -> str:
 
 
 def _statistics(name: str, unit: str, error: Floats, mean: bool = False) -> Report:
-    """RMS, largest and 95th percentile of the absolute error where it is known."""
+    """Statistics of the known absolute errors: RMS, largest, 95th percentile."""
     known = error[np.isfinite(error)]
     size = np.abs(known)
     values: Report = {

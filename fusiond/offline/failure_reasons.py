@@ -11,7 +11,7 @@ import numpy as np
 from drivers.immutable import immutable
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import Rejection, counts
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.distributions import median
@@ -24,9 +24,8 @@ _TIMES = {"time_backwards", "time_ahead"}
 
 @immutable()
 class FileRead:
-    """A file's rows as they were read: s of its own time from the first to the last that is used
-    (None: none is), how many are, and those that are not. Frames of a bus are no measurement by
-    themselves."""
+    """Rows of a file: s of its own time from the first to the last used one (None: none), their
+    number, and the rejected ones. Frames of a bus are not measurements."""
 
     span_s: tuple[float, float] | None
     used: int
@@ -40,12 +39,12 @@ class FileRead:
 
     @property
     def rows(self) -> int:
-        """All of them."""
+        """Number of all rows."""
         return self.used + self.refused
 
 
 def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
-    """The sentence, where forces or rates are not in the units that the columns' names say."""
+    """Sentence on forces or rates in other units than the columns' names state."""
     if not len(imu.t_s):
         return None
     return force_unit(median(magnitudes(imu.samples))) or _rate_unit(imu, section, arrivals)
@@ -107,8 +106,7 @@ def nothing_navigated(
 
 
 def without_overlap(files: Mapping[str, FileRead]) -> list[str]:
-    """A line for each measurement whose times have nothing in common with the IMU's, which come
-    first."""
+    """Lines on measurement files without common time with the first file, the IMU's."""
     if not files:
         return []
     imu_name, imu, measurements = _measurements(files)
@@ -122,7 +120,7 @@ def without_overlap(files: Mapping[str, FileRead]) -> list[str]:
 def _measurements(
     files: Mapping[str, FileRead],
 ) -> tuple[str, FileRead, list[tuple[str, FileRead]]]:
-    """The IMU's file, which comes first, and those of measurements."""
+    """Split into the IMU's file, the first one, and those of measurements."""
     (imu_name, imu), *others = files.items()
     return imu_name, imu, [(name, file) for name, file in others if file.is_measurement]
 

@@ -55,18 +55,19 @@ Array = NDArray[np.float64]
 
 SECONDS_OF_WEEK = 604800.0
 FEWEST_VALUES = 20
-"""Of n different values without steps the two nearest lie some (range / n^2) apart: of twenty, a
-step of a four-hundredth of the range is seen at most, which adds nothing to any sigma."""
+"""Fewest values for detecting steps. Of n different values without steps the two nearest are about
+(range / n^2) apart: of twenty, a step of at most a four-hundredth of the range is found, which adds
+nothing to a sigma."""
 
 
 OF_A_RECEIVER = frozenset({"nmea", "ubx", "bestpos", "sbf"})
-"""Kinds that are fixes of a receiver, as its own protocol states them."""
+"""Kinds of a receiver's own protocol with fixes."""
 _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
 
 
 class Arrival(NamedTuple):
-    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant;
-    `utc_ns` where the device stamped it with its date (POSIX)."""
+    """Arrival of a measurement or broadcast message, with one sigma of its instant; `utc_ns` where
+    the device stamped it with a date (POSIX)."""
 
     t_arrival_ns: int
     measurement: Measurement | RawEvent
@@ -204,8 +205,7 @@ def _read_bearing(path: Path, _: ImuTable, source: str) -> _Read:
 
 
 def _step_of(values: Array) -> float:
-    """The step that values were rounded to where nobody says it: the smallest difference between
-    two of them; 0 where they are too few to tell."""
+    """Step to which values were rounded: the smallest difference of two; 0 for too few values."""
     found = np.unique(values)
     return float(np.diff(found).min()) if len(found) >= FEWEST_VALUES else 0.0
 
@@ -245,13 +245,13 @@ def _read_barometer(path: Path, _: ImuTable, source: str) -> _Read:
 
 
 def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
-    """By the decoders' own options."""
+    """Read NMEA with the decoders' default options."""
     return read_nmea_by(path, imu, receiver_of(source, Config()))
 
 
 def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
-    """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
-    maps to: GPS second of week (below 604800) or POSIX seconds."""
+    """Read NMEA bytes of a wire. They hold UTC, so the IMU's `t_s` must be GPS second of week
+    (below 604800) or POSIX seconds."""
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     posix = len(imu.t_s) and not of_week
     imu_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if posix else None
@@ -260,7 +260,7 @@ def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
-    """UBX or RTCM 3 as it came off the wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
+    """Read UBX or RTCM 3 bytes of a wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
     must be GPS second of week or POSIX seconds.
 
     What the satellites broadcast is known from the first epoch on, as to a receiver that has been
@@ -312,7 +312,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
 
 
 def _corrected(correction: Correction, of_week: bool) -> Arrival:
-    """A correction as it came: at the instant of its epoch, before half an interval."""
+    """Arrival of a correction: the instant of its epoch less half an interval."""
     c = correction
     tow_s = c.tow_s - (0.5 * c.interval_s if c.interval_s > 1.0 else 0.0)
     now = _ns(tow_s) if of_week else utc_ns(c.week, tow_s, leap_seconds(c.week, tow_s))

@@ -1,4 +1,4 @@
-"""A file of NMEA as it came off the wire, through the decoders of the daemon: `--aid nmea=FILE`.
+"""NMEA file, read by the daemon's decoders: `--aid nmea=FILE`.
 
 The receiver's decoder has the options of its source in the configuration, so the file is read as
 the daemon reads the line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of a
@@ -52,7 +52,7 @@ _COMPASS = re.compile(
 _POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC|GLL),")
 _TIMED = re.compile(rb"\$[A-Z]{2}(?:(?:GGA|GNS|RMC|ZDA),|GLL,(?:[^,]*,){4})(?P<time>\d{6}[\d.]*),")
 _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
-"""Counters of what was refused, beside `REFUSALS`, by their ends."""
+"""Endings of counters of refusals, beside `REFUSALS`."""
 
 
 class Receiver(NamedTuple):
@@ -66,7 +66,7 @@ class Receiver(NamedTuple):
 
 
 class Received(NamedTuple):
-    """A measurement, when it was valid, on the IMU's times and in UTC (ns)."""
+    """Measurement with its instant of validity, on the IMU's time axis and in UTC (ns)."""
 
     t_ns: int
     measurement: Measurement
@@ -74,7 +74,7 @@ class Received(NamedTuple):
 
 
 def receiver_of(source: str, config: Config) -> Receiver:
-    """Of the configuration's sources, those that NMEA comes from."""
+    """Sources of the configuration that deliver NMEA."""
     points = driver_entry_points()
     decoding: NmeaDecoding | None = None
     compass: str | None = None
@@ -165,8 +165,7 @@ class _Epochs:
         self.times = [places[line] for line in self._lines]
 
     def spread(self, untimed: list[Any]) -> list[tuple[int, Any]]:
-        """Stamp measurements without time with its instants, less the latency that is stated of
-        it."""
+        """Stamp measurements without time with the epochs' instants, less the stated latency."""
         if not self.times:
             return []
         found: list[tuple[int, Any]] = []
@@ -209,7 +208,7 @@ def _is_refusal(name: str) -> bool:
 
 
 def _why_nothing(decoder: NmeaDecoder, refused: Counter[str], kind: str) -> str:
-    """In words, what stands in the way of a measurement; `kind` is what the file may be else."""
+    """Reason for the absence of measurements; `kind` is the file's probable kind."""
     if refused["undated"] or refused["untimed"]:
         missing = "no measurement with a date (RMC or ZDA missing)"
         return decoder.cautions.get("implausible_date", missing)

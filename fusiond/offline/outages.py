@@ -1,5 +1,4 @@
-"""Windows in which recorded measurements are withheld, to see what the navigation does without
-them."""
+"""Windows in which recorded measurements are withheld, to test the navigator without them."""
 
 from __future__ import annotations
 
@@ -7,11 +6,11 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 Outage: TypeAlias = tuple[float, float] | tuple[float, float, tuple[str, ...]]
-"""Start and length (s of the files), and the sources that are withheld: all without names."""
+"""Start and length (s of the files), and the withheld sources: all without names."""
 
 
 def withheld(source: str, t_s: float, outages: Sequence[Outage]) -> bool:
-    """True if what the source measured at `t_s` lies in a window of its own or of all."""
+    """True if the source's measurement at `t_s` lies in an outage."""
     return any(
         start <= t_s < start + length and (not names or source in names[0])
         for start, length, *names in outages

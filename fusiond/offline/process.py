@@ -89,9 +89,9 @@ def process(
 
 @contextmanager
 def _imports_left_alone() -> Iterator[None]:
-    """Keep the garbage collector from looking through all that was imported, numba above all, each
-    time that so many measurements have been made: a tenth of a second each. Nor does it look
-    through what is new as often as it does by default: nearly all of that is no garbage."""
+    """Exempt imports, numba above all, from garbage collection, which would take a tenth of a
+    second each time that enough measurements have been made. New objects are collected less often
+    than by default, since nearly all of them live on."""
     thresholds = gc.get_threshold()
     gc.freeze()
     gc.set_threshold(YOUNG, *thresholds[1:])
@@ -164,7 +164,7 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
 
 
 def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
-    """Rejections by source and name, satellites of raw epochs among it."""
+    """Rejections by source and name, including satellites of raw epochs."""
     found = {source: Counter(refused) for source, refused in navigator.refused.items()}
     for source, receiver in navigator.raw.items():
         if receiver.refused:
@@ -173,7 +173,7 @@ def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
 
 
 def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """Of each source's measurements, by name."""
+    """Outcomes of each source's measurements, by name."""
     sources: dict[str, dict[str, int]] = {}
     for source, outcomes in navigator.timeline.counters.outcomes.items():
         sources[source] = {name: count for name, count in outcomes.items() if count}
@@ -261,7 +261,7 @@ def _run_units(
     recorder: _Recorder,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Tick by tick, as in the daemon, which of two inertial units is used."""
+    """Run two inertial units tick by tick, as in the daemon."""
     units, arrivals = read.units, read.arrivals
     choice = ImuChoice(
         read.config.imu, lambda _, code, text: read.events.append({"code": code, "text": text})
@@ -299,8 +299,8 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
 
 
 def _waits(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
-    """Of each, whether samples of its validity, or of a measurement that it holds, come before it
-    does."""
+    """True for each arrival that samples of its validity, or of a measurement that it contains,
+    precede."""
     ahead = config.imu.time_offset_s > 0.0
     delayed = {
         source
@@ -324,7 +324,7 @@ def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
 
 
 class _Recorder:
-    """Takes each sample's solution as it was first known; how many, in which modes, from when."""
+    """Recorder of each sample's first solution; counts, modes and start."""
 
     def __init__(
         self,
@@ -371,7 +371,7 @@ class _Recorder:
             self.smoothed.take(first, taken)
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Write the remaining rows."""
         if self.smoothed is not None:
             self.smoothed.close()
         if self._writer is not None:

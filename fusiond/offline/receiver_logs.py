@@ -81,7 +81,7 @@ _USED = frozenset(
     | {"relposned", "logs", "logs_used", "sbf_blocks", "blocks_used", "garbage_bytes"}
     | {"other_bytes", "ubx_not_used", "logs_not_used", "blocks_not_used", "velocity_latent"}
 )
-"""Counters of what was taken, or is no fix at all; all others are refusals."""
+"""Counters of used items and of items that are not fixes; all others are refusals."""
 _COMPRESSED = (b"\x1f\x9d", b"PK", b"BZ")
 """Packings of RINEX files but gzip: compress, zip, bzip2."""
 
@@ -101,8 +101,8 @@ def decoding_of(source: str, config: Config) -> SolutionDecoding:
 def read_solutions(
     kind: str, path: Path, imu: ImuTable, source: str, decoding: SolutionDecoding
 ) -> Read:
-    """Fixes and headings as a receiver's own protocol states them. The bytes hold UTC, so the IMU's
-    `t_s` must be GPS second of week or POSIX seconds. TableError where there is no fix."""
+    """Read fixes and headings of a receiver's own protocol. They hold UTC, so the IMU's `t_s` must
+    be GPS second of week or POSIX seconds. TableError without a fix."""
     decoder = _DECODERS[kind](source, decoding)
     log = log_bytes(path)
     found = [*decoder.feed(log.data, 0), *decoder.flush()]
@@ -138,12 +138,12 @@ def is_of_week(imu: ImuTable) -> bool:
 
 
 _LINE = 200
-"""Characters in which a first line ends."""
+"""Longest first line, in characters."""
 
 
 def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
-    """The file's text, unpacked (Hatanaka, compress, zip), and what is lost of it; None where it is
-    no RINEX file. MissingPackageError, TableError."""
+    """Text of the file, unpacked (Hatanaka, compress, zip), and its losses; None for a file that is
+    not RINEX. MissingPackageError, TableError."""
     data = data.removeprefix(codecs.BOM_UTF8).lstrip(b"\r\n")
     first = data[:_LINE].partition(b"\n")[0].decode("ascii", "replace")
     label = first[LABEL].strip()
@@ -175,8 +175,8 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
 
 
 def _before_damage(data: bytes) -> str:
-    """Epochs of Hatanaka's compression up to where it cannot be followed, which the package's own
-    program has written by then; "" where there is none."""
+    """Epochs of Hatanaka's compression before the damage, as far as the package's program has
+    written them; "" without any."""
     program = importlib.resources.files("hatanaka.bin") / "crx2rnx"
     with importlib.resources.as_file(program) as path:
         done = subprocess.run([path, "-"], input=data, capture_output=True, check=False)
@@ -185,7 +185,7 @@ def _before_damage(data: bytes) -> str:
 
 
 def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
-    """Epochs of an observation file, or what satellites sent of a navigation file.
+    """Read epochs of an observation file, or messages of a navigation file.
 
     An ephemeris arrives when it was sent; the first of each satellite is known from the start, as
     to a receiver that has been on. TableError where it is neither."""
@@ -217,7 +217,8 @@ def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:
 
 
 def _kind(message: NavigationMessage) -> tuple[str, str]:
-    """Of which one stands for the next: satellite and message, or the ionosphere's model."""
+    """Kind of a message that the next of its kind replaces: satellite and message, or ionosphere
+    model."""
     if isinstance(message, Correction):
         return message.satellite, message.part
     if isinstance(message, Ephemeris):

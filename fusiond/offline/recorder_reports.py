@@ -1,4 +1,4 @@
-"""Reports of UTC in a recorded CAN bus, and what they say of its recorder's clock.
+"""Reports of UTC in a recorded CAN bus, as evidence on its recorder's clock.
 
 Before and behind a leap of its stamps they tell by how much it was set; all of them together, by
 how much it was slewed (fusiond.clock.recorder_clock, recorder_rate). What comes later is looked at
@@ -28,26 +28,26 @@ from fusiond.clock.recorder_clock import (
 from fusiond.clock.recorder_rate import SPACING_NS, slews
 
 REPORTS_WITHIN_NS = 120_000_000_000
-"""So far ahead reports of UTC are looked for where a clock may have been set: tunnels are shorter,
-and in two minutes a recorder's clock is off by 12 ms (100 ppm)."""
+"""Time ahead in which reports of UTC are searched after a possible step: tunnels are shorter, and
+in two minutes a recorder's clock drifts by 12 ms (100 ppm)."""
 LATEST_S = 9e9
-"""Seconds beyond which nanoseconds leave a 64-bit integer."""
+"""Largest time (s) whose nanoseconds fit a 64-bit integer."""
 
 Scouts = Callable[[Emit], dict[Any, list[CanDriver[Any]]]]
-"""Makes drivers by channel, which hand over to who is given."""
+"""Factory of drivers by channel, with a callback for measurements."""
 
 
 class Reports:
-    """Reports of each source with the recorder's stamps of them, less its slews."""
+    """Reports of each source with the recorder's stamps, less its slews."""
 
     def __init__(self, recorder: RecorderClock, scouts: Scouts) -> None:
         self._recorder = recorder
         self._scouts = scouts
         self._last: dict[str, deque[int]] = {}
-        """By source the last ones: the recorder's stamp less what was reported."""
+        """Last differences by source: recorder's stamp minus reported UTC."""
         self._all: dict[str, list[tuple[int, int]]] = {}
         self._silent_ns = (1, 0)
-        """Stamps from and to which nobody reports UTC."""
+        """Stamps that bound an interval without reports of UTC."""
 
     def __bool__(self) -> bool:
         return any(self._last.values())
@@ -61,19 +61,19 @@ class Reports:
             every.append((report.t_seen_ns, report.utc_ns))
 
     def follow(self, set_ns: int) -> None:
-        """Reports before a step, as the clock would have stamped them that was set."""
+        """Shift the reports before a step to the clock after it."""
         for reports in self._last.values():
             for k, ahead_ns in enumerate(reports):
                 reports[k] = ahead_ns + set_ns
 
     def slews(self, drift_ppm: float) -> tuple[str, tuple[Slew, ...]]:
-        """The source that has reported most often, and the slews that it tells of."""
+        """Slews by the source that reported most often, with its name."""
         source = max(self._all, key=lambda name: len(self._all[name]), default="")
         return source, slews(self._all.get(source, ()), drift_ppm)
 
     def set_before(self, frames: Ahead, first: can.Message, first_ns: int) -> int | None:
-        """By how much the recorder's clock was set before this frame, by the sources that have
-        reported before and go on to: behind further leaps, too."""
+        """Step of the recorder's clock before this frame, by the sources that report before and
+        after it, also across further steps."""
         known = {name for name, reports in self._last.items() if reports}
         if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None
@@ -112,15 +112,15 @@ class Reports:
 
 
 class Ahead:
-    """The data frames of a log with their stamps (ns), of which some may be looked at before they
-    are taken. What else a log holds is counted in `refused`."""
+    """Data frames of a log with their stamps (ns), with a lookahead. Other contents are counted in
+    `refused`."""
 
     def __init__(self, messages: Iterator[can.Message], refused: Counter[str]) -> None:
         self._messages = messages
         self._refused = refused
         self._kept: deque[tuple[can.Message, int]] = deque()
         self.number = 0
-        """Of all frames."""
+        """Number of all frames."""
 
     def __iter__(self) -> Iterator[tuple[can.Message, int]]:
         while True:
@@ -131,7 +131,7 @@ class Ahead:
             yield each
 
     def ahead(self, number: int | None = None) -> Iterator[tuple[can.Message, int]]:
-        """Those that have not been taken, at most so many, in order; they remain."""
+        """Next frames in order, at most so many; they remain."""
         yield from list(islice(self._kept, number))
         while number is None or len(self._kept) < number:
             if (each := self._read()) is None:
@@ -154,6 +154,6 @@ class Ahead:
 
 
 def frame(message: can.Message, t_ns: int, stamp_ns: int) -> CanFrame:
-    """The frame of a message, which came at `t_ns` and bears a stamp."""
+    """Frame of a message that came at `t_ns` and has a recorder's stamp."""
     can_id, extended = message.arbitration_id, message.is_extended_id
     return CanFrame(can_id, extended, bytes(message.data), t_ns, stamp_ns)

@@ -36,7 +36,7 @@ from fusiond.offline.outages import Outage, named, withheld
 
 @dataclass(slots=True)
 class Recorded:
-    """Input read, and its files; `withheld` measurements by source."""
+    """Input with its files; `withheld` measurements by source."""
 
     config: Config
     imu: ImuTable
@@ -45,7 +45,7 @@ class Recorded:
     events: list[dict[str, str]]
     withheld: Counter[str]
     units: list[tuple[int, ImuSample]]
-    """Samples of all inertial units as they came, where one of them is a spare; else none."""
+    """Samples of all inertial units if one is a spare; else none."""
 
 
 def read_recorded(
@@ -56,7 +56,8 @@ def read_recorded(
     systems: tuple[System, ...] | None,
     can_log: Path | None,
 ) -> Recorded:
-    """Read it, less what the outages withhold. Raises as `fusiond.offline.process.process` does."""
+    """Read the input without the measurements of outages. Raises as
+    `fusiond.offline.process.process` does."""
     if any(kind == "raw" for kind, _ in measurements):
         config = _with_raw(config, systems)
     events: list[dict[str, str]] = []
@@ -104,7 +105,7 @@ def read_recorded(
 
 
 def _check_observed(measurements: list[tuple[str, Path]], arrivals: list[Arrival]) -> None:
-    """Raise `TableError` for raw data of which nothing is an observation."""
+    """Check raw data for observations. Raises `TableError`."""
     raw = [path for kind, path in measurements if kind == "raw"]
     if raw and not any(isinstance(row.measurement, RawGnssEpoch) for row in arrivals):
         names = ", ".join(map(str, raw))
@@ -132,7 +133,7 @@ BROADCAST = Ephemeris, Klobuchar, Bdgim, SignalDelays, Correction
 
 
 def valid_ns(m: Measurement | RawGnssEpoch) -> int:
-    """The instant of the IMU's clock that a recorded measurement is valid at."""
+    """Validity of a recorded measurement, on the IMU's clock."""
     stamp = getattr(m, "stamp", None)
     assert isinstance(stamp, MonotonicStamp)
     return stamp.t_ns
@@ -144,7 +145,7 @@ def _imu_read(imu: ImuTable) -> FileRead:
 
 
 def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
-    """The configuration with a section for the raw data of a file, and the systems asked for."""
+    """Configuration with a section for a raw file's data, and the requested systems."""
     name = source_of("raw", config)
     section = config.aiding.get(name)
     raw = section if isinstance(section, RawAiding) else RawAiding()
@@ -154,8 +155,8 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Of the measurements' instants; what a satellite broadcasts has none, so that a file of
-    nothing else has those of its arrivals."""
+    """Span of the measurements' instants; broadcast messages have none, so a file of these has the
+    span of arrivals."""
     instants = [
         valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
     ] or [row.t_arrival_ns for row in rows]

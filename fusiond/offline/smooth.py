@@ -1,4 +1,4 @@
-"""`fusiond process --smooth`: at each sample the solution of all that was measured, later too.
+"""`fusiond process --smooth`: the solution at each sample from all measurements, later ones too.
 
 The filter runs as ever and leaves a tape (fusiond.estimators.smoothing). What the daemon would have
 said at each sample, in the last pass over it, is kept until the navigation has ended; then the
@@ -35,7 +35,7 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.offline.solution_rows import Rows, RowsWriter
 
 Held = list[NDArray[Any]] | tuple[int, int]
-"""Arrays, or where they are in the file and how many."""
+"""Arrays, or their place in the file and number."""
 
 # Nodes and solutions that are put aside at once, some 13 MB and 1.4 MB; beyond so many bytes of
 # them into a file.
@@ -54,8 +54,7 @@ def taped(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> TapedKalm
 
 
 class SmoothedRows:
-    """Takes the navigator's rows, and writes them smoothed when the start that they belong to has
-    ended.
+    """Writer of the navigator's rows, smoothed once their start has ended.
 
     `navigator` has an estimator of `taped`. `rows`, `nodes`, `starts` count what was smoothed.
     """
@@ -89,7 +88,7 @@ class SmoothedRows:
         e.rewound = NEVER
 
     def take(self, first: int, rows: Rows) -> None:
-        """Rows of the samples from number `first` on, which follow those before."""
+        """Add rows of the samples from number `first` on, in sequence."""
         if not self._count:
             self._first = first
         begin, end = self._count, self._count + len(rows.times)
@@ -104,7 +103,7 @@ class SmoothedRows:
         self._put_aside()
 
     def _put_aside(self) -> None:
-        """Out of the way with what no rewind reaches any more."""
+        """Store rows that no rewind can reach in a file."""
         needed = self._navigator.imu.needed
         final = 0 if needed is None else min(needed - self._first, self._count)
         if final >= BLOCK_ROWS:
@@ -170,7 +169,7 @@ def _room(count: int) -> Rows:
 
 
 class _Spool:
-    """Arrays by tuples, in memory while they are few, else in a temporary file."""
+    """Store of array tuples, in memory while few, else in a temporary file."""
 
     def __init__(self) -> None:
         self._file: BinaryIO | None = None
@@ -190,7 +189,7 @@ class _Spool:
         return place, len(arrays)
 
     def get(self, held: Held) -> list[NDArray[Any]]:
-        """The arrays that were put there."""
+        """Get stored arrays."""
         if isinstance(held, list):
             return held
         assert self._file is not None

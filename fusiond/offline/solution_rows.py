@@ -1,4 +1,4 @@
-"""Rows of a solution on their way from the navigator to a file."""
+"""Buffer of solution rows from the navigator to a file."""
 
 from __future__ import annotations
 
@@ -49,5 +49,5 @@ class RowsWriter:
         self._writer.states(rows.times, nav, sigmas, self._stated, rows.status)
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Write the remaining rows."""
         self._writer.close()

@@ -25,7 +25,7 @@ class Rollover(NamedTuple):
 
 
 def rollover_of(utc_ns: Sequence[int], imu_s: tuple[float, float] | None) -> Rollover:
-    """Of fixes at `utc_ns` beside an IMU from and to `imu_s` (POSIX; None: not POSIX)."""
+    """Rollover of fixes at `utc_ns`, by an IMU's times (POSIX; None: not POSIX)."""
     if not utc_ns:
         return Rollover()
     first_ns, last_ns = min(utc_ns), max(utc_ns)

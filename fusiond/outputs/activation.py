@@ -7,7 +7,7 @@ import socket
 from collections.abc import Mapping
 
 _FIRST_FD = 3
-"""SD_LISTEN_FDS_START."""
+"""First passed descriptor, SD_LISTEN_FDS_START."""
 
 
 def activated(name: str, environ: Mapping[str, str] = os.environ) -> socket.socket | None:

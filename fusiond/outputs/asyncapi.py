@@ -15,7 +15,7 @@ PARAMETER = re.compile(r"\{(\w+)\}")
 
 
 def asyncapi(vehicle: str) -> dict[str, Any]:
-    """The AsyncAPI 3.0 document of a vehicle's topics, with the schemas of the models."""
+    """AsyncAPI 3.0 document of a vehicle's topics, with the schemas of the models."""
     base = base_topic(vehicle)
     received = [Topic(f"cmd/{name}", model, 1, False) for name, model in COMMANDS.items()]
     models: list[tuple[type[BaseModel], Literal["validation", "serialization"]]] = [

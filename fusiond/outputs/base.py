@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from drivers.base import DriverStatus
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.outputs.client_sockets import Guests
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.mqtt import MqttPublisher
@@ -35,7 +35,7 @@ class Output(Protocol):
     def status(self) -> DriverStatus: ...
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Keep a message, of which the task may send the latest; never waits, never raises."""
+        """Keep a message, of which the task may send only the latest. Never waits, never raises."""
 
     async def run(self) -> None:
         """Send until cancelled."""
@@ -56,11 +56,11 @@ class Surroundings:
     """The door of all servers."""
 
     def broker(self) -> MqttPublisher:
-        """For outputs that go out by MQTT; the configuration has seen to it that there is one."""
+        """Broker of an output that publishes through MQTT; the configuration guarantees one."""
         assert self.mqtt is not None
         return self.mqtt
 
     def time(self) -> Clock:
-        """For an output that tells time."""
+        """Clock of an output that publishes time."""
         assert self.clock is not None
         return self.clock

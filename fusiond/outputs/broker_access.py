@@ -37,12 +37,12 @@ def password(options: Mqtt, environ: Mapping[str, str] = os.environ) -> str | No
 
 
 def readable_by_all(path: Path | None) -> bool:
-    """True if everyone on this machine can read the file."""
+    """True if every user of this computer can read the file."""
     return path is not None and path.exists() and bool(path.stat().st_mode & 0o004)
 
 
 def tls_context(options: Mqtt) -> ssl.SSLContext | None:
-    """A context that verifies the broker and its name, None if TLS is off.
+    """TLS context that verifies the broker and its name; None if TLS is off.
 
     Raises `ConfigError` for files that cannot be used, or that are given while TLS is off.
     """
@@ -69,7 +69,7 @@ def tls_context(options: Mqtt) -> ssl.SSLContext | None:
 
 
 def advice(error: aiomqtt.MqttError, host: str, port: int) -> str:
-    """Reason why the broker refused, and what would do."""
+    """Reason for the broker's refusal, and the remedy."""
     why = str(error) or "no answer"
     where = f"{host}:{port}"
     if isinstance(error, aiomqtt.MqttCodeError):

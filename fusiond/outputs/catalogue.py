@@ -1,4 +1,4 @@
-"""The outputs there are: a section of the configuration each, and what serves it."""
+"""Outputs by section of the configuration, with their classes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket
@@ -22,7 +22,7 @@ from fusiond.outputs.prometheus import PrometheusEndpoint
 
 
 def _foxglove(section: Any, around: Surroundings) -> Output:
-    """It brings websockets along, which few need."""
+    """Make the Foxglove server, which imports websockets on demand."""
     from fusiond.outputs.foxglove.server import FoxgloveServer  # noqa: PLC0415
 
     return FoxgloveServer(section, around)
@@ -37,7 +37,7 @@ MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "prometheus": PrometheusEndpoint,
     "foxglove": _foxglove,
 }
-"""By the section's name below `[outputs]`."""
+"""Factories by name of the section below `[outputs]`."""
 
 
 def make_outputs(
@@ -49,9 +49,9 @@ def make_outputs(
     guests: Guests,
     kept: Mapping[str, Output] = MappingProxyType({}),
 ) -> dict[str, Output]:
-    """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
-    Servers share the door `guests`. `kept` are there already, those that go out by MQTT with its
-    own among them.
+    """Make the configured outputs by name, MQTT first. `on_event(source, code, text)` receives
+    their events. Servers share the connections of `guests`. `kept` outputs exist already, among
+    them those that publish through MQTT.
 
     Raises `ConfigError` for one that cannot be as it is configured.
     """

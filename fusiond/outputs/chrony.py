@@ -38,7 +38,7 @@ class ChronySocket:
     name = "chrony"
     sets_clocks = True
     nav_rate_hz = 0.1
-    """It has no use for `nav`."""
+    """No rate: chrony does not use `nav`."""
 
     def __init__(self, section: Chrony, around: Surroundings) -> None:
         self._path = str(section.socket)
@@ -50,7 +50,7 @@ class ChronySocket:
         around.time().on_time = self._sampled
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Nothing to do: time does not come with the messages."""
+        """Ignore messages, which carry no time for chrony."""
 
     def _sampled(self, sample: TimeSample) -> None:
         """Keep the best of a second of UTC; the next one's first sends it off."""

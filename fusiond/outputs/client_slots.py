@@ -22,14 +22,14 @@ class Placed(Protocol):
     host: str
 
     def owes(self, now_ns: int) -> bool:
-        """True if something of it has been waited for long enough."""
+        """True if the client has missed a deadline."""
 
 
 T = TypeVar("T", bound=Placed)
 
 
 def host_of(address: Any) -> str:
-    """Of a peer's address as `accept` gives it."""
+    """Host of a peer's address as returned by `accept`."""
     name = str(address[0]) if address else ""
     try:
         found = ip_address(name.partition("%")[0])

@@ -1,4 +1,4 @@
-"""The door for guests: sockets of all servers, served in turns that cost a tick little.
+"""Client sockets of all servers, served in turns at little cost to a tick.
 
 All listeners and connections are in one epoll set, of which the event loop sees a single
 descriptor. When something is there the loop gives a turn: pieces of work, of each server one to
@@ -28,31 +28,32 @@ from typing import Protocol
 WINDOW_NS = 10_000_000
 """A tick at 100 Hz, the rate by default."""
 BUDGET_NS = 1_000_000
-"""A tenth of it: a tick that falls due in the middle of a turn starts 1 ms late, as it does by
-asyncio's own rounding; and all guests together cost a tenth of a core. 200 clients at 10 Hz, which
-docs/outputs.md promises, cost a third of that."""
+"""Processor time for clients between ticks: a tenth of a tick. A tick that falls due in a turn
+starts 1 ms late, as by asyncio's own rounding, and all clients together cost a tenth of a core. 200
+clients at 10 Hz, as promised in docs/outputs.md, cost a third of that."""
 RESERVED_DESCRIPTORS = 256
-"""For the daemon's own: some 40 in peace with all outputs; the rest for files of a recording, of
-the state and of libraries. Half of them where the process has fewer than twice as many."""
+"""Descriptors reserved for the daemon: some 40 in normal operation with all outputs; the rest for
+files of a recording, of the state and of libraries. Half of them where the process has fewer than
+twice as many."""
 LOOK_S = 0.25
-"""Between two looks at who waits too long."""
+"""Interval of the check for missed deadlines."""
 _AT_ONCE = 16
 """Events asked of the kernel in one go."""
 
 Work = Callable[[], None]
 Handler = Callable[[int], None]
-"""Is told the events of epoll(7)."""
+"""Callback with the events of epoll(7)."""
 
 
 class Guest(Protocol):
-    """One connection."""
+    """Client connection."""
 
     def look(self, now_ns: int) -> None:
         """Wake up, or give up: called four times a second."""
 
 
 class Guests:
-    """One door for all servers of a daemon; `most` connections may be open at it.
+    """Connections of all servers of a daemon; at most `most` are open.
 
     It needs a running event loop while something is watched, and is never called from outside it.
     `postponed` counts windows whose budget was spent.
@@ -66,9 +67,9 @@ class Guests:
         self.postponed = 0
         self._open: set[Guest] = set()
         self._queues: deque[ServerQueue] = deque()
-        """Those that watch something, the next in turn first."""
+        """Queues with watched descriptors, the next in turn first."""
         self._epoll: select.epoll | None = None
-        """Of the queues' own."""
+        """Descriptors of the queues."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._window_ns = self._left_ns = 0
         self._paused: asyncio.TimerHandle | None = None
@@ -83,7 +84,7 @@ class Guests:
         return len(self._open) >= self.most
 
     def places(self, wanted: int) -> int:
-        """Of one server that would have so many: its share, where there are not as many for all."""
+        """Share of a server that wants `wanted` places, where there are too few for all."""
         return min(wanted, self.most * wanted // max(wanted, self.wanted))
 
     def came(self, guest: Guest) -> None:
@@ -103,7 +104,7 @@ class Guests:
         self._queues.append(queue)
 
     def end(self, queue: ServerQueue, fd: int) -> None:
-        """`queue` watches nothing more."""
+        """Remove `queue` from the watched queues."""
         self._queues.remove(queue)
         if self._epoll is not None:
             self._epoll.unregister(fd)
@@ -111,7 +112,7 @@ class Guests:
                 self._end()
 
     def due(self) -> None:
-        """There is work that no descriptor tells of."""
+        """Schedule a turn for work that no descriptor signals."""
         if self._paused is None and self._due is None:
             self._due = asyncio.get_running_loop().call_soon(self._turn)
 
@@ -200,7 +201,7 @@ class ServerQueue:
             self._epoll.modify(fd, events)
 
     def forget(self, fd: int) -> None:
-        """Before it is closed."""
+        """Remove a descriptor before it is closed."""
         if self._handlers.pop(fd, None) is None or self._epoll is None:
             return
         self._epoll.unregister(fd)
@@ -217,7 +218,7 @@ class ServerQueue:
         self._guests.due()
 
     def serve(self) -> bool:
-        """One piece to send and one to receive; False where there was neither."""
+        """Send one piece and receive one; False if there was neither."""
         return self._send_one() | self._receive_one()
 
     def _send_one(self) -> bool:

@@ -1,4 +1,4 @@
-"""Commands as they come off the broker: how many are taken, which, and what each is answered.
+"""Intake of commands from the broker: rate, permission and replies.
 
 The rate is bounded by a token bucket: it holds `BURST` tokens, gains `RATE_HZ` a second, and a
 command takes one. A command without a token is not read; the first of a row is answered, the row
@@ -32,11 +32,11 @@ from fusiond.outputs.messages.reply import ReplyMessage
 RATE_HZ = 5.0
 BURST = 20.0
 REMEMBERED = 1000
-"""Commands whose ids are kept: 200 s of them at the greatest rate; 100 kB."""
+"""Command ids kept: 200 s of them at the greatest rate; 100 kB."""
 # The longest command name is 13 characters; of what is none so much is repeated.
 _NAME_SHOWN = 40
 Answer = ReplyMessage | Coroutine[None, None, ReplyMessage]
-"""At once, or when what was done is on disk."""
+"""Reply to a command: immediate, or once its result is on disk."""
 
 
 class CommandIntake:

@@ -34,7 +34,7 @@ class SetPosition(Command):
 
 
 class RequestFix(Command):
-    """Ask the RDSS terminal for a fix as soon as its service frequency allows."""
+    """Request an RDSS fix as soon as the service frequency allows."""
 
 
 class SendMessage(Command):
@@ -63,7 +63,7 @@ class StopRecording(Command):
 
 
 class Inject(Command):
-    """Falsify what a source sends, for a time: to see what comes of it, never on the road.
+    """Falsify a source's measurements for a time, to test the reaction; never on the road.
 
     `drop`: nothing comes. `delay`: everything comes `size` s later. `jump`, `drift`, `noise`: an
     error of `size`, of `size` a second, or of one sigma `size`, in the measurement's unit: m of a
@@ -150,7 +150,7 @@ def parse(name: str, payload: bytes) -> Command:
 
 
 def request_id(payload: bytes) -> str | None:
-    """The request's `id` where it can be read, whatever else the payload is."""
+    """Request's `id`, if readable, from any payload."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         return None
     try:

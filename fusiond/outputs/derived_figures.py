@@ -17,7 +17,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.outputs.messages.nav import NavMessage
 
 TWO_SIDED_95 = 1.959964
-"""Sigmas of a Gaussian within which 95 % lie."""
+"""Two-sided 95 % quantile of a Gaussian, in sigmas."""
 
 
 class Motion(NamedTuple):
@@ -36,7 +36,7 @@ def usable(nav: NavMessage) -> bool:
 
 
 def known(value: float | None) -> float | None:
-    """A figure, None where it is not known: messages made here hold NaN, those read back null."""
+    """Value, or None if unknown: NaN in messages made here, null in those read back."""
     return value if value is not None and isfinite(value) else None
 
 

@@ -1,4 +1,4 @@
-"""Height of the geoid above the ellipsoid, for clients that want heights above the sea.
+"""Geoid height above the ellipsoid, for clients that need heights above the sea.
 
     N(lat, lon) = bilinear in EGM96 at whole degrees,    H = h - N
 
@@ -37,8 +37,8 @@ class SeaHeight(NamedTuple):
 
 
 def sea_height(nav: NavMessage, configured_m: float | None) -> SeaHeight | None:
-    """Height of a solution above the sea, by N as configured, else by the table; None where the
-    solution has no place, no height or no sigma of its height."""
+    """Height of a solution above the sea, by the configured geoid height, else by the table. None
+    where the solution lacks position, height or the height's sigma."""
     lat, lon, height = known(nav.lat_deg), known(nav.lon_deg), known(nav.height_m)
     if not usable(nav) or lat is None or lon is None or height is None:
         return None

@@ -58,7 +58,7 @@ class HomeAssistantDiscovery:
         return self._mqtt.status
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Nothing to do: the entities read what MQTT publishes."""
+        """Ignore messages: the entities read the topics of MQTT."""
 
     async def run(self) -> None:
         await asyncio.get_running_loop().create_future()

@@ -1,4 +1,4 @@
-"""Parser of a guest's JSON, or one refusal for all that is none.
+"""Parser of a client's JSON, with one error for all invalid input.
 
 Refused beside what is no JSON: what is nested deeper than any request is, half a surrogate pair
 (no text that can be written out again), NaN and infinities.
@@ -17,7 +17,7 @@ DEEPEST = 16
 
 
 class NotUnderstoodError(ValueError):
-    """It is no JSON that can be answered: the text says why, in a few ASCII characters."""
+    """Error: invalid JSON; the text is a reason in a few ASCII characters."""
 
 
 def parsed(text: str | bytes) -> Any:

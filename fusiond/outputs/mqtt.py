@@ -1,4 +1,4 @@
-"""MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
+"""MQTT publisher: a supervised connection and bounded queues.
 
 `publish` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, packet_limit, subscriptions
+from fusiond.outputs import broker_access, oversized_packets, subscriptions
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
@@ -31,18 +31,18 @@ from fusiond.outputs.reconnection import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
 _TIMEOUT_S = 1.0
-"""An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
+"""Age of an unconfirmed message that stops the QoS 0 flow, whose messages would be lost unseen."""
 _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
 _OVERDUE = "timed out"
-"""In the text of aiomqtt's error for a confirmation that did not come: it was we who hung up."""
+"""Text of aiomqtt's error for a missing confirmation: the disconnection is our own."""
 # aiomqtt warns of every message that it discards: in a flood of commands a line each.
 _LOG = logging.getLogger("fusiond.aiomqtt")
 _LOG.setLevel(logging.ERROR)
 
 
 class MqttPublisher:
-    """Publishes a vehicle's topics and takes its commands.
+    """Publisher of a vehicle's topics, and receiver of its commands.
 
     `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
     `mqtt_flooded`, `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`.
@@ -99,9 +99,9 @@ class MqttPublisher:
             )
         self._replying: set[asyncio.Task[None]] = set()
         self.on_confirmed: Callable[[BaseModel], None] = lambda message: None
-        """Hears each queued message that the broker has taken."""
+        """Callback with each queued message that the broker has confirmed."""
         self._reconnecting = Reconnecting()
-        self._version = MqttVersion(MAX_PAYLOAD_BYTES + packet_limit.LONGEST_TOPIC)
+        self._version = MqttVersion(MAX_PAYLOAD_BYTES + oversized_packets.LONGEST_TOPIC)
         self._quiet = subscriptions.quiet()
         self.status = DriverStatus()
 
@@ -112,12 +112,12 @@ class MqttPublisher:
     # ------------------------------------------------------------------ for the tick
 
     def listen(self, address: str, listener: Callable[[bytes], None]) -> None:
-        """Let `listener` have what others publish at `address`; before `run`."""
+        """Subscribe `listener` to publications of others at `address`; before `run`."""
         self._listeners[address] = listener
 
     def publish(self, topic: Topic, message: BaseModel) -> None:
-        """Put a message into its place: with QoS 0 the latest counts, what is retained is
-        confirmed and sent again after each connection, all else is queued."""
+        """Store a message for sending. With QoS 0 the latest counts; a retained one is confirmed
+        and sent again after each connection; all others are queued."""
         if topic.qos == 0:
             self._replace(topic, message)
         elif topic.retained:
@@ -144,8 +144,7 @@ class MqttPublisher:
         self._confirmed_ready.set()
 
     def _keep_event(self, message: EventMessage) -> None:
-        """The last events are retained, so that who comes later sees them; nothing is lost when
-        the list grows before it is sent."""
+        """Retain the last events for later subscribers; the list may grow before it is sent."""
         self._events.append(message)
         self._retained[EVENTS] = events_message(tuple(self._events))
         self._due[EVENTS] = None
@@ -214,9 +213,9 @@ class MqttPublisher:
             max_queued_incoming_messages=_INCOMING,
             logger=_LOG,
             tls_context=self._tls,
-            socket_options=packet_limit.SOCKET_OPTIONS,
+            socket_options=oversized_packets.SOCKET_OPTIONS,
         )
-        packet_limit.limit(client, MAX_PAYLOAD_BYTES)
+        oversized_packets.limit(client, MAX_PAYLOAD_BYTES)
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> str:
@@ -292,7 +291,7 @@ class MqttPublisher:
                     await self._confirm(client, self._online, b"online", retain=True)
 
     async def _send_waiting(self, client: aiomqtt.Client) -> None:
-        """Send what is retained and due, and every queued message; one that fails stays queued."""
+        """Send due retained messages and every queued one; a failed one stays queued."""
         while self._due or self._queue:
             if self._due:
                 topic = next(iter(self._due))

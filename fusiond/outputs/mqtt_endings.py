@@ -1,5 +1,5 @@
-"""End of a connection to a broker where aiomqtt has no answer: a cancellation that is swallowed,
-a broker that is frozen, an attempt that is given up."""
+"""End of a broker's connection where aiomqtt fails: a swallowed cancellation, a frozen broker, an
+abandoned attempt."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FAREWELL_S = 2.0
 
 
 async def end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
-    """Cancel the tasks, wait for them; the errors they ended with."""
+    """Cancel tasks and wait for them; their errors."""
     for task in tasks:
         task.cancel()
     results = await asyncio.gather(*tasks, return_exceptions=True)
@@ -22,8 +22,8 @@ async def end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
 
 
 def honour_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows
-    when it comes together with the result (python/cpython issue 86296)."""
+    """Raise a cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows when it
+    coincides with the result (python/cpython issue 86296)."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
@@ -44,7 +44,7 @@ def hang_up(client: aiomqtt.Client) -> None:
 
 
 async def abandon(client: aiomqtt.Client) -> None:
-    """Hang up and wait until aiomqtt has noticed, so that leaving its context is immediate."""
+    """Disconnect and wait until aiomqtt has noticed, so that its context ends at once."""
 
     async def ended() -> None:
         async for _ in client.messages:

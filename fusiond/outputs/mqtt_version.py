@@ -18,17 +18,17 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 ANSWER_S = 1.0
-"""For the answer to CONNECT of version 5, on a connection that stands: over a satellite a round
-trip takes 0.6 s. A broker that is slower gets all its time with 3.1.1."""
+"""Timeout of the reply to CONNECT of version 5, on an open connection: a satellite round trip takes
+0.6 s. A slower broker gets the full timeout with 3.1.1."""
 _UNSUPPORTED = 132
-"""Of the reason codes: Unsupported Protocol Version, to which paho translates 3.1.1's 1 as well."""
+"""Reason code Unsupported Protocol Version; paho translates 1 of 3.1.1 to it."""
 
 _UNANSWERED = "Operation timed out"
-"""aiomqtt's words, also for who hangs up before an answer."""
+"""Text of aiomqtt's error for a missing reply, also for a disconnection before it."""
 
 
 class MqttVersion:
-    """Of one broker, for a client that takes packets of at most `most_bytes`."""
+    """Protocol version of one broker, for a client with packets of at most `most_bytes`."""
 
     def __init__(self, most_bytes: int) -> None:
         self.is_5 = True
@@ -36,7 +36,7 @@ class MqttVersion:
         self._other_tried = False
 
     def client(self, host: str, port: int, *, timeout: float, **options: Any) -> aiomqtt.Client:
-        """A client of this version, yet to connect; `timeout` (s) is for answers once it has."""
+        """Unconnected client of this version; `timeout` (s) is for replies once connected."""
         if not self.is_5:
             return aiomqtt.Client(host, port, timeout=timeout, **options)
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
@@ -51,11 +51,11 @@ class MqttVersion:
         )
 
     def connected(self) -> None:
-        """The broker speaks it."""
+        """Note that the broker supports this version."""
         self._other_tried = False
 
     def failed(self, error: aiomqtt.MqttError) -> bool:
-        """Take the other version, where this one may be why; whether to try that at once."""
+        """Switch to the other version if this one may be the cause; True to retry at once."""
         code = error.rc if isinstance(error, aiomqtt.MqttCodeError) else None
         refused = getattr(code, "value", code) == _UNSUPPORTED
         if not (refused or str(error) == _UNANSWERED):
@@ -65,7 +65,7 @@ class MqttVersion:
         return self._other_tried
 
     async def subscribe(self, client: aiomqtt.Client, address: str) -> None:
-        """With QoS 1. Raises `MqttError`."""
+        """Subscribe with QoS 1. Raises `MqttError`."""
         if self.is_5:
             options = SubscribeOptions(qos=1, retainAsPublished=True)
             await client.subscribe(address, options=options)

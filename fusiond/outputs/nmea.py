@@ -31,8 +31,8 @@ from fusiond.outputs.tcp import TcpServer, Unheard
 from fusiond.outputs.topics import NAV, Topic
 
 SATELLITES = "04"
-"""In GGA: the solution is no receiver's and has no number of satellites, but gpsd 3.22 takes fewer
-than four for no fix, while dead reckoning too."""
+"""Number of satellites in GGA. The solution has none, but gpsd 3.22 takes fewer than four for no
+fix, even for dead reckoning."""
 DEFAULT = ("RMC", "GGA", "VTG", "GST", "THS")
 KNOT_M_S = 1852.0 / 3600.0
 KMH_M_S = 1.0 / 3.6
@@ -100,7 +100,7 @@ def _sentence(kind: str, fields: list[str]) -> bytes:
 
 
 class _Epoch:
-    """One `nav` in the words of NMEA; a field that is not known is empty."""
+    """Solution `nav` as NMEA fields; unknown ones are empty."""
 
     def __init__(self, nav: NavMessage, geoid_separation_m: float | None) -> None:
         self._nav = nav
@@ -120,7 +120,7 @@ class _Epoch:
         return "" if figure is None else f"{figure * scale:.{decimals}f}"
 
     def _angle(self, value: float | None, decimals: int) -> str:
-        """0 to 360, which rounding must not reach."""
+        """Format an angle from 0 to 360; rounding must not reach 360."""
         figure = known(value) if self._usable else None
         return "" if figure is None else f"{round(figure, decimals) % 360.0:.{decimals}f}"
 

@@ -1,4 +1,4 @@
-"""OwnTracks: the vehicle among friends' phones, through the broker of `[mqtt]`.
+"""OwnTracks output: the vehicle among friends' phones, through the broker of `[mqtt]`.
 
 A location for each `tracker`, with the speed, course and height of the last `nav`. It is dated, so
 that none goes out before UTC is settled.

@@ -1,4 +1,4 @@
-"""Listening port of a server, retried while it is taken; and its state."""
+"""Listening port of a server, retried while in use, with its state."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ S = TypeVar("S", bound=Listening)
 
 
 class Port:
-    """`on_event` hears `<name>_absent` when the port cannot be had, once; `status` says how it
-    stands and `address` where it is, once it is `running`."""
+    """Listening port. `on_event` receives `<name>_absent` once when the port is unavailable;
+    `status` is its state, `address` its address once `running`."""
 
     def __init__(
         self, name: str, host: str, port: int, on_event: Callable[[str, str], None]
@@ -55,6 +55,6 @@ class Port:
         self._on_event(f"{self._name}_{code}", text)
 
     def serves(self, clients: int) -> None:
-        """So many are connected."""
+        """Report the number of connected clients."""
         host, port = self.address
         self.status = DriverStatus("running", f"{host}:{port}, {clients} connected")

@@ -1,4 +1,4 @@
-"""Prometheus: the state of the daemon as metrics, at `/metrics`.
+"""Prometheus output: the daemon's state as metrics at `/metrics`.
 
 Answers from the latest messages, with a text that is made once a second at most, so that scrapes
 cost no tick anything. Units are Prometheus's base units: seconds, metres, radians, bytes.
@@ -33,17 +33,17 @@ from fusiond.outputs.topics import Topic
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MOST_SCRAPERS = 32
-"""At once; Prometheus opens one, and keeps none."""
+"""Most simultaneous connections; Prometheus opens one and keeps none."""
 _KEPT_S = 1.0
-"""Time for which a text is reused: `health` comes once a second."""
+"""Time for which a text is reused; `health` comes once a second."""
 _MOST_HEAD_BYTES = 8192
-"""Of a request's line and headers, as HTTP servers have it."""
+"""Largest request line and headers, as in HTTP servers."""
 
 Labels = tuple[tuple[str, str], ...]
 
 
 class Family(NamedTuple):
-    """One metric: `samples` are (suffix of the name, labels, value)."""
+    """Metric; `samples` are (suffix of the name, labels, value)."""
 
     name: str
     kind: Literal["gauge", "counter", "histogram"]
@@ -89,7 +89,7 @@ class PrometheusEndpoint:
         return _Scrape(self, client)
 
     def answer(self, head: bytes) -> bytes:
-        """To a request of which that is the head."""
+        """Reply to a request with this head."""
         method, path, *_ = [*head.split(b"\r\n", 1)[0].split(), b"", b""]
         if method not in (b"GET", b"HEAD"):
             self.counters["malformed"] += 1
@@ -134,7 +134,7 @@ class PrometheusEndpoint:
 
 
 class _Scrape:
-    """One connection: a request, an answer, the end."""
+    """Connection: one request, one reply, then the end."""
 
     def __init__(self, endpoint: PrometheusEndpoint, client: Client) -> None:
         self._endpoint, self._client = endpoint, client

@@ -15,20 +15,20 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """So much a second, and so much at once."""
+    """Rate limit: amount a second, and burst."""
 
     per_s: float
     burst: float
 
 
 BYTES = Rate(65_536.0, 65_536.0)
-"""Of what a guest sends. Requests have 10 to 1000 bytes; a plotter that sends the sentences of a
+"""Bytes from a client. Requests have 10 to 1000 bytes; a plotter that sends the sentences of a
 whole vessel at 38400 baud (NMEA 0183-HS) has 4 kB/s."""
 MESSAGES = Rate(25.0, 50.0)
-"""Requests. gpsd's clients poll once a report, receivers report at 20 Hz at most; a viewer of
-Foxglove sends one for each of its panels when it opens a layout."""
+"""Requests. gpsd's clients poll once a report, and receivers report at 20 Hz at most; a Foxglove
+viewer sends one for each panel of a layout."""
 MICROSECONDS = Rate(20_000.0, 20_000.0)
-"""For reading what a guest sends: 2 % of a core, a fifth of what all guests have together."""
+"""Processor time for a client's requests: 2 % of a core, a fifth of the time of all clients."""
 
 
 class Bucket:
@@ -46,7 +46,7 @@ class Bucket:
         self._left -= amount
 
     def empty(self, now_ns: int) -> bool:
-        """True if more was spent than there was."""
+        """True if more was used than the limit allows."""
         self._fill(now_ns)
         return self._left < 0.0
 
@@ -67,5 +67,5 @@ class Allowance:
         self.microseconds = Bucket(MICROSECONDS, now_ns)
 
     def must_wait(self, now_ns: int) -> bool:
-        """True if nothing more is to be read of it for now."""
+        """True if the client must not be read now."""
         return self.bytes.empty(now_ns) or self.microseconds.empty(now_ns)

@@ -1,4 +1,4 @@
-"""Reconnection to the broker, and how to know that another client has our name.
+"""Reconnection to the broker, and detection of a second client with our name.
 
 A broker ends the older of two connections of one client identifier (MQTT 3.1.1, 3.1.4-2). In that
 version it does not say why; but a connection that it ends moments after it was made, again and

@@ -7,7 +7,7 @@ import socket
 import struct
 
 LINGER_NOT = struct.pack("ii", 1, 0)
-"""SO_LINGER, by which closing is a reset: the kernel would keep for a minute what nobody reads."""
+"""SO_LINGER for a reset at close; otherwise the kernel keeps unread data for a minute."""
 
 
 async def bound(host: str, port: int) -> list[socket.socket]:

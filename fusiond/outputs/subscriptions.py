@@ -1,4 +1,4 @@
-"""Publications of others, counted before anything is made of it.
+"""Subscriptions to publications of others, counted before they are parsed.
 
 A broker hands on whatever anybody publishes, as fast as it comes, on the connection that our own
 messages are confirmed on: behind a hundred thousand commands a confirmation comes seconds late, and
@@ -28,13 +28,13 @@ until its row is refused: so many a second are a hundredth of a core."""
 BYTES = Rate(65_536.0, 131_072.0)
 """Sixteen of the longest commands a second, thirty-two at once (`MAX_PAYLOAD_BYTES`)."""
 QUIET_S, LONGEST_QUIET_S = 10.0, 60.0
-"""Nobody is listened to after a flood, doubling with each that follows."""
+"""Pause after a flood, doubled by each further one."""
 PEACE_S = 60.0
-"""Without a flood for so long the next one is the first again."""
+"""Time without a flood after which the pause is the first again."""
 
 
 class Incoming:
-    """Of one connection. `counters["mqtt_flooded"]` are messages that were dropped unread."""
+    """Publications of one connection. `counters["mqtt_flooded"]` counts messages dropped unread."""
 
     def __init__(self, client: aiomqtt.Client, counters: Counter[str], quiet: Backoff) -> None:
         self._counters = counters
@@ -63,7 +63,7 @@ class Incoming:
         return self._quiet.next()
 
     def over(self) -> None:
-        """It is listened again."""
+        """End the pause."""
         self._flooded.clear()
         self._restart()
 

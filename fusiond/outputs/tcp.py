@@ -1,4 +1,4 @@
-"""A TCP port and its clients, none of whom holds up another, or a tick.
+"""TCP server whose clients hold up neither each other nor a tick.
 
 Whatever a client causes is done in a turn of the door (`fusiond.outputs.client_sockets`) and
 charged to its allowance: who sends too much is read more slowly, who asks too often is dropped.
@@ -27,24 +27,24 @@ from fusiond.outputs.rate_limits import Allowance
 from fusiond.outputs.sockets import LINGER_NOT, bound, tune
 
 MOST_CLIENTS = 256
-"""A quarter of the descriptors that a process has by default (1024, RLIMIT_NOFILE)."""
+"""Most clients: a quarter of a process's default descriptors (1024, RLIMIT_NOFILE)."""
 MOST_WAITING_BYTES = 16384
 """Some ten epochs of gpsd's JSON, 1 to 1.5 kB each: a second at 10 Hz. What is older is no use."""
 MOST_SKIPPED = 30
 """Epochs in a row: 3 s at 10 Hz, half a minute at 1 Hz, the time that gpsd's clients wait."""
 STUCK_S = 30.0
-"""Something waits for the client and it takes nothing: as long as thirty epochs at 1 Hz."""
+"""Time in which a client must accept waiting data: thirty epochs at 1 Hz."""
 REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""Idle time after which a client is closed for a new one; one that reads nothing counts as idle."""
+"""Idle time after which a client may be closed for a new one; one that reads nothing is idle."""
 PAUSE_S = 1.0
-"""Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
+"""Pause when no descriptor is available; the kernel queues connections meanwhile."""
 SHORT_LOGGED_S = 60.0
 """Between two events about that."""
 _READ_BYTES = 1024
-"""One piece of work: 50 requests of gpsd's at most."""
+"""Bytes read in one step: at most 50 requests of gpsd."""
 _BACKLOG = 128
 _SHORT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _GONE = select.EPOLLHUP | select.EPOLLERR
@@ -64,7 +64,7 @@ class Session(Protocol):
 
 
 class Unheard:
-    """A session of who has nothing to say: what comes is read, so that its end is noticed."""
+    """Session of a client without requests; input is read only to notice its end."""
 
     def receive(self, data: bytes) -> None:
         pass
@@ -74,7 +74,7 @@ class Unheard:
 
 
 class Client:
-    """One connection; closed, it is nothing more than its number of descriptor was."""
+    """Client connection; after its close only the descriptor number remains."""
 
     def __init__(self, sock: socket.socket, server: TcpServer, host: str) -> None:
         self.host = host
@@ -92,7 +92,7 @@ class Client:
         self._allowance = Allowance(now_ns)
         self._moved_ns = now_ns
         self.request_due = False
-        """True if it has yet to ask what its connection is for; it has `REQUEST_S` for that."""
+        """True until the client states its request, within `REQUEST_S`."""
         self._flushing = self._slowed = self._finishing = self.closed = False
         self.session: Session | None = None
         self.on_room: Callable[[], None] | None = None
@@ -104,7 +104,7 @@ class Client:
     # ------------------------------------------------------------------ for the server
 
     def send(self, data: bytes) -> None:
-        """Send all of `data` or nothing of it; does not wait."""
+        """Send all of `data` or nothing, without waiting."""
         if self.closed or self._finishing:
             return
         if self._out_bytes > MOST_WAITING_BYTES:
@@ -117,7 +117,7 @@ class Client:
         self._put(data)
 
     def finish(self, data: bytes = b"") -> None:
-        """Send `data` and close when it is out."""
+        """Send `data`, then close."""
         if self.closed or self._finishing:
             return
         self._finishing = True
@@ -127,7 +127,7 @@ class Client:
             self.close()
 
     def charge(self) -> bool:
-        """One request; False, and the client is dropped, if it was one too many."""
+        """Count one request; False, and the client is dropped, beyond its limit."""
         now_ns = time.perf_counter_ns()
         self._allowance.messages.spend(1.0, now_ns)
         if not self._allowance.messages.empty(now_ns):
@@ -140,7 +140,7 @@ class Client:
         return self._out_bytes
 
     def drop(self, reason: str) -> None:
-        """Close at once, whatever waits for it; counted as `reason`."""
+        """Close at once and discard waiting data; counted as `reason`."""
         if not self.closed:
             self._counters[reason] += 1
             # Reset: the kernel would keep for a minute what nobody reads.
@@ -161,7 +161,7 @@ class Client:
             session.end()
 
     def owes(self, now_ns: int) -> bool:
-        """True if a request, or the room for an answer that ends the connection, is overdue."""
+        """True if a request, or room for a final reply, is overdue."""
         since_ns = self.since_ns if self.request_due else self._moved_ns
         due = self.request_due or self._finishing
         return due and now_ns - since_ns > HASTY_S * _SECOND_NS
@@ -212,7 +212,7 @@ class Client:
             self._wait_for(self._wanted & ~select.EPOLLIN)
 
     def _hung_up(self) -> None:
-        """It sends no more; what it has asked for it still gets."""
+        """Handle the client's end of sending; pending replies are still sent."""
         self._wait_for(self._wanted & ~select.EPOLLIN)
         self.finish()
 
@@ -267,7 +267,7 @@ class _Listener:
 
 
 class TcpServer:
-    """Listens at `host:port`, or at the socket that the service manager holds as `name`.
+    """Server at `host:port`, or at the socket that the service manager holds as `name`.
 
     `greet(client)` gives the session of a connection. `counters`: `clients` (since the start),
     `clients_refused` (too many at once), `clients_dropped` (did not read), `clients_flooding`
@@ -311,7 +311,7 @@ class TcpServer:
                 client.close()
 
     def send(self, data: Callable[[Client], bytes]) -> None:
-        """Send each client what `data` makes for it, if anything."""
+        """Send each client the bytes that `data` returns for it, if any."""
         for client in tuple(self.clients):
             payload = data(client)
             if payload:
@@ -367,7 +367,7 @@ class TcpServer:
         return self.guests.places(self._most)
 
     def _make_room(self, host: str) -> None:
-        """Handle a full server, for one who comes from `host`."""
+        """Free a place on a full server for a client from `host`."""
         if len(self.clients) < self._places:
             return
         client = gives_way(self.clients, host, time.perf_counter_ns())

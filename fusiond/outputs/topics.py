@@ -23,7 +23,7 @@ from fusiond.outputs.messages.tracker import TrackerMessage
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic below `fusiond/<vehicle>`: what it carries and how it is delivered.
+    """Topic below `fusiond/<vehicle>`: contents and delivery.
 
     `below` is the rest of the address of a topic of which there are several.
     """
@@ -37,7 +37,7 @@ class Topic:
 
     @property
     def path(self) -> str:
-        """Its name, with what stands below it."""
+        """Name of the topic with its subtopics."""
         return f"{self.name}/{self.below}" if self.below else self.name
 
     def address(self, base: str) -> str:
@@ -57,7 +57,7 @@ EVENTS = Topic("events", EventsMessage, 1, True)
 REPLY = Topic("reply", ReplyMessage, 1, False)
 MESSAGE = Topic("message", ShortMessage, 1, False)
 FLEET = Topic("fleet", FleetMessage, 1, True, below="{card}")
-"""Of all cards; `fleet(card)` is that of one."""
+"""Topic of all cards; `fleet(card)` is that of one."""
 TOPICS = (
     *(NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER),
     *(EVENT, EVENTS, REPLY, MESSAGE, FLEET),

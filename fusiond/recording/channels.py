@@ -1,4 +1,4 @@
-"""The channels of a log, their schemas, and the messages that are made for other tools.
+"""Channels of a log with their schemas, and messages for other tools.
 
 `/fusiond/input` is what a replay needs (`fusiond.recording.records`); all other channels are
 derived from it, JSON, and there so that a log opens in Foxglove, Lichtblick and PlotJuggler as it
@@ -30,10 +30,10 @@ INPUT_ENCODING = "fusiond.records"
 
 @dataclass(frozen=True, slots=True)
 class InnovationMessage:
-    """Outcome of a measurement when the filter met it, again after a rewind."""
+    """Outcome of a measurement in the filter, repeated after a rewind."""
 
     t_ns: int
-    """Of validity, CLOCK_MONOTONIC."""
+    """Instant of validity, CLOCK_MONOTONIC."""
     source: str
     outcome: str
     """`fused`, `gated`, `too_old`, ... as counted in `health`."""
@@ -43,8 +43,8 @@ class InnovationMessage:
     whitened: tuple[float, ...]
     """L^-1 nu with S = L L^T: each is N(0, 1) while filter and measurement agree."""
     raw: tuple[float, ...]
-    """Estimate minus measurement in `unit`, before the filter judged it; empty where the
-    measurement measures neither position nor velocity, or was not applied. To a micrometre."""
+    """Estimate minus measurement in `unit`, before the gate, to a micrometre. Empty for a
+    measurement of neither position nor velocity, or one that was not applied."""
     unit: Literal["m", "m/s"] | None
     axes: str
     """A letter for each of `raw`, of `ned`; empty where each is along a direction of its own."""
@@ -52,7 +52,7 @@ class InnovationMessage:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel as MCAP has it; `schema()` is made when a file needs it."""
+    """MCAP channel; `schema()` is built on demand."""
 
     topic: str
     schema_name: str
@@ -66,7 +66,7 @@ def _json_channel(topic: str, name: str, schema: Callable[[], dict[str, Any]]) -
 
 
 OF_FOXGLOVE = tuple(c for c in foxglove.CHANNELS if c.schema_name.startswith("foxglove."))
-"""Made of the topics for Foxglove and what reads its schemas: map, attitude, log."""
+"""Channels for Foxglove: map, attitude, log."""
 CHANNELS: dict[str, Channel] = {
     channel.topic: channel
     for channel in (

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fusiond.clock.host import SECOND_NS
 from fusiond.recording.channels import CHANNELS, INPUT, STATE
-from fusiond.recording.log_file import About, Attachment, LogFile
+from fusiond.recording.mcap_writer import About, Attachment, LogFile
 from fusiond.recording.reader import About as Described
 from fusiond.recording.reader import Log, LogError, LogMessage
 from fusiond.recording.records import NO_SOURCE, Kind, Record, pack, unpack
@@ -33,7 +33,7 @@ class Edited:
 
 
 def merge(paths: Sequence[Path], out: Path) -> Edited:
-    """All parts of one recording as one file. Raises `LogError`, OSError."""
+    """Merge all parts of one recording into one file. Raises `LogError`, OSError."""
     recording = Log(paths)
     written = write_log(out, recording.about, {}, recording.messages())
     return Edited(out, written, "what the recording began with", tuple(recording.problems))
@@ -45,7 +45,8 @@ def recover(path: Path, out: Path) -> Edited:
 
 
 def trim(paths: Sequence[Path], from_s: float, to_s: float, out: Path) -> Edited:
-    """The time from `from_s` to `to_s`, s after the recording's first tick, to replay by itself.
+    """Cut out `from_s` to `to_s`, s after the recording's first tick, as a log that can be
+    replayed.
 
     It begins with the last state before `from_s` that the log holds (every 10 s), so that a replay
     goes on from there; with the recording itself where `from_s` is before its first state.
@@ -105,7 +106,7 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
 def write_log(
     out: Path, about: Described, more: dict[str, str], messages: Iterable[LogMessage]
 ) -> int:
-    """Messages as a log of their own, with `more` in its metadata; how many they are."""
+    """Write messages as a new log with `more` in its metadata; their number."""
     attachments = tuple(
         Attachment(name, _TYPES.get(Path(name).suffix, "text/plain"), data)
         for name, data in about.attachments.items()

@@ -19,7 +19,7 @@ A slew (500 ppm at most) stays below it between two readings of a running daemon
 
 
 def info(recording: Log) -> dict[str, Any]:
-    """Versions, time, channels, what came from each source, and what is wrong with the log.
+    """Summary of a log: versions, time, channels, inputs by source, damage.
 
     `gaps` are pauses between ticks of more than a second; `clock_steps` of the system clock.
     """

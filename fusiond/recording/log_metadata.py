@@ -13,17 +13,17 @@ from drivers.base import PermanentDriverError
 from drivers.can.dbc import find_dbc
 from fusiond.configuration.load import config_digest, dumped
 from fusiond.configuration.schema import Config
-from fusiond.recording.log_file import FORMAT, About, Attachment
+from fusiond.recording.mcap_writer import FORMAT, About, Attachment
 
 CONFIG = "config.json"
-"""The configuration as the daemon had it, every default and path filled in."""
+"""Configuration of the daemon with every default and path filled in."""
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 CPU_INFO = Path("/proc/cpuinfo")
 _PACKAGES = ("numpy", "numba", "scipy", "mcap")
 
 
 def about_run(config: Config, run: str, epoch_ns: int, sources: Iterable[str]) -> About:
-    """Of a run of the daemon. `epoch_ns` is what the log's times are ahead of CLOCK_MONOTONIC."""
+    """Metadata of a run of the daemon. `epoch_ns`: the log's time minus CLOCK_MONOTONIC."""
     metadata = {
         "format": FORMAT,
         "version": version("fusiond"),
@@ -44,7 +44,7 @@ def about_run(config: Config, run: str, epoch_ns: int, sources: Iterable[str]) -
 
 
 def _versions() -> dict[str, str]:
-    """Of the packages that figures depend on, as far as they are there."""
+    """Versions of the installed packages that affect results."""
     found = {}
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -53,7 +53,7 @@ def _versions() -> dict[str, str]:
 
 
 def processor() -> str:
-    """Its model: compiled code may differ in the last bit between two."""
+    """Processor model; compiled code may differ between models in the last bit."""
     for line in _read(CPU_INFO).splitlines():
         if line.startswith(("model name", "Hardware", "Model")):
             return line.partition(":")[2].strip()

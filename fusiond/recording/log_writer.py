@@ -25,7 +25,7 @@ from fusiond.clock.host import SECOND_NS
 from fusiond.configuration.recording import Recording
 from fusiond.outputs.messages.base import Message
 from fusiond.recording.channels import CHANNELS, OF_FOXGLOVE, InnovationMessage
-from fusiond.recording.log_file import SUFFIX, About, LogFile
+from fusiond.recording.mcap_writer import SUFFIX, About, LogFile
 
 log = logging.getLogger("fusiond")
 
@@ -34,7 +34,7 @@ WRITE_S = 0.5
 QUEUE = 20_000
 """Messages that may wait: over a minute of 200 a second, 15 MB; a disk that hangs longer loses."""
 KEEP_EVERY_NS = 10 * SECOND_NS
-"""Between two looks at which logs are too many: at most 10 MB come in that time."""
+"""Interval of the check for surplus logs: at most 10 MB are written in it."""
 MB = 1_000_000
 _INNOVATION = TypeAdapter(InnovationMessage)
 
@@ -95,7 +95,7 @@ class LogWriter:
         self._closing.set()
 
     def wait(self) -> None:
-        """Until that is done."""
+        """Wait until the file is closed."""
         self._thread.join()
 
     @property
@@ -169,7 +169,7 @@ class LogWriter:
             )
 
     def _keep_newest(self) -> None:
-        """Remove this vehicle's oldest logs beyond `keep_mb`, now and then."""
+        """Remove this vehicle's oldest logs beyond `keep_mb`, periodically."""
         now_ns = time.monotonic_ns()
         if now_ns - self._looked_ns < KEEP_EVERY_NS:
             return
@@ -192,7 +192,7 @@ class LogWriter:
 
 
 class _DiskFullError(Exception):
-    """Not yet, but soon."""
+    """Error: the disk is almost full."""
 
 
 def _worded(item: Item) -> list[tuple[str, bytes]]:

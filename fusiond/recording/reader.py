@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader
 
 from fusiond.recording.channels import INPUT
-from fusiond.recording.log_file import FORMAT, METADATA
+from fusiond.recording.mcap_writer import FORMAT, METADATA
 from fusiond.recording.records import DamagedRecordError, Record, check, unpack
 
 RECORD_LIMIT = 1 << 26
@@ -32,28 +32,29 @@ CHUNK_LIMIT = 1 << 24
 """Bytes of a chunk, decompressed: ours have 128 KiB and a message more; other writers, by whom logs
 were merged, make 4 MiB (the tool `mcap`)."""
 RATIO_LIMIT, RATIO_FREE = 100, 1 << 18
-"""A chunk may become so many times as long, and two chunks of ours more: those of a drive are 4 to
-5 times as long, one of nothing but 0xD3 from a line 188. A small file is no large recording."""
+"""Limits of a chunk's decompressed size: ratio, and bytes that are always allowed. Chunks of drives
+have a ratio of 4 to 5; repeated bytes 0xD3 from a line have 188. The free bytes are two of our
+chunks."""
 WINDOW_LIMIT = 1 << 23
-"""Window that a decompressor of zstd must be ready to hold of the past (RFC 8878, section
-3.1.1.1.2)."""
+"""Largest window of a zstd decompressor (RFC 8878, section 3.1.1.1.2)."""
 LATEST_NS = 253_402_300_800 * 1_000_000_000
 """The end of 9999, POSIX: what is told of a log has four digits for a year."""
 MOST_PROBLEMS = 100
-"""Sentences on what is wrong with a log; a file can be wrong in as many ways as it has bytes."""
+"""Most problems listed for a log; damage can cause one for each byte."""
 _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, RuntimeError)
 
 
 _RECORD = struct.Struct("<BQ")
 """Opcode and length of an MCAP record."""
 _MESSAGE = struct.Struct("<HIQ8x")
-"""MCAP: channel, sequence and log time of a message, before its data."""
+"""MCAP message header: channel, sequence and log time."""
 _CHANNEL = struct.Struct("<HHI")
-"""MCAP: channel, schema and the length of the topic that follows."""
+"""MCAP channel header: channel, schema and length of the topic."""
 
 
 class LogError(Exception):
-    """A file that is no log of fusiond, or one of a later format: the text says which and why."""
+    """Error: a file that is not a log of fusiond, or has a later format; the text names the
+    reason."""
 
 
 class LogMessage(NamedTuple):
@@ -86,7 +87,7 @@ class About:
 
     @property
     def sources(self) -> list[str]:
-        """The drivers' names, in the order in which records number them."""
+        """Names of the drivers, in the order in which records number them."""
         named: list[str] = json.loads(self.metadata["sources"])
         return named
 
@@ -115,7 +116,7 @@ class Log:
                 self._problem(f"{path.name}: a part before it is missing")
 
     def messages(self, *topics: str) -> Iterator[LogMessage]:
-        """The messages of these channels, of all by default, as they were written."""
+        """Messages of these channels, by default of all, in recorded order."""
         wanted = frozenset(topics)
         for path in self.paths:
             yield from _messages(path, wanted, self._problem)
@@ -152,7 +153,7 @@ class Log:
 
     @property
     def first_part(self) -> bool:
-        """True if the recording's beginning is there."""
+        """True if the recording's first part is present."""
         return self.about.metadata["part"] == "0"
 
 
@@ -182,7 +183,7 @@ def described_by(path: Path) -> About:
 def _messages(
     path: Path, wanted: Collection[str], problem: Callable[[str], None]
 ) -> Iterator[LogMessage]:
-    """Those of the channels `wanted`, of all if it is empty."""
+    """Messages of the channels `wanted`, of all if it is empty."""
     topics: dict[int, str | None] = {}
 
     def name(channel: int, topic: str) -> None:
@@ -203,7 +204,7 @@ def _messages(
 def _opened(
     data: bytes, topics: Mapping[int, str | None], name: Callable[[int, str], None]
 ) -> Iterator[LogMessage]:
-    """The messages of a chunk whose channel has a topic; `name` is told its channels.
+    """Messages of a decompressed chunk whose channel has a topic; `name` receives its channels.
 
     A chunk is read by its bytes: an object of each message, of which most are of no interest, costs
     more than all else of reading a log. Raises one of `_DAMAGED`.
@@ -257,8 +258,8 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 class _Bounded:
-    """A file of which no more is asked at once than a record may have: a length inside a record is
-    believed by mcap, which looks at the record's own alone."""
+    """File whose reads are limited to a record's size, since mcap trusts lengths inside a
+    record."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -270,7 +271,7 @@ class _Bounded:
 
 
 class _Unindexed(StreamReader):
-    """Passes over the indices behind each chunk, a pair of numbers a message: nobody seeks here."""
+    """File without the indices behind chunks, which a sequential reader skips."""
 
     def _read_record(self, opcode: int, length: int) -> McapRecord | None:
         return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)

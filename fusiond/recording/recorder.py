@@ -1,4 +1,4 @@
-"""The daemon's side of a recording: what moves it is written down in the order it is handled.
+"""Daemon side of a recording: every input is written in the order of handling.
 
 A record begins when its input is about to be handled, and is complete when the next begins: the
 readings of the host's clocks in between are its own. A tick closes a message, so that the log grows
@@ -21,8 +21,8 @@ from pydantic import BaseModel
 from drivers.base import DriverStatus
 from drivers.can.bus import CanFrame
 from drivers.inputs import Inputs
-from fusiond.clock.clock import Clock
 from fusiond.clock.host import SECOND_NS, ReadClock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config
 from fusiond.navigator.timeline import Entry
@@ -47,7 +47,7 @@ from fusiond.recording.records import (
 from fusiond.recording.retry import Retry
 
 MESSAGE_BYTES = 64 * 1024
-"""Inputs that come without a tick (it is late, or none is left) make a message of their own."""
+"""Size at which inputs without a tick form a message of their own."""
 STATE_EVERY_NS = 10 * SECOND_NS
 """Largest early begin of a cut; a state has 6 kB."""
 
@@ -79,7 +79,7 @@ class Recorder:
         now_ns = clock.now_ns()
         self._epoch_ns = (clock.utc_ns(now_ns) or now_ns) - now_ns
         self.state: RecordingState = "off"
-        """`waiting`: the last seconds are kept in memory until an event comes."""
+        """State of the recording; `waiting`: the last seconds are kept in memory until an event."""
         self._writer: LogWriter | None = None
         self._closing: list[LogWriter] = []
         self._again = Retry()
@@ -99,13 +99,13 @@ class Recorder:
     # ------------------------------------------------------------------ what is asked of it
 
     def listen(self, inputs: Mapping[str, Inputs]) -> None:
-        """These are the drivers' inputs by source."""
+        """Record the inputs of drivers, by source."""
         self._inputs = dict(inputs)
         self._numbers = {name: number for number, name in enumerate(inputs)}
 
     def arm(self, restored: Mapping[str, Any]) -> None:
-        """Do from the start what the configuration says. `restored` is what the start had read
-        from disk: a replay starts from it."""
+        """Start recording as configured. `restored` is the saved state that the start read; a
+        replay starts from it."""
         if self._options.directory is None:
             return
         if self._options.when == "always":
@@ -173,12 +173,12 @@ class Recorder:
 
     @property
     def active(self) -> bool:
-        """True if anything is to be told to it."""
+        """True if input must be handed to the recorder."""
         return self.state in ("recording", "waiting")
 
     @property
     def recording(self) -> RecordingStatus:
-        """As `status` has it."""
+        """State of the recording for `status`."""
         writer = self._writer
         if writer is None:
             return RecordingStatus(self.state)
@@ -232,7 +232,7 @@ class Recorder:
             self._begin(Record(Kind.COMMAND, NO_SOURCE, t_ns, text.encode()))
 
     def tick_begins(self, t_ns: int) -> None:
-        """The tick with this deadline begins."""
+        """Begin the tick with this deadline."""
         if self.state == "failed":
             self._take_up_again(t_ns)
         if self.active:
@@ -262,7 +262,7 @@ class Recorder:
         return self.active and (old or parts != self._state_part)
 
     def keep_state(self, t_ns: int, kept: bytes) -> None:
-        """A navigation state as the warm start takes it (JSON): where a cut log can begin."""
+        """Keep a navigation state in the warm start's format (JSON): where a cut log can begin."""
         self._state_ns = t_ns
         self._state_part = 0 if self._writer is None else self._writer.parts
         self._put(Item(STATE, t_ns + self._epoch_ns, kept))
@@ -270,7 +270,7 @@ class Recorder:
     # ------------------------------------------------------------------ inside
 
     def _take_up_again(self, t_ns: int) -> None:
-        """Record what it did before it failed; with `when = "event"`, wait for the next."""
+        """Resume recording after a failure; with `when = "event"`, wait for the next event."""
         writer = self._again.ready(t_ns, self._open)
         if writer is None:
             return
@@ -356,7 +356,7 @@ class Recorder:
         self._started = record
 
     def _complete(self) -> None:
-        """The record that was started has all its readings."""
+        """Write the current record, whose readings are complete."""
         record = self._started
         if record is None:
             self._readings.clear()

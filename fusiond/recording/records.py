@@ -12,7 +12,7 @@ Records stand in the order in which the daemon handled them: a log is played by 
 
     kind        payload
     start       JSON: what the daemon had loaded when the recording began
-    tick        inputs u64, overruns u64, late_ns i64, digest 8 bytes; t_ns is the tick's deadline
+    tick        inputs u64, overruns u64, latency_ns i64, digest 8 bytes; t_ns is the tick's deadline
     read        bytes of one read
     frame       CAN id u32, flags u8 (1 extended, 2 remote, 4 error, 8 stamped), realtime_ns i64,
                 data
@@ -72,7 +72,7 @@ _OF_TEXT = frozenset({Kind.CLOSE, Kind.CONTROLLER, Kind.TIMER})
 
 
 class Record(NamedTuple):
-    """One record; `payload` is as in the table above."""
+    """One record; `payload` follows the table above."""
 
     kind: Kind
     source: int
@@ -87,7 +87,7 @@ class Tick(NamedTuple):
 
     inputs: int
     overruns: int
-    late_ns: int
+    latency_ns: int
     digest: bytes
 
 
@@ -130,7 +130,7 @@ def unpack(data: bytes) -> Iterator[Record]:
 
 
 def check(record: Record, sources: int) -> None:
-    """Raise `DamagedRecordError` for a record that nobody writes who has so many sources."""
+    """Check a record of a log with `sources`. Raises `DamagedRecordError`."""
     kind, source, _, payload, _ = record
     if kind in _OF_DAEMON:
         if source != NO_SOURCE:
@@ -211,7 +211,7 @@ KINDS_BY_INPUT = {
     "sent": Kind.SENT,
     "correction": Kind.CORRECTION,
 }
-"""Of `drivers.inputs`; a kind that is not listed is a timer of the driver's own."""
+"""Record kinds by kind of `drivers.inputs`; any other kind is a timer of the driver."""
 
 
 def input_record(
@@ -231,7 +231,7 @@ def input_record(
 
 
 def input_of(record: Record) -> tuple[str, bytes | str | CanFrame | None]:
-    """Kind and payload as the driver's `Inputs.take` has them."""
+    """Input of a driver: kind and payload for `Inputs.take`."""
     kind = record.kind
     if kind is Kind.FRAME:
         return "frame", frame_of(record)

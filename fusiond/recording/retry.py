@@ -15,7 +15,7 @@ from fusiond.recording.log_writer import LogWriter
 FIRST_S = 5.0
 """A disk that was plugged in again is mounted within some seconds."""
 LONGEST_S = 60.0
-"""Also how long it has to write until a failure is a new one."""
+"""Longest wait between attempts; a failure after a longer success begins a new series."""
 
 
 class Retry:
@@ -28,7 +28,7 @@ class Retry:
         self._attempt: LogWriter | None = None
 
     def ready(self, t_ns: int, open_log: Callable[[], LogWriter]) -> LogWriter | None:
-        """A log that the disk has taken, once there is one; called every tick until then."""
+        """Log on a writable disk, once there is one; called every tick until then."""
         if self._due_ns is None:
             self._wait(t_ns)
         elif self._attempt is None and t_ns >= self._due_ns:
@@ -43,7 +43,7 @@ class Retry:
         return None
 
     def give_up(self) -> None:
-        """Nothing is to be tried any more."""
+        """Stop retrying."""
         if self._attempt is not None:
             self._attempt.close()
         self._attempt = self._due_ns = None

@@ -1,4 +1,4 @@
-"""The recording host's clocks, as the log has them."""
+"""Recorded clocks of the host."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REALTIME, BOOTTIME = 0, 1
 
 
 class RecordedTime:
-    """A `HostTime` that stands at `t_ns` until it is moved."""
+    """`HostTime` that stands at `t_ns` until it is moved."""
 
     def __init__(self, t_ns: int) -> None:
         self.t_ns = t_ns

@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.clock.clock import Clock
 from fusiond.clock.results import Instant
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
@@ -32,9 +32,9 @@ from fusiond.navigator.timeline import Entry
 from fusiond.outputs.commands import CARRIED_OUT, CommandRefusedError
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.recording.channels import STATE
-from fusiond.recording.digest import state_digest
 from fusiond.recording.reader import Log
 from fusiond.recording.records import Kind, Record, Tick, input_of, tick_of
+from fusiond.recording.state_digest import state_digest
 from fusiond.replay.recorded_time import RecordedReadings, RecordedTime
 
 log = logging.getLogger("fusiond")
@@ -71,8 +71,8 @@ class ReplayedTick(NamedTuple):
 
 
 class Replay:
-    """One run through a log with a configuration. `exact` says whether the log's own digests should
-    come out: it does not for another configuration, nor from the middle of a drive.
+    """One replay of a log with a configuration. `exact`: the log's own digests should be
+    reproduced, which needs its configuration and the start of the drive.
 
     `on_event`, `on_outcome` and `on_arrival` (of each measurement, with its instant) hear what the
     daemon's parts say. Without `navigate` the filter does not run, and there are no ticks. `afresh`
@@ -105,7 +105,7 @@ class Replay:
         self.chain: Chain | None = None
 
     def ticks(self) -> Iterator[ReplayedTick]:
-        """Run; each tick as it has ended. To be called once."""
+        """Run the replay once; yields each tick after its end."""
         after_ns = 0
         for record in self._log.records():
             if self.chain is None:
@@ -199,7 +199,7 @@ class Replay:
         return tick
 
     def _finish(self) -> None:
-        """The daemon read its host's clocks for outputs too, which a replay need not have."""
+        """Consume the remaining clock readings, which the daemon's outputs made."""
         assert self.chain is not None
         while self._readings.pending:
             self.chain.clock.look()

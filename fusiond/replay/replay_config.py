@@ -19,7 +19,7 @@ from fusiond.recording.reader import About
 def config_of(
     about: About, folder: Path, other: Path | None = None, settings: Sequence[str] = ()
 ) -> Config:
-    """The configuration of a log, or that of the file `other`, with `KEY=VALUE` settings.
+    """Configuration of the log or of the file `other`, with `KEY=VALUE` settings.
 
     The log's DBC files are laid into `folder`, which must outlast the use. Raises `ConfigError`.
     """

@@ -113,7 +113,7 @@ class _Files:
 
 
 class _Run:
-    """A replay and what is counted of it."""
+    """Replay with its counters."""
 
     def __init__(self, recording: Log, config: Config, same: bool, out: _Files | None) -> None:
         self._recording = recording
@@ -123,7 +123,7 @@ class _Run:
         self._modes: Counter[str] = Counter()
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._lateness = LatencyHistogram()
+        self._latency = LatencyHistogram()
         self._overruns = 0
 
     def add(self, tick: ReplayedTick) -> None:
@@ -131,7 +131,7 @@ class _Run:
         self._modes[solution.mode] += 1
         self._first_ns = solution.t_ns if self._first_ns is None else self._first_ns
         self._last_ns = solution.t_ns
-        self._lateness.add(max(0, tick.recorded.late_ns))
+        self._latency.add(max(0, tick.recorded.latency_ns))
         self._overruns = tick.recorded.overruns
         if self._out is not None:
             self._out.solution(solution)
@@ -147,11 +147,11 @@ class _Run:
         return SchedulerStatus(
             ticks=self.replay.comparison.ticks,
             overruns=self._overruns,
-            lateness_p50_ms=self._lateness.quantile_ms(0.5),
-            lateness_p99_ms=self._lateness.quantile_ms(0.99),
-            lateness_max_ms=self._lateness.max_ns / 1e6,
-            lateness_sum_s=self._lateness.sum_ns / SECOND_NS,
-            lateness_at_most=self._lateness.at_most(),
+            lateness_p50_ms=self._latency.quantile_ms(0.5),
+            lateness_p99_ms=self._latency.quantile_ms(0.99),
+            lateness_max_ms=self._latency.max_ns / 1e6,
+            lateness_sum_s=self._latency.sum_ns / SECOND_NS,
+            lateness_at_most=self._latency.at_most(),
             gc_collections=0,
             gc_forced=0,
             gc_max_ms=0.0,
@@ -185,7 +185,7 @@ class _Run:
 
 
 async def _publish(run: _Run, config: Config, speed: float) -> None:
-    """At `speed` times real time, what the daemon would publish."""
+    """Publish the daemon's messages at `speed` times real time."""
     mqtt = MqttPublisher(config.mqtt, config.vehicle, on_event=lambda code, text: None)
     run.listeners.append(partial(mqtt.publish, EVENT))
     sending = asyncio.create_task(mqtt.run())

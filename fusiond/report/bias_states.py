@@ -11,10 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.error_model import RATE_ERROR
-from fusiond.report.channels import number
+from fusiond.report.channel_arrays import number
 from fusiond.report.run import Estimated
 
 _AXES = tuple(f"{what} {axis}" for what in ("gyro", "accel") for axis in "xyz")
@@ -70,8 +70,7 @@ class Biases:
 
 
 def _bias_slots(config: bytes | None) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]] | None:
-    """For each axis (gyro x, y, z, accel x, y, z) its slots; None where the configuration does not
-    say which model ran."""
+    """Slots of the biases of each axis (gyro x, y, z, accel x, y, z); None for an unknown model."""
     try:
         data = json.loads(config or b"")
         estimator = Estimator.model_validate(data["estimator"])

@@ -1,4 +1,4 @@
-"""Innovations, verdicts, delays and satellites: whether what came in goes with the filter."""
+"""Plots of innovations, verdicts, delays and satellites: agreement of inputs and filter."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from fusiond.report.run import Innovations, LogParts, Run
 
 _AXES = {"n": "north", "e": "east", "d": "down"}
 _MOST_ROWS = 3
-"""Innovations of more rows (an epoch of pseudoranges) are shown by their NIS alone."""
+"""Most rows of an innovation that are plotted singly; an epoch of pseudoranges is shown by its NIS.
+"""
 _BINS = 60
 _CONSTRAINT = (
     "Good: far below 1, and slow: a constraint's sigma is what the vehicle may do at most, and no"
     " verdict is made of it. What is refused stands alone."
 )
 LEAST_NIS = 1e-3
-"""Below it the logarithm would show nothing but how well one innovation happened to fit."""
+"""Least NIS on the logarithmic axis; smaller values carry no information."""
 
 
 def innovations(run: Run) -> Section | None:
@@ -44,7 +45,7 @@ def innovations(run: Run) -> Section | None:
 
 
 def _is_judged(log: LogParts, source: str) -> bool:
-    """True if there is a verdict on it, or on a part of it: there is none on a constraint."""
+    """True if the log has a verdict on the source or on a part of it; constraints have none."""
     return not log.verdicts or any(f"{name}_".startswith(f"{source}_") for name in log.verdicts)
 
 
@@ -78,7 +79,7 @@ def _of_source(source: str, found: Innovations, judged: bool) -> list[tuple[str,
 
 
 def _raw(source: str, found: Innovations) -> list[tuple[str, Item]]:
-    """In metres or m/s, where the source measures them."""
+    """Plot of innovations in metres or m/s, where the source measures them."""
     count = found.raw.shape[1]
     if not 0 < count <= _MOST_ROWS:
         return []
@@ -106,7 +107,7 @@ def _by_row(values: Floats, fused: np.ndarray[Any, Any], names: Sequence[str]) -
 
 
 def _shares(judged: dict[str, Innovations]) -> Item:
-    """Of what was fused, how the normalised innovations are spread."""
+    """Distribution of the normalised innovations of fused measurements."""
     rows = []
     for source, found in judged.items():
         values = found.whitened[found.fused]

@@ -41,9 +41,9 @@ from fusiond.report.run import ImuStatistics
 
 WHOLE_S, EVERY_S, STRETCH_S = 60.0, 60.0, 10.0
 _SEGMENT_S = 4.0
-"""Of the spectrum: it resolves 0.25 Hz."""
+"""Segment of the spectrum (s): a resolution of 0.25 Hz."""
 _TRIAL = 200
-"""Inputs after which a driver that has given no inertial sample is none of an inertial unit."""
+"""Inputs after which a driver without inertial samples is not an inertial unit."""
 
 
 class InputStatistics:
@@ -60,7 +60,7 @@ class InputStatistics:
             self._first_ns = record.t_ns
         if record.kind is Kind.TICK:
             with suppress(DamagedRecordError):
-                self._tick_delays.append((record.t_ns, tick_of(record).late_ns))
+                self._tick_delays.append((record.t_ns, tick_of(record).latency_ns))
         elif record.source != NO_SOURCE:
             since_s = (record.t_ns - self._first_ns) / SECOND_NS
             if since_s < WHOLE_S:
@@ -69,7 +69,7 @@ class InputStatistics:
                 self._units.read(int(since_s / EVERY_S), record)
 
     def tick_delay_ms(self) -> tuple[Floats, Floats] | None:
-        """Lateness of each tick (ms), and its instant."""
+        """Latency of each tick (ms), and its instant."""
         if not self._tick_delays:
             return None
         table = np.array(self._tick_delays, dtype=np.int64)
@@ -81,7 +81,7 @@ class InputStatistics:
 
 
 class _Units:
-    """Finds the inertial unit among the sources, and collects its samples."""
+    """Collector of the inertial unit's samples; it finds the unit among the sources."""
 
     def __init__(self, about: About, folder: Path) -> None:
         self._names = about.sources
@@ -160,7 +160,7 @@ class _Units:
 
 
 def _instant_ns(stamp: Stamp, t_seen_ns: int) -> int:
-    """Stamp on its own time axis, of which only differences count."""
+    """Instant of a stamp on its own time axis; only differences count."""
     match stamp:
         case DeviceStamp():
             return stamp.ticks_ns
@@ -173,8 +173,8 @@ def _instant_ns(stamp: Stamp, t_seen_ns: int) -> int:
 
 
 def spectrum(values: Floats, stretch: Floats, step_s: float) -> tuple[Floats, Floats]:
-    """Amplitude spectral density (m, k) of columns (n, k) in units per root Hz, one-sided, and its
-    frequencies (m,): Welch's mean of periodograms (IEEE Trans. Audio 15, 1967, 70), Hann window,
+    """Amplitude spectral density (m, k) in units per root Hz, one-sided, and its frequencies (m,),
+    of columns (n, k). Welch's mean of periodograms (IEEE Trans. Audio 15, 1967, 70), Hann window,
     half overlapped, mean removed. The samples are taken as equally spaced. Empty without a whole
     segment."""
     if not step_s > 0.0:

@@ -19,7 +19,7 @@ from fusiond.recording.log_metadata import CONFIG
 from fusiond.recording.reader import Log, LogMessage
 from fusiond.recording.records import Record
 from fusiond.report.bias_states import Biases
-from fusiond.report.channels import (
+from fusiond.report.channel_arrays import (
     Calibrations,
     FaultLists,
     Healths,
@@ -190,7 +190,7 @@ class _Channels:
         self.dropped = self.dropped if isnan(dropped) else int(dropped)
 
     def utc_ahead_s(self) -> float:
-        """UTC as the daemon knew it, minus the log's own time."""
+        """Offset of the daemon's UTC from the log's own time."""
         return float(np.median(self._utc_ahead)) if self._utc_ahead else 0.0
 
     def solution(self) -> TrajectoryTable:

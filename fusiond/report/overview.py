@@ -1,4 +1,4 @@
-"""The first sections: what the run was, what became of each source's measurements, the way."""
+"""First sections: summary of the run, outcomes of each source's measurements, track."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _NO_FAULT = frozenset(
         *("quiet_at_speed", "too_slow", "height_held", "no_attitude"),
     )
 )
-"""Outcomes that say nothing against the source: it could not be used just then."""
+"""Outcomes without evidence against the source: it could not be used at that instant."""
 TRACK_POINTS = 4000
-"""Of the picture of the way; it is 700 pixels wide."""
+"""Most points of the plotted track; it is 700 pixels wide."""
 
 
 def summary(run: Run) -> Section:
@@ -73,7 +73,8 @@ def track(run: Run, truth: TrajectoryTable | None) -> Section:
 
 
 def _distance(solution: TrajectoryTable) -> str:
-    """By the speed over ground: positions of a standing vehicle wander, its speed does not."""
+    """Distance by the integrated speed over ground; positions of a vehicle at rest wander, its
+    speed does not."""
     speed = np.hypot(solution.v[:, 0], solution.v[:, 1])
     known = np.isfinite(speed)
     if known.sum() < 2:

@@ -28,7 +28,7 @@ def page(title: str, document: Mapping[str, Any]) -> str:
 
 
 def _inert(text: str) -> str:
-    """JSON that no HTML parser takes for an end of the script or a beginning of a comment."""
+    """JSON that cannot end the script or begin a comment in HTML."""
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 

@@ -1,4 +1,4 @@
-"""Series as a page takes them: no more points than it can show, four bytes each."""
+"""Series in the page's format: no more points than it can show, four bytes each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from fusiond.files.csv_tables import Floats
 BUCKETS = 1200
 """Two points a bucket: more than a screen has columns; 13 kB a series in the page."""
 _PAUSES = 5.0
-"""A pause this many times the median interval is shown as a gap, from `_LEAST_GAP_S` on."""
+"""Ratio of a pause to the median interval from which it is plotted as a gap, if longer than
+`_LEAST_GAP_S`."""
 _LEAST_GAP_S = 1.0
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.files.tables import TrajectoryTable, read_truth
-from fusiond.report import devices, filter_plots, overview, states
+from fusiond.report import filter_plots, imu_and_host, overview, states
 from fusiond.report.log_run import run_from_log
 from fusiond.report.page import page
 from fusiond.report.page_items import Item, Section
@@ -103,14 +103,14 @@ def _sections(run: Run, truth: TrajectoryTable | None) -> list[Section]:
         filter_plots.verdicts(run),
         filter_plots.delays(run),
         filter_plots.satellites(run),
-        devices.inertial(run),
-        devices.computer(run),
+        imu_and_host.inertial(run),
+        imu_and_host.computer(run),
     )
     return [section for section in made if section is not None]
 
 
 def _joined(runs: Sequence[Sequence[Section]], zeros: Sequence[float]) -> list[dict[str, Any]]:
-    """Sections by title and items by key, those of two runs in one row."""
+    """Merge sections by title and items by key, so that two runs share a row."""
     titles = dict.fromkeys(section.title for sections in runs for section in sections)
     # A run without a section does not move it to the end.
     order = max(runs, key=len)

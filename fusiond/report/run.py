@@ -1,4 +1,4 @@
-"""One run as a report sees it, whatever it was read from."""
+"""Run as the input of a report, from any kind of file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from fusiond.files.tables import TrajectoryTable
 
 
 class Problem(NamedTuple):
-    """Something that is wrong with the file, or that a reader must know before he believes it."""
+    """Problem of a file that a reader must know before using the figures."""
 
     level: Literal["warning", "error"]
     text: str
 
 
 class Event(NamedTuple):
-    """At `t_s` of the run."""
+    """Event at `t_s` of the run."""
 
     t_s: float
     level: str
@@ -32,7 +32,7 @@ class Event(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A setting that is not at its default, dotted; None: it has no default."""
+    """Setting that differs from its default (None: no default), with a dotted name."""
 
     key: str
     value: str
@@ -172,7 +172,7 @@ class Run:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """First and last instant of the solution, or of the events where there is none."""
+        """First and last instant of the solution, or of the events without a solution."""
         times = self.solution.t_s if len(self.solution.t_s) else [e.t_s for e in self.events]
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 

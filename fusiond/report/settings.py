@@ -1,4 +1,4 @@
-"""Configuration that differs from the defaults of this version."""
+"""Settings that differ from the defaults of this version."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from fusiond.files.tables import read_solution
 from fusiond.report.run import Problem, Run
 
 POSIX_FROM_S = 1e9
-"""Seconds beyond this are no second of a week and no time since a start: 2001 in POSIX time."""
+"""Least POSIX time (s), in 2001; smaller values are a second of the week or a time since start."""
 _GAP_S = 1.0
 
 

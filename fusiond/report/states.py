@@ -1,4 +1,5 @@
-"""Position, velocity and attitude with sigma, errors against a truth, biases and calibration."""
+"""Plots of position, velocity and attitude with sigma, errors against a truth, biases and
+calibration."""
 
 from __future__ import annotations
 
@@ -160,7 +161,7 @@ def _coverage(found: Errors) -> Item:
 
 
 def difference(first: Run, second: Run) -> Section | None:
-    """Instants at which two runs differ; None where they have no time in common."""
+    """Difference of two runs at common instants, as a section; None without common time."""
     try:
         found = errors_of(second.solution, first.solution)
     except NothingToCompareError:
@@ -230,7 +231,7 @@ def _biases(what: str, axes: dict[str, Estimated]) -> list[tuple[str, Item]]:
 
 
 def _with_bounds(title: str, name: str, found: Estimated, good: str) -> Plot:
-    """A value with two sigma around it."""
+    """Plot of a value with two sigma around it."""
     series = [
         Series(name, found.value),
         Series("+2 sigma", found.value + 2.0 * found.sd, "bound", like=0),

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
 LEAST_SIGHT_DEG = 75.0
-"""The radar does not look at points steeper than this, above or below."""
+"""Largest elevation of a point, above or below, that the radar observes."""
 
 
 FLIGHT_POINTS: Mapping[str, Vector3] = {
@@ -53,8 +53,8 @@ FLIGHT_POINTS: Mapping[str, Vector3] = {
     "19": (24.2450, 110.8951, 60.0),
     "20": (23.6780, 110.9545, 70.0),
 }
-"""Known points along the flight of `fusiond.simulation.trajectories`, one each 200 s, 15 km to the
-right and to the left of the track in turn; as in `config/flight_sar.toml`."""
+"""Known points along the flight of `fusiond.simulation.trajectories`, one each 200 s, alternately
+15 km to the right and left of the track; as in `config/flight_sar.toml`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +221,7 @@ def _wrapped(angles: Array) -> Array:
 
 
 def _earth_fixed(lat: Array, lon: Array, height: Array) -> Array:
-    """Earth-fixed coordinates (n, 3) in m of geodetic places (n,), rad and m."""
+    """Earth-fixed coordinates (n, 3) in m of geodetic positions (n,), rad and m."""
     n = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
     across = (n + height) * np.cos(lat)
     polar = (n * (1.0 - ECCENTRICITY_SQUARED) + height) * np.sin(lat)
@@ -231,7 +231,7 @@ def _earth_fixed(lat: Array, lon: Array, height: Array) -> Array:
 def sensor_tables(
     truth: Truth, star: StarTrackerOptions | None, sar: SarOptions | None, seed: int
 ) -> dict[str, tuple[tuple[tuple[str, int], ...], Array]]:
-    """Columns and rows of attitude.csv and bearing.csv, of what is on board."""
+    """Columns and rows of attitude.csv and bearing.csv, for the sensors on board."""
     star_rng, sar_rng = sensor_streams(seed)
     tables = {}
     if star is not None:

@@ -1,4 +1,4 @@
-r"""Barometer of a simulated vehicle: the pressure at which the standard atmosphere says
+r"""Barometer of a simulated vehicle: the pressure of this height in the standard atmosphere:
 
     H = (1 + k) h + b + c v^2 / (2 g) + n
 
@@ -69,5 +69,5 @@ class Barometer:
 
 
 def barometer_stream(seed: int) -> np.random.Generator:
-    """A generator independent of the other devices'."""
+    """Generator independent of the other devices'."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(102,)))

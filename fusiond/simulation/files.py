@@ -68,9 +68,8 @@ def simulate(
     *,
     gnss_raw: RawFormat | None = None,
 ) -> Simulated:
-    """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, which is made if need be;
-    attitude.csv, bearing.csv and barometer.csv where star tracker, radar and barometer are on
-    board.
+    """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, created on demand;
+    attitude.csv, bearing.csv and barometer.csv for a star tracker, radar and barometer on board.
 
     With `gnss_raw` also the receiver's raw stream, gnss.ubx or gnss.rtcm3. The same scenario, seed
     and duration write the same bytes. `t_s` counts from the start of the trajectory, which is the

@@ -1,4 +1,4 @@
-r"""Samples of an ideal IMU on a trajectory, and where the vehicle is at any instant.
+r"""Samples of an ideal IMU on a trajectory, and the vehicle's true state at any instant.
 
     w_ib^b = w_nb^b(rpy, rpy') + C_bn (w_ie^n + w_en^n)
     f^b    = C_bn (v' + (2 w_ie + w_en) x v - g)
@@ -140,7 +140,7 @@ class States:
 
 
 class Truth:
-    """A trajectory from `origin` (lat, lon in rad, height in m), sampled at `rate_hz`.
+    """Trajectory from `origin` (lat, lon in rad, height in m), sampled at `rate_hz`.
 
     `t_s` (n + 1,) are the sample instants from 0; `gyro` and `accel` (n, 3) are the means over the
     intervals that end at t_s[1:], body axes, rad/s and m/s^2.
@@ -210,7 +210,8 @@ _transverse_radii = np.vectorize(transverse_radius, otypes=[np.float64])
 
 
 def metres_to_geodetic(lat: Array, height: Array, ned_m: Array) -> Array:
-    """Small displacement (n, 3) in m, NED, as changes of latitude, longitude (rad), height (m)."""
+    """Convert displacements (n, 3) in m, NED, to changes of latitude, longitude (rad), height
+    (m)."""
     return np.stack(
         (
             ned_m[:, 0] / (_meridian_radii(lat) + height),

@@ -1,4 +1,4 @@
-"""A simulated vehicle for a daemon of its own: devices, and a configuration that reads them.
+"""Simulated vehicle for a separate daemon: devices, and a configuration that reads them.
 
     fusiond simulate drive --live DIR          and in another terminal
     fusiond run DIR/vehicle.toml
@@ -29,7 +29,7 @@ from fusiond.simulation.vehicle import SimulatedVehicle
 
 VCAN, MULTICAST = "vcan0", "239.74.163.2"
 REST_S = 20.0
-"""At rest before the drive: time to start a daemon in, and for it to level."""
+"""Time at rest before the drive, to start a daemon and to level."""
 SERVICE_FREQUENCY_S = 10
 
 

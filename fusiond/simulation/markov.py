@@ -1,4 +1,4 @@
-r"""First-order Gauss-Markov processes: what of the errors of sensors and measurements lasts.
+r"""First-order Gauss-Markov processes: time-correlated errors of sensors and measurements.
 
     x' = -x / T + w,   x_k = x_(k-1) exp(-dt / T) + w_k,   var(w_k) = sigma^2 (1 - exp(-2 dt / T))
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @compiled("void(f8[:, ::1], f8)")
 def _decaying(process: Array, decay: float) -> None:
-    """Row by row add to what drives the processes (n, columns) what is left of the row before.
+    """Add to each row of the processes' input (n, columns) the decayed row before.
 
     As scipy's `lfilter`, to the bit; its package takes a second to load."""
     for k in range(1, process.shape[0]):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 REST_S = 8.0
 COURSE_DEG = 40.0
-"""In which the car stands, and of which the start of paper 000 knows as much as the paper's."""
+"""Initial heading of the car, known to the start of paper 000 as in the paper."""
 IMU_COMES_S = 25.0
 TOWN = (
     Leg(9, speed_m_s=14.0),
@@ -41,16 +41,16 @@ TOWN = (
     Leg(5),
 )
 WHITE: dict[str, Any] = {"bias_sd_m": 0.0, "time_offset_sd_s": 0.0, "lever_arm_sd_m": 0.0}
-"""Of a receiver: the simulated one's errors are white, and the papers' models have no others."""
+"""Receiver with white errors only, as in the papers' models."""
 AS_TAKEN: dict[str, Any] = {
     "ionosphere_sd": 0.5,
     "wet_delay_sd_m": 0.12,
     "signal_in_space_sd_m": 0.6,
 }
-"""A sky that errs as the daemon takes it to (`fusiond.gnss.plan`): orbits, clocks, and what models
-leave of ionosphere and troposphere. That of `Scenario` is a better one."""
+"""Sky whose errors match the daemon's assumptions (`fusiond.gnss.plan`): orbits, clocks, and
+residuals of ionosphere and troposphere models. That of `Scenario` is better."""
 NO_SCALES = {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}
-"""Of an inertial unit whose model has no states for scale factors, as the papers' have none."""
+"""Inertial unit without scale factor errors, for which the papers' models have no states."""
 
 
 def town(duration_s: float) -> Path:
@@ -60,20 +60,20 @@ def town(duration_s: float) -> Path:
 
 
 def level_town(duration_s: float) -> Path:
-    """The same without hills, for a filter that holds its height."""
+    """Town without hills, for a filter that holds its height."""
     legs = chain([Leg(REST_S)], cycle(replace(leg, climb_deg=None) for leg in TOWN))
     return follow(legs, duration_s, course_deg=COURSE_DEG, bank_ratio=-0.08)
 
 
 def _by_ranges(scenario: Scenario) -> Scenario:
-    """A vehicle by ranges, below a sky that is as good as the daemon takes it for."""
+    """Vehicle with ranges, under a sky that matches the daemon's assumptions."""
     return replace(scenario, gnss_raw=replace(scenario.gnss_raw, **AS_TAKEN))
 
 
 @dataclass(frozen=True)
 class Paper:
-    """`lines` are the paper's own, `start` what makes a demo short; both by section. The inertial
-    unit comes after `imu_comes_s`."""
+    """Paper: `lines` are its configuration, `start` shortens the demo; both by section. The
+    inertial unit starts after `imu_comes_s`."""
 
     title: str
     config: str
@@ -167,8 +167,8 @@ def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_lines(base: dict[str, Any], lines: dict[str, Any]) -> dict[str, Any]:
-    """A configuration with further lines, of which a measurement of another kind takes the place of
-    what was there: it has other keys, but for the lever arm, which is the antenna's."""
+    """Configuration with further lines. A measurement of another kind replaces the section, whose
+    keys differ, except for the antenna's lever arm."""
     base, changed = {**base, "aiding": {**base["aiding"]}}, lines.get("aiding", {})
     for name, section in changed.items():
         was = base["aiding"].get(name, {})
@@ -178,8 +178,7 @@ def with_lines(base: dict[str, Any], lines: dict[str, Any]) -> dict[str, Any]:
 
 
 def settings(number: str) -> dict[str, Any]:
-    """A paper's configuration as it would stand in a file: the shipped one with its lines, without
-    devices."""
+    """Configuration of a paper as in a file: the shipped one with its lines, without devices."""
     paper = PAPERS[number]
     base = tomllib.loads(shipped(paper.config).read_text(encoding="utf-8"))
     base.pop("sources")
@@ -187,7 +186,7 @@ def settings(number: str) -> dict[str, Any]:
 
 
 def configured(number: str, more: dict[str, Any] | None = None) -> tuple[Config, Scenario]:
-    """A paper's configuration with its start and `more`, and the vehicle that fits it."""
+    """Configuration of a paper with its start and `more`, and the matching vehicle."""
     paper = PAPERS[number]
     found = merged(settings(number), {**paper.start, "vehicle": "demo"})
     config = Config.model_validate(with_lines(found, more or {}))

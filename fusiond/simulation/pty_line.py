@@ -57,14 +57,14 @@ class PtyLine:
         return self._master is not None and not self._hangup.poll(0)
 
     def read(self) -> bytes:
-        """Bytes of the host, b"" for nothing."""
+        """Read bytes of the host, b"" for none."""
         if self._master is not None and self._open_by_host():
             with contextlib.suppress(OSError):
                 return os.read(self._master, _READ_BYTES)
         return b""
 
     def write(self, data: bytes) -> bool:
-        """Send; False if it was lost, in whole or in part: nobody listens, or does not read."""
+        """Send; False if data was lost because nothing reads it."""
         if self._master is None or not self._open_by_host():
             return False
         try:

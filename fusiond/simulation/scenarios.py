@@ -20,11 +20,11 @@ from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
 from fusiond.simulation.trajectories import Path, drive, flight, level_flight, static
 
 ANTENNA_M = (0.0, 0.0, -1.0)
-"""Both antennas: on the roof, 1 m above the IMU."""
+"""Lever arm of both antennas: on the roof, 1 m above the IMU."""
 CAR_IMU = Imu(axes=("+x", "-y", "-z"), rate_hz=100.0, gyro_range_deg_s=2000.0, accel_range_g=10.0)
-"""As in `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1 m/s/sqrt(h)."""
+"""IMU of `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1 m/s/sqrt(h)."""
 REAR_AXLE_M = (-1.0, 0.0, 0.5)
-"""From the IMU of the car to the middle of its rear axle, body axes."""
+"""Vector from the car's IMU to the middle of its rear axle, body axes."""
 AIRCRAFT_IMU = Imu(
     rate_hz=200.0,
     gyro_noise_deg_sqrt_h=0.05,
@@ -36,7 +36,7 @@ AIRCRAFT_IMU = Imu(
     gyro_scale_ppm=300.0,
     accel_scale_ppm=300.0,
 )
-"""As in `config/tactical.toml`: 1 deg/h and 50 ug, 0.05 deg/sqrt(h), 0.02 m/s/sqrt(h)."""
+"""IMU of `config/tactical.toml`: 1 deg/h and 50 ug, 0.05 deg/sqrt(h), 0.02 m/s/sqrt(h)."""
 
 
 MICRO_IMU = Imu(
@@ -51,7 +51,7 @@ MICRO_IMU = Imu(
     gyro_scale_ppm=1e-9,
     accel_scale_ppm=1e-9,
 )
-"""Of paper 001 (study `multiscale`): 0.1 deg/s of Markov drift, 1e-3 g white in each sample."""
+"""IMU of paper 001 (study `multiscale`): 0.1 deg/s of Markov drift, 1e-3 g white in each sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Scenario:
     rdss: RdssOptions = field(default_factory=lambda: RdssOptions(lever_arm_m=ANTENNA_M))
     vibration: Vibration = field(default_factory=Vibration)
     no_slip_m: tuple[float, float, float] = REAR_AXLE_M
-    """From the IMU to the point that follows the path without side slip, body axes."""
+    """Vector from the IMU to the point that moves without side slip, body axes."""
     star_tracker: StarTrackerOptions | None = None
     sar: SarOptions | None = None
     barometer: BarometerOptions | None = None
@@ -87,7 +87,7 @@ class Scenario:
         return imu_output(self.imu, truth.gyro, truth.accel, rng, vibration=self.vibration)
 
     def fitted(self, config: Config) -> Scenario:
-        """This scenario with the IMU, the lever arms and the no-slip point of a configuration."""
+        """Scenario with the IMU, the lever arms and the no-slip point of a configuration."""
         gnss, raw, rdss, no_slip = self.gnss, self.gnss_raw, self.rdss, self.no_slip_m
         sar = self.sar
         for aiding in config.aiding.values():
@@ -108,8 +108,8 @@ class Scenario:
         )
 
     def masked(self, masks: Sequence[Mask]) -> Scenario:
-        """This scenario with what stands in the sky's way. A receiver has no fix of its own in a
-        tunnel and with fewer than four satellites, so its NMEA falls out there."""
+        """Scenario with sky masks. A receiver has no fix in a tunnel or with fewer than four
+        satellites, so its NMEA stops there."""
         windows = tuple(
             (mask.start_s, mask.length_s)
             for mask in masks

@@ -1,4 +1,4 @@
-r"""Errors of inertial sensors and measurements, as the configuration's error model states them.
+r"""Errors of inertial sensors and measurements, by the configuration's error model.
 
     y = (1 + s) x + b + c + n + m
     n   white, sigma = N / sqrt(dt)                            N angle or velocity random walk
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.si_units import DEG, imu_noise, sensor_to_body
 from fusiond.simulation.markov import gauss_markov
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ def imu_output(
     gyro_step_rad_s: float = 0.0,
     accel_step_m_s2: float = 0.0,
 ) -> ImuOutput:
-    """Turn ideal means in body axes (n, 3) at `imu.rate_hz` into what this IMU would send.
+    """Convert ideal means in body axes (n, 3) at `imu.rate_hz` into this IMU's samples.
 
     `misalignment_deg` is one sigma of each small angle between a sensor's axes and its nominal
     ones, None for that of `imu`, `*_step_*` the resolution of its output (0: none). The same `rng`

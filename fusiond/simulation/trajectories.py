@@ -59,7 +59,7 @@ def _steps(knots: Array, values: Array, t_s: Array, out: Array) -> None:
 
 
 class Profile:
-    """A function of time through knots (t_s increasing, values), constant outside them."""
+    """Function of time through knots (t_s increasing, values), constant outside them."""
 
     def __init__(self, t_s: Sequence[float], values: Sequence[float]) -> None:
         self._t = np.asarray(t_s, dtype=np.float64)
@@ -164,7 +164,8 @@ def dcm_from_rpy(rpy: Array) -> Array:
 
 
 def body_rate(rpy: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
-    """w_nb^b (..., 3) and its time derivative from Euler angles and their two derivatives."""
+    """Body rate w_nb^b (..., 3) and its time derivative from Euler angles and their two
+    derivatives."""
     sr, cr = np.sin(rpy[..., 0]), np.cos(rpy[..., 0])
     sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])
     a, b, c = rate[..., 0], rate[..., 1], rate[..., 2]
@@ -183,7 +184,8 @@ def body_rate(rpy: Array, rate: Array, acceleration: Array) -> tuple[Array, Arra
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Time in which speed and climb go to a new value (None: stay) and the course turns."""
+    """Leg: time in which speed and climb reach a new value (None: unchanged) and the course
+    turns."""
 
     duration_s: float
     speed_m_s: float | None = None
@@ -199,7 +201,7 @@ def follow(
     bank_ratio: float = 0.0,
     incidence_deg: float = 0.0,
 ) -> Path:
-    """The path of a vehicle that starts at rest and does the legs in turn until `duration_s`."""
+    """Path of a vehicle that starts at rest and repeats the legs until `duration_s`."""
     t, speed, course, climb = [0.0], [0.0], [course_deg], [0.0]
     for leg in legs:
         if t[-1] >= duration_s:
@@ -263,7 +265,7 @@ def _for_ever(legs: Sequence[Leg]) -> Iterable[Leg]:
 
 
 def static(duration_s: float) -> Path:
-    """At rest, facing north-east."""
+    """Vehicle at rest, facing north-east."""
     return follow([Leg(duration_s)], duration_s, course_deg=45.0)
 
 

@@ -119,7 +119,7 @@ class SimulatedVehicle:
     # ------------------------------------------------------------------ plugs
 
     def plug(self, device: Device) -> None:
-        """Put a device (back) on its line. Raises OSError, can.CanError."""
+        """Connect a device to its line. Raises OSError, can.CanError."""
         if device == "imu":
             if self._bus is None:
                 interface, channel = self._can
@@ -132,7 +132,7 @@ class SimulatedVehicle:
             self.lines[device].plug()
 
     def unplug(self, device: Device) -> None:
-        """Take a device off its line: the IMU falls silent, a serial port vanishes."""
+        """Disconnect a device from its line: the IMU falls silent, a serial port vanishes."""
         if device == "imu":
             if self._bus is not None:
                 self._bus.shutdown()
@@ -143,13 +143,13 @@ class SimulatedVehicle:
             self.lines[device].unplug()
 
     def lift(self) -> None:
-        """The terminal's suppression or silence ends, and it says so."""
+        """End the terminal's suppression or silence, with its report."""
         self.terminal.lift(self._now_s())
 
     # ------------------------------------------------------------------ real time
 
     async def run(self) -> None:
-        """Plug everything in and drive to the end of the trajectory, or until cancelled."""
+        """Connect all devices and drive to the end of the trajectory, or until cancelled."""
         try:
             for device in get_args(Device):
                 self.plug(device)

@@ -1,4 +1,4 @@
-"""Studies: the papers' experiments and what else a decision stands on, one module each.
+"""Studies: the papers' experiments and those behind decisions, one module each.
 
 A study module has `run_study(runs, seed, progress) -> dict` and `plot(result, path)`; it may have
 `tables(result)` or `table(result)` for people. `runs` None is its own default.

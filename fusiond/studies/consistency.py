@@ -1,4 +1,4 @@
-r"""Error rate of the consistency verdict, and how soon it notices a fault.
+r"""Error rate and detection delay of the consistency verdict.
 
 The filter is that of `level_axis` with the MEMS IMU of config/vehicle.toml (0.1 m/s/sqrt(h),
 0.3 deg/sqrt(h)), aided by GNSS, 1.5 m every 1 s, or by RDSS, 20 m every 1.5 s. Faults set in while
@@ -30,7 +30,7 @@ WINDOWS = (20, 50, 100, 200)
 VERDICTS = ("consistent", "optimistic", "pessimistic", "coloured")
 CONFIDENCE = 0.99
 SETTLED, WATCHED = 300, 1500
-"""Epochs before the fault sets in, and epochs in which it may be noticed."""
+"""Epochs before the fault, and epochs in which it may be detected."""
 NOTICED = 0.9
 PAPER = {
     "k": 50,
@@ -97,7 +97,7 @@ def _largest_lag_p(rho: Array, k: int, m: int) -> Array:
 
 
 def held(outside: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
-    """The verdict with hysteresis (runs, epochs), consistent at first, as the monitor holds it."""
+    """Verdict with hysteresis (runs, epochs), consistent at first, as in the monitor."""
     state = np.zeros(len(outside), dtype=bool)
     count = np.zeros(len(outside), dtype=int)
     result = np.empty_like(outside)
@@ -150,8 +150,8 @@ def _pieces(total: int) -> Iterator[int]:
 
 
 def _noticed(verdicts: Ints, k: int) -> dict[str, Any]:
-    """Epochs from the onset until the held verdict turns, over runs that were consistent then;
-    and the verdicts of windows that lie behind the onset.
+    """Epochs from the onset to a change of the held verdict, over runs consistent at the onset; and
+    the verdicts of windows behind the onset.
     """
     verdict = held(verdicts > 0, k // 2)
     first = SETTLED - (k + LAGS - 1)  # index of the window that ends with the first faulty epoch
@@ -174,7 +174,7 @@ def _noticed(verdicts: Ints, k: int) -> dict[str, Any]:
 def _quiet(
     source: Aided, runs: int, alpha: float, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """False verdicts begun per 1,000 epochs of a matched filter, without and with hysteresis."""
+    """Rate of false verdicts per 1,000 epochs of a matched filter, without and with hysteresis."""
     nu = innovations(source, MATCHED, runs, SETTLED + WATCHED, 0, rng)
     rows = []
     for k in WINDOWS:
@@ -190,8 +190,9 @@ def _quiet(
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Study with `runs` windows for each false-alarm rate and a fortieth (at least 50) of them
-    as runs of 1,800 epochs for each power. The same arguments give the same result.
+    """Run the study with `runs` windows a false-alarm rate, 1/40 of them (>= 50) runs a power.
+
+    A run has 1,800 epochs. The same arguments give the same result.
     """
     windows = runs or DEFAULT_RUNS
     drives = max(50, windows // 40)
@@ -250,7 +251,7 @@ def run_study(
 
 
 def _paper() -> dict[str, Any]:
-    """The printed figures and what they say: with the paper's N(0, 1/K), and with 1/(K m)."""
+    """Printed figures and their meaning: with the paper's N(0, 1/K), and with 1/(K m)."""
     k, dof, average, rho = PAPER["k"], PAPER["dof"], PAPER["nis_average"], PAPER["rho"]
     result: dict[str, Any] = dict(PAPER)
     for name, whitened in (("variance_1_k", False), ("variance_1_km", True)):
@@ -278,7 +279,7 @@ def _finding(total: dict[str, Any], rows: list[dict[str, Any]], alpha: float) ->
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """False-alarm rates with intervals, and the epochs until a fault is noticed, to `path`."""
+    """Plot false-alarm rates with intervals and detection delays to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(11.0, 6.5), layout="constrained")

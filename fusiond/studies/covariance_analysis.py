@@ -46,7 +46,7 @@ Indices = NDArray[np.int64]
 
 
 class System(NamedTuple):
-    """One step of a linear model: transition (n, n), noise (n, n), rows (m, n), variances (m,)."""
+    """Step of a linear model: transition (n, n), noise (n, n), rows (m, n), variances (m,)."""
 
     phi: Array
     q: Array
@@ -55,21 +55,21 @@ class System(NamedTuple):
 
 
 class Result(NamedTuple):
-    """After an epoch: covariance of the true error `e` (n, n), all states of the truth; and what
-    the filter believes, P_r (m, m)."""
+    """Result after an epoch: covariance of the true error `e` (n, n), all states of the truth; and
+    the filter's own P_r (m, m)."""
 
     true: Array
     believed: Array
 
 
 def optimal_gain(p: Array, h: Array, r: Array) -> Array:
-    """K (n, m) of the Kalman filter for P (n, n), H (m, n), variances r (m,)."""
+    """Gain K (n, m) of the Kalman filter for P (n, n), H (m, n), variances r (m,)."""
     ph = p @ h.T
     return np.asarray(np.linalg.solve(h @ ph + np.diag(r), ph.T).T)
 
 
 def joseph(p: Array, k: Array, h: Array, r: Array) -> Array:
-    """(I - K H) P (I - K H)^T + K R K^T for any gain K."""
+    """Covariance (I - K H) P (I - K H)^T + K R K^T for any gain K."""
     a = np.eye(len(p)) - k @ h
     p = a @ p @ a.T + (k * r) @ k.T
     return np.asarray(0.5 * (p + p.T))
@@ -82,7 +82,8 @@ def analyse(
     believed_initial: Array,
     fed_back: Indices | None = None,
 ) -> Iterator[Result]:
-    """For each step (truth, filter): the true error and the filter's belief after its update.
+    """Analyse each step (truth, filter): the true error and the filter's covariance after its
+    update.
 
     `kept` (m,) are the truth's states that the filter has, in the filter's order; `fed_back` those
     of the filter's states that are taken out of the navigation state after every update. The

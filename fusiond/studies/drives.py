@@ -35,7 +35,7 @@ from fusiond.studies.monte_carlo import Progress, of_run, on_processes, step_cou
 DEFAULT_RUNS = 200
 DURATION_S = 60.0
 EXPECTED_NEES = 3.0
-"""Of a position with honest sigma (Bar-Shalom, Li, Kirubarajan (2001), 5.4.2)."""
+"""Expected NEES of a position with an honest sigma (Bar-Shalom, Li, Kirubarajan (2001), 5.4.2)."""
 SHARES = (5.0, 50.0, 95.0, 99.0, 100.0)
 SHOWN = {
     "horizontal RMS m": "error.horizontal_rms_m",

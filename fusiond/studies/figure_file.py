@@ -7,7 +7,7 @@ from typing import Any
 
 DOTS_PER_INCH = 120
 _TICKS = (1.0, 2.0, 5.0)
-"""Of a decade, on an axis that spans less than two."""
+"""Ticks of a decade, on an axis that spans less than two."""
 
 
 def save_figure(figure: Any, path: Path) -> None:

@@ -53,7 +53,7 @@ DEFAULT_RUNS = 50
 CHECKED_S = 50
 """Errors are taken at every 50th second: three instants for each radar point."""
 COUNTED_FROM = 0.75
-"""Share of the flight after which they count."""
+"""Share of the flight after which errors count."""
 STATES = ("23", "17")
 SKIES = {"four": False, "all": True}
 STD = ("attitude_std_arcsec", "velocity_std_m_s")
@@ -127,7 +127,7 @@ def _figures(of: Flown, counted: NDArray[np.bool_], spent: Cost) -> dict[str, An
 
 
 def _second_moment(error: Array) -> Array:
-    """Average over the runs of e e^T (k, m, m), of errors (runs, k, m)."""
+    """Average over the runs of e e^T (k, m, m), for errors (runs, k, m)."""
     return np.asarray(np.einsum("rki,rkj->kij", error, error) / len(error))
 
 
@@ -141,7 +141,7 @@ def _satellites(seconds: float, all_in_view: bool) -> dict[str, float]:
 
 
 def _integration(of: Model, seconds: float) -> dict[str, float]:
-    """Effect of the IMU's rate on a flight without errors of the sensors."""
+    """Effect of the IMU's rate on a flight without sensor errors."""
     nav = flight.true_nav(flight.truth(seconds))
     true = State(nav[0], np.zeros(of.size), np.zeros(STEP_SIZE), of)
     errors, sd = [], []
@@ -197,7 +197,7 @@ def _finding(result: dict[str, Any]) -> str:
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Errors beside what the filters state and what the paper has; position, NEES and times."""
+    """Tables of errors beside the filters' sigmas and the paper's; position, NEES and times."""
     errors: list[list[str]] = []
     others: list[list[str]] = []
     for sky, of in result["cases"].items():
@@ -229,5 +229,5 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Root mean square errors over time and what the filters state, beside the paper's."""
+    """Plot RMS errors over time and the filters' sigmas, beside the paper's."""
     picture(result["series"], path)

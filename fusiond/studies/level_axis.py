@@ -1,4 +1,4 @@
-r"""INS errors of a level axis aided by positions: the smallest filter that drifts as an INS does.
+r"""Level-axis INS errors aided by positions: the smallest filter with INS drift.
 
     p' = v,   v' = a + w_v,   a' = w_a,   z = p + e,   var e = R
 
@@ -43,7 +43,7 @@ class Fault:
     q: float = 1.0
     r: float = 1.0
     correlation: float = 0.0
-    """Of successive measurement errors, a first-order Gauss-Markov sequence."""
+    """Correlation of successive measurement errors, a first-order Gauss-Markov sequence."""
     delay_s: float = 0.0
 
 

@@ -1,4 +1,4 @@
-"""One filter of a study, fed as the daemon feeds it; a drive to feed it on.
+"""Filter of a study, fed as in the daemon, and a drive for it.
 
 The vehicle is the drive of `fusiond simulate`, 500 s as in paper 003, on IMU samples at `RATE_HZ`.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.timeline import Entry, Timeline
@@ -28,7 +28,7 @@ REST_S = 20.0
 ORIGIN_DEG_M = (30.5, 114.3, 40.0)
 RATE_HZ = 50.0
 HISTORY_S, CHECKPOINT_S = 15.0, 0.5
-"""As the daemon has them."""
+"""History and checkpoint interval, as in the daemon."""
 
 
 @lru_cache(maxsize=1)
@@ -47,7 +47,7 @@ def drive_samples(imu: Imu, rng: np.random.Generator) -> Array:
 
 
 class LiveFilter:
-    """An estimator on the IMU samples (n, 6) of a run, through the daemon's timeline.
+    """Estimator on the IMU samples (n, 6) of a run, through the daemon's timeline.
 
     `gap_s` is the longest pause of the IMU that is none. The filter starts at 0 at the navigation
     state `nav` (10,) with one sigma `sd` (states,). `entries` are the measurements in the order in

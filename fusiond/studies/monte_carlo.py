@@ -1,4 +1,4 @@
-"""Monte Carlo runs: on processes, with their progress, and what NEES may be on average.
+"""Parallel Monte Carlo runs with progress, and the bounds of their mean NEES.
 
 A run draws from a generator of its own, made of the study's seed and the run's number, so that no
 result depends on who ran what, in which order, and on how many processes. `of_run` makes it by a
@@ -28,16 +28,16 @@ TAIL = (1.0 - 0.95) / 2.0
 MOST_AT_ONCE = 100
 """Runs handed to a worker together: their hand-over is then no share of the time."""
 SHARES = 4
-"""Chunks a worker gets at least, where there are runs enough, so that all end at about one time."""
+"""Least chunks a worker, given enough runs, so that all end at about the same time."""
 
 Progress = Callable[[int, int], None]
-"""Hears how many steps are done, and of how many."""
+"""Callback with the number of finished steps and of all steps."""
 R = TypeVar("R")
 T = TypeVar("T")
 
 
 class RunsLostError(Exception):
-    """So many runs gave no result that there is nothing to average."""
+    """Error: too few runs succeeded for an average."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ _GIVEN: ContextVar[_Given | None] = ContextVar("runner of Monte Carlo runs", def
 
 @contextmanager
 def runs_on(runner: Runner, kept: KeptRuns | None = None) -> Iterator[list[Lost]]:
-    """Have the runs of what is inside made by `runner`, but for those that are in `kept`, where the
-    others are added; the runs that were lost."""
+    """Context in which runs are made by `runner`, except those in `kept`, where new ones are added;
+    the lost runs."""
     given = _Given(runner, kept)
     token = _GIVEN.set(given)
     try:
@@ -124,7 +124,7 @@ def over(
 
 
 def _outcomes(given: _Given, work: Callable[[T], R], items: Sequence[T]) -> Iterator[Outcome[R]]:
-    """Those that are kept, then the others, which are."""
+    """Stored outcomes, then new ones, which are stored."""
     part = None if given.kept is None else given.kept.of(work)
     known = {} if part is None else part.known(len(items))
     yield from known.values()

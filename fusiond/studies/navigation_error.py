@@ -1,4 +1,4 @@
-"""Errors of a computed navigation state, as the filters define them: computed minus true.
+"""Errors of a computed navigation state, by the filters' definition: computed minus true.
 
 A navigation state (10,) is latitude, longitude (rad), height (m), velocity north, east, down (m/s)
 and the attitude's quaternion; an error (9,) is phi (rad), dv (m/s), dr (m), north, east, down.
@@ -26,7 +26,7 @@ def true_nav(truth: Truth, t_s: Array) -> Array:
 
 
 def metres(lat: float, height: float) -> Array:
-    """Metres north, east, down a unit of latitude, longitude (rad) and height (m)."""
+    """Metres north, east, down for a unit of latitude, longitude (rad) and height (m)."""
     east = (transverse_radius(lat) + height) * math.cos(lat)
     return np.array([meridian_radius(lat) + height, east, -1.0])
 

@@ -43,18 +43,18 @@ from scipy.linalg import expm, solve_triangular
 Array = NDArray[np.float64]
 
 INFORMATIVE = 1.0
-"""Singular value at which measurements tell as much as the prior did (module's text)."""
+"""Singular value at which measurements give as much information as the prior (module's text)."""
 KEPT_SIGMA = 0.9
-"""A state of whose sigma more than this share is left is not estimated: below one tenth of its
-sigma, a fifth of its variance, the measurements have told nothing that a filter could use."""
+"""Share of the initial sigma above which a state is not estimated: with more than nine tenths left,
+measurements have removed less than a fifth of its variance."""
 NAMED_SHARE = 0.1
-"""A state belongs to the name of a direction if it makes up this much of its squared length."""
+"""Share of a direction's squared length from which a state appears in its name."""
 _DOUBLINGS = 60
 """Most doublings of the horizon in `gramian_stable`: 2^60 times the fastest time constant."""
 
 
 class Epoch(NamedTuple):
-    """Transition (n, n) from the epoch before to this one, then its rows (m, n), variances (m,).
+    """Epoch: transition (n, n) from the epoch before, then its rows (m, n), variances (m,).
 
     m may be 0.
     """
@@ -76,7 +76,7 @@ class Direction(NamedTuple):
         return 1.0 / math.sqrt(1.0 + self.singular * self.singular)
 
     def states(self, names: Sequence[str]) -> list[str]:
-        """The states that make it up, largest first."""
+        """States of the direction, largest first."""
         share = np.square(self.vector)
         order = [int(i) for i in np.argsort(-share)]
         return [names[i] for i in order if share[i] >= NAMED_SHARE]
@@ -116,7 +116,7 @@ class Observability:
 
     @property
     def informative(self) -> int:
-        """Number of directions of which the measurements tell more than the prior."""
+        """Number of directions with more information from measurements than from the prior."""
         s = np.linalg.svd(self.factor, compute_uv=False)
         return int(np.count_nonzero(s > INFORMATIVE))
 
@@ -131,12 +131,13 @@ class Observability:
 
     @property
     def sigma_left(self) -> Array:
-        """Share (n,) of each state's initial sigma that is left at the start: 1, nothing told."""
+        """Share (n,) of each state's initial sigma that remains at the start; 1: no information."""
         return np.sqrt(np.diag(self.start)) / self.scale
 
     @property
     def sigma_end(self) -> tuple[Array, Array]:
-        """One sigma (n,) at the end with the measurements and without them, both noise-free."""
+        """One sigma (n,) at the end with and without the measurements, both without process
+        noise."""
         with_them = self.theta @ self.start @ self.theta.T
         without = self.theta * self.scale
         return np.sqrt(np.diag(with_them)), np.sqrt(np.square(without).sum(axis=1))

@@ -77,7 +77,7 @@ def _filter(model: str, name: str = "kalman") -> dict[str, Any]:
 
 
 def _fixes(model: str) -> dict[str, Any]:
-    """A paper's vehicle whose receiver gives fixes in place of ranges."""
+    """Vehicle of a paper whose receiver gives fixes instead of ranges."""
     return {**_filter(model), "aiding": {"gnss": {"kind": "gnss", **WHITE}}}
 
 
@@ -112,7 +112,7 @@ WITHOUT_IMU = "004 constant velocity"
 
 
 class _Watch:
-    """Errors of the filter that serves, once a second, over its covariance."""
+    """Errors of the active filter over its covariance, once a second."""
 
     def __init__(self, scenario: Scenario, seconds: float) -> None:
         self._truth = scenario.truth(seconds)

@@ -53,7 +53,7 @@ LIMITS_M = (40.0, 40.0)
 """Horizontal and vertical alert limit: the vertical one of LPV approaches is 50 m (ICAO annex 10),
 and a car asks for no less than an aircraft."""
 SAMPLE_RISK, PRIOR = 1e-2, 0.1
-"""Coarse: of a second without a fault, and of a fault."""
+"""Coarse probabilities: risk of a second without a fault, and of a fault."""
 BEGIN_S, END_S = 80.0, 140.0
 POOR = 2.0
 """Sigma of the second receiver over that of the first."""
@@ -67,7 +67,7 @@ EARTH_M = 6_378_137.0
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Fault: a device, and how far its position is off to the north."""
+    """Fault: a device, and its position's offset to the north."""
 
     name: str
     source: str = ""
@@ -75,7 +75,7 @@ class Case:
     shape: str = "none"
 
     def error_m(self, since_s: float) -> float:
-        """At a time (s) after the fault began."""
+        """Offset (m) at a time (s) after the fault began."""
         if self.shape == "step":
             return self.size_m
         if self.shape == "ramp":
@@ -96,7 +96,7 @@ CASES = (
 
 
 def vehicle(watched: bool) -> Config:
-    """The vehicle with its two receivers, with or without alert limits."""
+    """Vehicle with its two receivers, with or without alert limits."""
     settings = VEHICLE.model_dump(exclude_unset=True)
     settings["aiding"]["second"] = {**settings["aiding"]["gnss"], "kind": "gnss"}
     if watched:
@@ -108,13 +108,13 @@ def vehicle(watched: bool) -> Config:
 
 
 def coarse(devices: int) -> IntegrityRisk:
-    """The risk by which misses are counted."""
+    """Coarse risk by which misses are counted."""
     hour = SAMPLE_RISK * INDEPENDENT_PER_HOUR
     return IntegrityRisk(hour, hour, (PRIOR,) * devices)
 
 
 def recorded(case: Case, seed: int) -> tuple[Truth, Recording]:
-    """The drive with its second receiver, and the case's fault."""
+    """Drive with a second receiver, and the case's fault."""
     truth, recording = Drive(gnss_rate_hz=1.0).recorded(VEHICLE, seed)
     first = SCENARIOS["drive"].gnss
     horizontal, vertical = first.white_sd_m
@@ -210,7 +210,7 @@ def run_study(
 
 
 def _of_seed(case: Case, watched: bool, seed: int, k: int) -> dict[str, Array]:
-    """Drives of a seed other than 0 share none with those of 0, however many there are."""
+    """Drives of a seed; those of other seeds than 0 share none with it."""
     return drive(case, watched, k + MOST_DRIVES * seed)
 
 
@@ -259,7 +259,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Shares beyond the coarse level against what is allowed."""
+    """Plot the shares beyond the coarse level against the allowed ones."""
     from matplotlib.figure import Figure  # noqa: PLC0415  # an extra
 
     figure = Figure(figsize=(8, 4.5), layout="constrained")

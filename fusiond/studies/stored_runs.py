@@ -57,7 +57,7 @@ class KeptRuns:
         self.ended: dict[str, int] = {}
 
     def of(self, work: Callable[[Any], Any]) -> KeptPart:
-        """Those that `work` makes."""
+        """Stored runs of `work`."""
         digest = hashlib.sha256(described(work).encode()).hexdigest()[:12]
         named = self._named | {"part": _part(work), "config_digest": digest}
         return KeptPart(self, self._file, {name: named[name] for name in NAME[:-1]})
@@ -89,7 +89,7 @@ class KeptPart:
 
 
 def described(value: Any) -> str:
-    """One text for what is equal, and another for what is not, whatever process asks."""
+    """Text that is equal for equal values in every process, and different otherwise."""
     if isinstance(value, partial):
         return described((value.func, value.args, value.keywords))
     if is_dataclass(value) and not isinstance(value, type):
@@ -171,7 +171,7 @@ def _outcome(row: Row) -> Outcome[Any]:
 
 
 class _Results(pickle.Unpickler):
-    """Reads records of studies and arrays and calls nothing else: a file may be anyone's."""
+    """Unpickler for records of studies and arrays only, since a file may come from anyone."""
 
     def find_class(self, module: str, name: str) -> Any:
         found = super().find_class(module, name) if (module, name) in _PLAIN else None

@@ -1,4 +1,4 @@
-"""A timeline without diagnosis, for experiments on filters that are wrong by design."""
+"""Timeline without diagnosis, for experiments on deliberately wrong filters."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Trusting(Diagnosis):
         return None
 
     def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
-        """All is in service."""
+        """Series of a measurement, always in service."""
         return self.own(measurement)
 
     def judge(
         self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
-        """Nobody is ever suspected."""
+        """Judge nothing."""
         return None

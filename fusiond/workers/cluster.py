@@ -1,4 +1,4 @@
-"""The same runs on the workers of a Dask scheduler (extra `[cluster]`).
+"""Runner on the workers of a Dask scheduler (extra `[cluster]`).
 
 Each thread of a Dask worker has a process of a `Pool` of its own: what a run does to its process,
 or that it never ends, is an outcome here, too, and no Dask worker is lost by it. A Dask worker that
@@ -46,7 +46,7 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """Threads of all its workers."""
+        """Number of threads of all workers."""
         threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
@@ -59,7 +59,7 @@ class Cluster:
     def outcomes(
         self, work: Callable[[T], R], items: Sequence[T], chunk: int = 1
     ) -> Iterator[Outcome[R]]:
-        """As `Runner` says."""
+        """Outcomes of `items`, as in `Runner`."""
         from distributed import as_completed  # noqa: PLC0415
 
         firsts = {
@@ -82,7 +82,7 @@ class Cluster:
 def _work_off(
     work: Callable[[T], R], items: Sequence[T], timeout_s: float | None
 ) -> list[Outcome[R]]:
-    """In a thread of a Dask worker."""
+    """Run items in a thread of a Dask worker."""
     pool = getattr(_THIS_THREAD, "pool", None)
     if pool is None or pool.timeout_s != timeout_s:
         pool = _THIS_THREAD.pool = Pool(1, timeout_s)

@@ -1,4 +1,4 @@
-"""Jobs of this process done for their side effects by children that are forked, and end.
+"""Forked child processes that run jobs for their side effects, then end.
 
 A job finds everything as its caller has it, and what it takes of memory goes when its child ends.
 One child forks the others and tells how many jobs are done by a pipe, so that whoever waits may do
@@ -70,7 +70,7 @@ class Forked:
             yield self.done
 
     def fileno(self) -> int:
-        """Descriptor that is readable when there is news."""
+        """Descriptor that is readable when a result is available."""
         return self._read
 
     def read(self) -> bool:
@@ -90,7 +90,7 @@ class Forked:
 
 
 class _Child:
-    """A child process and its job."""
+    """Child process and its job."""
 
     def __init__(self, jobs: Sequence[Job], share: int) -> None:
         self.connection, theirs = socket.socketpair()

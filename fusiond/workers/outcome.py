@@ -1,4 +1,4 @@
-"""Outcome of one run, and the interface of what runs them."""
+"""Outcome of one run, and the interface of runners."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Ended = Literal["done", "error", "died", "timeout"]
 
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[R]):
-    """Of item `index`: its result, or why there is none.
+    """Outcome of item `index`: its result or the reason for its failure.
 
     `error`: an exception left the run; `died`: its process ended; `timeout`: it took too long.
     `reason` says more, and is empty for what is done.
@@ -34,7 +34,7 @@ class Runner(Protocol):
     def outcomes(
         self, work: Callable[[T], R], items: Sequence[T], chunk: int = 1
     ) -> Iterator[Outcome[R]]:
-        """One outcome an item, in the order in which they come.
+        """Run each item; yields outcomes in order of completion.
 
         `work` is a function of a module, or a partial of one; `chunk` items are handed over at
         once. No failure of a run is raised.

@@ -44,7 +44,7 @@ def processors() -> int:
 
 
 class Pool:
-    """Up to `workers` processes, started when there is work; an item may take `timeout_s`."""
+    """Pool of up to `workers` processes, started on demand; an item may take `timeout_s`."""
 
     def __init__(self, workers: int, timeout_s: float | None = None) -> None:
         self.workers = workers
@@ -62,7 +62,7 @@ class Pool:
     def outcomes(
         self, work: Callable[[T], R], items: Sequence[T], chunk: int = 1
     ) -> Iterator[Outcome[R]]:
-        """As `Runner` says. Raises `PoolError`."""
+        """Outcomes of `items`, as in `Runner`. Raises `PoolError`."""
         numbered = list(enumerate(items))
         waiting = deque(numbered[k : k + chunk] for k in range(0, len(numbered), chunk))
         busy: list[_Worker] = []
@@ -96,13 +96,13 @@ class Pool:
 
 
 def _least_s(busy: Sequence[_Worker]) -> float | None:
-    """Until the first of them is overdue."""
+    """Time (s) until the first running item is overdue."""
     deadlines = [w.deadline_s for w in busy if w.deadline_s is not None]
     return max(0.0, min(deadlines) - time.monotonic()) if deadlines else None
 
 
 class _Worker:
-    """One process; `todo`: items without a reply so far."""
+    """Worker process; `todo`: items without a result."""
 
     def __init__(self, timeout_s: float | None) -> None:
         ours, theirs = socket.socketpair()
@@ -129,7 +129,7 @@ class _Worker:
             return
 
     def receive(self, ready: bool) -> Outcome[Any] | None:
-        """The outcome of its first item, if it has come."""
+        """Receive the outcome of the first item, if complete."""
         if not ready:
             if self.deadline_s is None or time.monotonic() < self.deadline_s:
                 return None

@@ -18,7 +18,7 @@ STARTED = "begun"
 
 
 def serve(descriptor: int) -> None:
-    """Work until the other end is closed; then end at once, in the middle of a run, too."""
+    """Serve items until the pipe is closed, then exit at once, even during a run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started us
     connection = Connection(descriptor)
     chunks: SimpleQueue[bytes] = SimpleQueue()
@@ -47,7 +47,7 @@ def _work_off(connection: Connection, chunk: bytes) -> None:
 
 
 def _described(error: BaseException) -> str:
-    """Its class, its text, and the line that raised it."""
+    """Describe an exception by class, text and the line that raised it."""
     text = f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:

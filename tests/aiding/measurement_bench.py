@@ -10,7 +10,7 @@ from fusiond.aiding.base import Innovation, Linearised, State
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

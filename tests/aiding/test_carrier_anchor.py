@@ -12,7 +12,7 @@ from fusiond.aiding import carrier_anchor as an
 from fusiond.aiding.base import Innovation, Renewal, State
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values, nothing_left
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.blocks import (
     CARRIER_ANCHOR,
     CARRIER_CLOCK,

@@ -17,7 +17,7 @@ from fusiond.aiding.height import BarometerMeasurement, HeightMeasurement
 from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (

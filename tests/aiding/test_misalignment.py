@@ -15,7 +15,7 @@ from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.gnss.ecef import to_ecef
 from fusiond.models.blocks import misalignment
 from fusiond.models.catalogue import make_model

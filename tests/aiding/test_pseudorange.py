@@ -13,7 +13,7 @@ from fusiond.aiding.carrier_anchor import CARRIER, CARRIER_VARIANCE, RATE, SPAN
 from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_SHARED, PseudorangeMeasurement, epoch_values
 from fusiond.aiding.range_rows import UNUSED_VARIANCE
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.blocks import ClockNoise, carrier_blocks, clock_blocks, shared_error
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

@@ -14,7 +14,7 @@ from fusiond.aiding.rest_evidence import SMOOTH_WINDOWS, RestEvidence
 from fusiond.aiding.standstill import ZeroAngularRateUpdate
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.strapdown import STEP_SIZE
 from tests import runs

@@ -17,7 +17,7 @@ from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.aiding import BarometerAiding, HeightAiding, WheelAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.navigator.intake import Intake

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from fusiond.batch.drives import drive_row
+from fusiond.batch.log_row import drive_row
 from fusiond.commands.app import app
 from fusiond.files.parquet_rows import Row, read_rows
 from fusiond.simulation.files import simulate

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.measurements import DeviceStamp, KernelStamp, TimeReport, UtcStamp
-from fusiond.clock.clock import Clock
 from fusiond.clock.host import SystemTime
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from tests.clock.host_time import MS, Host, S, utc
 

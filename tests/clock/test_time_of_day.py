@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.measurements import TimeOfDayStamp, TimeReport
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from tests.clock.host_time import MS, Host, S, utc
 

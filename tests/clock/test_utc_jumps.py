@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.measurements import TimeReport, UtcStamp
-from fusiond.clock.clock import Clock
 from fusiond.clock.results import Instant
-from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown, whole_seconds_ns
+from fusiond.clock.stamp_mapping import Clock
+from fusiond.clock.utc_from_arrivals import UtcEnvelope, UtcKnown, whole_seconds_ns
 from fusiond.configuration.schema import ClockOptions
 from tests.clock.host_time import MS, Host, S, utc
 

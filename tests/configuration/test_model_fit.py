@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.model_fit import MINUTE_S, after_a_minute, model_doubts
 from fusiond.configuration.schema import ClockOptions, Config, Imu
 from fusiond.configuration.sensor_class import CLASSES
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events

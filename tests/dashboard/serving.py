@@ -12,8 +12,8 @@ from typing import Any
 import websockets
 from websockets.asyncio.client import ClientConnection, connect
 
-from fusiond.dashboard.hub import Hub
 from fusiond.dashboard.serve import PageAddress, listening, serve
+from fusiond.dashboard.vehicles import Hub
 from fusiond.outputs.topics import TOPICS
 from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from tests.dashboard.serving import at_work
 from tests.dashboard.tiles import PNG, png, tile_id, tile_of, write_map
 from tests.patience import PATIENCE_S

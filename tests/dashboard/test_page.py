@@ -15,8 +15,8 @@ import pytest
 
 from fusiond.dashboard import viewer
 from fusiond.dashboard.broker import Access, Broker
-from fusiond.dashboard.hub import GIVES_WAY_S, LARGEST_BYTES, MOST_VEHICLES, Hub
 from fusiond.dashboard.player import Player
+from fusiond.dashboard.vehicles import GIVES_WAY_S, LARGEST_BYTES, MOST_VEHICLES, Hub
 from tests.broker import Broker as Mosquitto
 from tests.broker import listening
 from tests.dashboard.serving import NAMES, Browser, at_work, browsing, payload, refused, said

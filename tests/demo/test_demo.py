@@ -28,7 +28,7 @@ from fusiond.demo.demo import (
     wrapped,
 )
 from fusiond.demo.outage_report import outage_report
-from fusiond.demo.view import _MADE_INSIDE, Live, Screen, line
+from fusiond.demo.terminal_view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.replay.run import ReplayOptions, replay
 from fusiond.simulation.papers import REST_S

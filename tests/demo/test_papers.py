@@ -18,7 +18,7 @@ import pytest
 from fusiond.configuration.load import load_config
 from fusiond.demo.demo import ned_error
 from fusiond.demo.papers import paper_setup
-from fusiond.demo.setup import Unplugged
+from fusiond.demo.scenario import Unplugged
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth

@@ -19,7 +19,7 @@ from fusiond.commands.app import app
 from fusiond.commands.configure import _measured_axes
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.doctor.discovery import Device as Found
 from fusiond.doctor.discovery import (
     SilentPort,
@@ -28,7 +28,7 @@ from fusiond.doctor.discovery import (
     down_axis,
     round_rate,
 )
-from fusiond.doctor.known_devices import KNOWN_DEVICES
+from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle

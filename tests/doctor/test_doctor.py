@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 
 from drivers.rdss.messages import BeamPower
-from fusiond.clock.clock import Clock
 from fusiond.clock.host import SystemTime
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.doctor import devices as doctor_devices
 from fusiond.doctor.doctor import _beams_line, doctor, examine

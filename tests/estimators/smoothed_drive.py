@@ -21,7 +21,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rdss_position import BIAS_BLOCK, HeldFeedback, RdssPositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.smoothing.backward import Smoothed, Smoother
 from fusiond.estimators.smoothing.node import Nodes
 from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes_of

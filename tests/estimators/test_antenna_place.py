@@ -19,7 +19,7 @@ from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.tilt_axes import TiltAxesFilter

@@ -12,7 +12,7 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.block_covariance import GRID_NS
 from fusiond.estimators.block_sigmas import ROWS

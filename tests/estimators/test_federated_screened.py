@@ -15,7 +15,7 @@ import pytest
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.isolation import INNOVATION
 from fusiond.estimators.federated.no_reset import NoResetFilter

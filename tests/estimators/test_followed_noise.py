@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.fault_bank import E_AT, L_AT
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import kinds_of, table_of

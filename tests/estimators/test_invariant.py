@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.invariant import InvariantFilter, Turning
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import mounting

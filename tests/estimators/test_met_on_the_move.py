@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import mounting

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.catalogue import make_model

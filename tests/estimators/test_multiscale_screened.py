@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionMeasurement
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.blocks import CLOCK_OFFSET, clock_blocks

@@ -15,7 +15,7 @@ import pytest
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
-from fusiond.configuration.settings import ARCSEC, imu_noise
+from fusiond.configuration.si_units import ARCSEC, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.blocks import misalignment
 from fusiond.models.catalogue import make_model

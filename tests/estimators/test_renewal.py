@@ -10,7 +10,7 @@ import pytest
 from fusiond.aiding.base import Renewal
 from fusiond.aiding.pseudorange import RANGE_BIAS
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.renewal import renew, transition
 from fusiond.estimators.separation import SeparatedEstimator

@@ -14,7 +14,7 @@ from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.aiding.base import Innovation
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.aiding import GnssAiding
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.robust import DEGREES
 from fusiond.models.catalogue import make_model

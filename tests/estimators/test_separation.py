@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.models.catalogue import make_model

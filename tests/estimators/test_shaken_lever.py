@@ -11,7 +11,7 @@ import pytest
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import ANTENNA_LEVER, AXLE_LEVER, antenna_lever, axle_lever

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement, Linearised
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.published_state import Published
 from fusiond.estimators.smoothing.backward import Smoother

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.tilt_axes_carried import heading_turn
 from fusiond.models.catalogue import make_model

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.tilt_axes_carried import heading_turn, turn_rows
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
 from fusiond.models.catalogue import make_model

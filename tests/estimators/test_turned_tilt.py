@@ -19,7 +19,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.covariance import mirror
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator

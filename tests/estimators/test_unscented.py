@@ -13,7 +13,7 @@ from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
 from fusiond.estimators.unscented.sigma_points import linear_form

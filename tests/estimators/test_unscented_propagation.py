@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
 from fusiond.estimators.unscented.propagation import error_of

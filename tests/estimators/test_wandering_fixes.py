@@ -10,7 +10,7 @@ import pytest
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import FIX_MARKOV

@@ -17,8 +17,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from fusiond.dashboard.hub import REFUSALS, Hub
 from fusiond.dashboard.schemas import topics
+from fusiond.dashboard.vehicles import REFUSALS, Hub
 from fusiond.files import tables
 from fusiond.files.csv_tables import TableError
 from fusiond.live.warm_keeper import KEPT_STATE
@@ -28,7 +28,7 @@ from fusiond.navigator.state_file import DamagedStateError, read_state, write_st
 from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
 from fusiond.recording.channels import CHANNELS
 from fusiond.recording.info import info
-from fusiond.recording.log_file import About, LogFile
+from fusiond.recording.mcap_writer import About, LogFile
 from fusiond.recording.reader import MOST_PROBLEMS, Log, LogError
 from fusiond.recording.records import NO_SOURCE, Kind, Record, pack
 from fusiond.recording.records import input_of as kind_of_input

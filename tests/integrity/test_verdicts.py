@@ -11,7 +11,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.pseudorange import RANGE_BIAS
 from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionMeasurement
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import position_bias

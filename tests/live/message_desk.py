@@ -8,7 +8,7 @@ from typing import Any
 from drivers.measurements import TimeReport
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.rdss.mail import MessageReceived
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.messaging import Messaging
 from fusiond.navigation.solution import Mode, Solution

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from fusiond.aiding.fix_errors import SHOWN
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.navigator.drift_levels import GRID as LEVELS

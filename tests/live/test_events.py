@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.live.events import Events
 from fusiond.live.injection import Injection

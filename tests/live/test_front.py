@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.commands.status import ask, chosen
 from fusiond.live import daemon
 from fusiond.live.daemon import Daemon

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from fusiond.live.events import Events
 from fusiond.live.journal import JournalHandler, handler

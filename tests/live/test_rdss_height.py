@@ -17,7 +17,7 @@ from drivers.can.python_can import can
 from drivers.measurements import DelayedFix
 from drivers.rdss.messages import HeightMode, PositionRequest
 from drivers.standard_atmosphere import standard_pressure_pa
-from fusiond.clock.clock import Instant
+from fusiond.clock.stamp_mapping import Instant
 from fusiond.live.daemon import Daemon
 from fusiond.live.sources import Emitted
 from fusiond.simulation.can.encoder import CanEncoder

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drivers.measurements import ArrivalStamp, ImuSample
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.schema import Config, Imu, SpareImu
-from fusiond.configuration.settings import DEG, sensor_to_body
+from fusiond.configuration.si_units import DEG, sensor_to_body
 from fusiond.demo.demo import demo_setup
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_choice import ImuChoice

@@ -16,7 +16,7 @@ from fusiond.aiding.bearing import SAR_BLOCK
 from fusiond.configuration import load as loading
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.files.tables import read_attitude, read_bearing
 from fusiond.live import sources as serving
 from fusiond.live.daemon import Daemon

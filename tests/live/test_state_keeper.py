@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.state_keeper import (
     FORGET_SPEED_M_S,

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import solve_continuous_are
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.catalogue import make_model
 from fusiond.models.missing_states import density_of, tilt_memory_s, with_force_biases_as_noise

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fusiond.commands.app import app
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.blocks import clock_blocks, misalignment
 from fusiond.models.catalogue import MODELS, make_model

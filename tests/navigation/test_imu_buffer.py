@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.navigation.imu_buffer import MARGIN, MAX_FORCE_M_S2, MAX_RATE_RAD_S, ImuBuffer
 from tests import runs
 

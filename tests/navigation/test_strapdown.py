@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import j1
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix
 from fusiond.configuration.alignment import Alignment
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.alignment import gyrocompass, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.rotation import dcm_from_rpy, wrap_angle

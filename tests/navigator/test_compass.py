@@ -13,7 +13,7 @@ from drivers.measurements import MagneticHeading, Measurement, MonotonicStamp, P
 from fusiond.aiding.compass import CompassMeasurement, lasting
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.compass import declination

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.navigator.alignment.evidence import AlignmentEvidence, Fix
 from fusiond.navigator.alignment.options import alignment_options
 

@@ -22,7 +22,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.aiding import StarTrackerAiding as Star
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import ARCSEC, DEG
+from fusiond.configuration.si_units import ARCSEC, DEG
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
 

@@ -17,7 +17,7 @@ from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
 from fusiond.files.tables import read_solution, read_truth

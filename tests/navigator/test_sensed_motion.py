@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.motion_descent import judge_guess, least_squares, moved
 from fusiond.navigation.rotation import dcm_from_rpy

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth

@@ -14,7 +14,7 @@ from drivers.measurements import PositionFix
 from drivers.nmea.geoid import GEOID_SD_M
 from fusiond.aiding.candidates import PositionCandidate
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.evidence import AlignmentEvidence
 from fusiond.navigator.alignment.options import alignment_options

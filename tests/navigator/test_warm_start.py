@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator

@@ -13,7 +13,7 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rdss_position import HeldFeedback, RdssPositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of

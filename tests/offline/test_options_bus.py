@@ -14,7 +14,7 @@ import can
 import pytest
 
 from drivers.can.bus import CanFrame
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain

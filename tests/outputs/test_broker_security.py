@@ -19,7 +19,7 @@ import pytest
 from fusiond.configuration.schema import Mqtt
 from fusiond.dashboard import broker as dashboard_broker
 from fusiond.dashboard.broker import Access
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from fusiond.outputs.commands import Command
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import (

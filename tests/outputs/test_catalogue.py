@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import load_config
 from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.schema import ClockOptions, Config

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.measurements import TimeReport
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.outputs import Chrony
 from fusiond.configuration.schema import ClockOptions

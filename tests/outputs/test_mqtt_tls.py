@@ -13,7 +13,7 @@ import pytest
 
 from fusiond.dashboard.broker import Access
 from fusiond.dashboard.broker import Broker as DashboardBroker
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.vehicles import Hub
 from tests.broker import Broker
 from tests.outputs.publisher import Running, options, running
 from tests.patience import until

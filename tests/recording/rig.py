@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.can.bus import CanFrame
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
@@ -24,8 +24,8 @@ from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import NAMES, Command
 from fusiond.outputs.topics import EVENT
-from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder
+from fusiond.recording.state_digest import state_digest
 from tests.clock.host_time import MS, Host
 from tests.patience import PATIENCE_S
 

@@ -23,7 +23,7 @@ FULL = """
 import json, random, resource, shutil, subprocess, sys
 from pathlib import Path
 from fusiond.recording.channels import CHANNELS
-from fusiond.recording.log_file import About, LogFile
+from fusiond.recording.mcap_writer import About, LogFile
 
 folder, about, limits, kind = Path(sys.argv[1]), *map(json.loads, sys.argv[2:4]), sys.argv[4]
 disk = folder / "disk"

@@ -14,7 +14,7 @@ import zstandard
 
 from fusiond.recording.channels import CHANNELS, INPUT
 from fusiond.recording.info import info
-from fusiond.recording.log_file import FORMAT, About, LogFile
+from fusiond.recording.mcap_writer import FORMAT, About, LogFile
 from fusiond.recording.reader import CHUNK_LIMIT, MOST_PROBLEMS, RATIO_FREE, Log, LogError
 from fusiond.recording.records import NO_SOURCE, Kind, Record, pack
 

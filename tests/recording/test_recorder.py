@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 
 from drivers.inputs import Inputs
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.outputs.messages.event import event_message
 from fusiond.outputs.topics import EVENT
 from fusiond.recording import log_writer
 from fusiond.recording.info import info
-from fusiond.recording.log_file import LogFile
 from fusiond.recording.log_writer import logs_of
+from fusiond.recording.mcap_writer import LogFile
 from fusiond.recording.reader import Log
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
 from fusiond.recording.records import Kind, tick_of

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.navigator.navigator import Navigator
 from fusiond.recording.reader import Log
+from fusiond.replay.calibration_replay import watched
 from fusiond.replay.replay_config import config_of
-from fusiond.replay.watched import watched
 from fusiond.simulation.can.imu import SIM_IMU
 from tests.live.daemon_bench import RDSS, imu_section
 from tests.places import REPOSITORY

@@ -24,10 +24,10 @@ from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import Inject, RequestFix
 from fusiond.recording.channels import INPUT, STATE
 from fusiond.recording.edit import recover, trim, write_log
-from fusiond.recording.export import WRITERS, Point
 from fusiond.recording.info import info
 from fusiond.recording.reader import Log, LogError
 from fusiond.recording.records import Kind
+from fusiond.recording.track_export import WRITERS, Point
 from fusiond.replay.replay import Replay
 from fusiond.replay.replay_config import config_of
 from fusiond.replay.run import ReplayOptions, replay

@@ -17,8 +17,8 @@ from fusiond.commands.app import app
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.recording.channels import CHANNELS
-from fusiond.recording.log_file import About, LogFile
 from fusiond.recording.log_metadata import about_run
+from fusiond.recording.mcap_writer import About, LogFile
 
 SECOND = 1_000_000_000
 EPOCH_NS = 1_800_000_000 * SECOND

@@ -13,7 +13,7 @@ import pytest
 
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
-from fusiond.configuration.settings import clock_noise
+from fusiond.configuration.si_units import clock_noise
 from fusiond.gnss.ecef import ned_axes, to_geodetic
 from fusiond.gnss.single_point import SinglePoint
 from fusiond.navigator.intake import Intake

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
 from fusiond.configuration.aiding import RawAiding
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT

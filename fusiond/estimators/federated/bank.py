@@ -35,8 +35,8 @@ FIRST_ADDITION = 1e-13
 
 @compiled("b1(f8[:, ::1])")
 def cholesky(a: Array) -> bool:
-    """a (n, n) <- U with a = U^T U, in place from its upper part, lower part untouched; False if
-    there is none."""
+    """Cholesky factor U of a (n, n) with a = U^T U, in place from its upper part, lower part
+    untouched; False if there is none."""
     n = a.shape[0]
     for k in range(n):
         if not a[k, k] > 0.0:
@@ -80,8 +80,8 @@ def inverse_of_factor(upper: Array, out: Array) -> None:
 
 @compiled("b1(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
 def _scaled_information(cov: Array, order: Indices, out: Array, work: Array, sigma: Array) -> bool:
-    """out (a, a) <- P^-1 of the states `order` of `cov`, times sigma_i sigma_j, their sigmas (a,)
-    written too; False if P cannot be made positive definite."""
+    """Write out (a, a) <- P^-1 of the states `order` of `cov`, times sigma_i sigma_j, and their
+    sigmas (a,); False if P cannot be made positive definite."""
     a = order.shape[0]
     for i in range(a):
         sigma[i] = math.sqrt(cov[order[i], order[i]])
@@ -179,8 +179,8 @@ def difference(
     member: int,
     tested: int,
 ) -> float:
-    """The statistic of estimate `member` (`cov`, `dx`) against all others that `combine` has fused,
-    on the last `tested` states of `order`; 0 if the others know nothing."""
+    """Statistic of estimate `member` (`cov`, `dx`) against all others that `combine` has fused, on
+    the last `tested` states of `order`; 0 without information of others."""
     k, a, b = infos.shape[0] - 1, order.shape[0], tested
     upper, y = np.empty((a, a)), np.empty(a)
     for i in range(a):
@@ -223,7 +223,7 @@ def difference(
     "void(f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", allocates=True
 )
 def carry(covs: Array, dxs: Array, shares: Array, phi: Array, before: Array, after: Array) -> None:
-    """Bring a bank over an interval with transition `phi` (width, width), in place:
+    """Propagate a bank over an interval with transition `phi` (width, width), in place:
 
         P_k <- phi (P_k - B / beta_k) phi^T + A / beta_k,   x_k <- phi x_k
 
@@ -271,7 +271,7 @@ def carry(covs: Array, dxs: Array, shares: Array, phi: Array, before: Array, aft
 
 @compiled("void(f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[::1])")
 def publish(cov: Array, dx: Array, order: Indices, fused: Array, estimate: Array) -> None:
-    """Write what `combine` has fused into `cov` (width, width) and `dx` (n,)."""
+    """Write the result of `combine` into `cov` (width, width) and `dx` (n,)."""
     for i in range(order.shape[0]):
         dx[order[i]] = estimate[i]
         for j in range(order.shape[0]):

@@ -1,4 +1,4 @@
-"""Federated filters whose local filters go on after a fusion: what two modes share.
+"""Common base of federated filters whose local filters continue after a fusion.
 
 Between updates only the published covariance B and the transition matrix Phi are propagated; at an
 update the local filters follow. After it the local filter that was updated is compared with the
@@ -52,11 +52,12 @@ class CarriedFilter(FederatedFilter):
         raise NotImplementedError
 
     def _difference(self, k: int) -> float:
-        """d^T cov(d)^-1 d of filter k and the best of all others, on position and velocity."""
+        """Statistic d^T cov(d)^-1 d of filter k and the best of all others, on position and
+        velocity."""
         raise NotImplementedError
 
     def _take_over(self, updated: int | None) -> None:
-        """Publish what was fused."""
+        """Publish the fused estimate."""
         raise NotImplementedError
 
     def _fuse_all(self, updated: int | None) -> str:
@@ -71,7 +72,7 @@ class CarriedFilter(FederatedFilter):
         return "fused"
 
     def _worst(self, updated: int) -> int | None:
-        """The local filter that stands out most, if the one just updated stands out at all."""
+        """Local filter with the largest failed statistic, if the updated one fails at all."""
         believed = self._believed()
         own = self._difference(updated)
         if self._faults.worst(dict.fromkeys(believed, own), self._tested) is None:
@@ -82,7 +83,7 @@ class CarriedFilter(FederatedFilter):
         self._bank_dxs -= x
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._bring_up()
         super().release()
 

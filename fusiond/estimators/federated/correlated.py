@@ -1,4 +1,4 @@
-r"""Federated filter that keeps what its local filters have in common: correlated fusion.
+r"""Federated filter with cross-covariances of its local filters: correlated fusion.
 
 Each local filter is one of its own source, with all of the initial uncertainty and all of the
 process noise: no sharing factors, no bound. What the estimates share is carried beside them, for
@@ -44,14 +44,14 @@ SAME = 1e-8
 
 
 class Fused(NamedTuple):
-    """The weights (k, n, n) of k estimates and the covariance (n, n) of their combination."""
+    """Weights (k, n, n) of k estimates and the covariance (n, n) of their combination."""
 
     weights: Array
     covariance: Array
 
 
 def best_combination(joint: Array) -> Fused:
-    """The least covariance of estimates with the joint covariance (k, k, n, n)."""
+    """Combination of least covariance of estimates with the joint covariance (k, k, n, n)."""
     k, n = joint.shape[0], joint.shape[2]
     first = joint[0, 0]
     weights = np.zeros((k, n, n))
@@ -100,8 +100,8 @@ class CorrelatedFilter(CarriedFilter):
         self._mark()
 
     def local(self, name: str) -> tuple[Array, Array]:
-        """Error estimate (n,) and covariance (n, n) of a local filter, relative to the navigation
-        state that all share; copies."""
+        """Copies of a local filter's error estimate (n,) and covariance (n, n), relative to the
+        common navigation state."""
         n, i = self.model.size, self.names.index(name)
         phi = self._phi
         cov = phi @ (self._joint[i, i] - self._before) @ phi.T + self._covs[0]

@@ -108,7 +108,7 @@ class FederatedFilter(Estimator):
 
     @property
     def isolates(self) -> bool:
-        """True if it detects and leaves out faulty sources by itself."""
+        """True if it detects and excludes faulty sources itself."""
         return self.options.fault_detection
 
     @property
@@ -175,7 +175,7 @@ class FederatedFilter(Estimator):
         cov: Array,
         dx: Array,
     ) -> Outcome:
-        """Rows that pass are folded in, or none.
+        """Update a local filter by all rows, or by none.
 
         For the innovation test an epoch counts with the rows that pass, or as failed where most do
         not: single bad satellites are the screening's business.
@@ -209,7 +209,7 @@ class FederatedFilter(Estimator):
         return sound or not self._isolate(local, INNOVATION)
 
     def _forget_clock(self, offsets: list[int]) -> None:
-        """The receiver has set its clock: nobody knows the offset."""
+        """Reset the clock offsets after the receiver has set its clock."""
         initial = self.model.initial[offsets] ** 2
         for cov, share in self._kept():
             cov[offsets] = 0.0
@@ -222,7 +222,7 @@ class FederatedFilter(Estimator):
         """Make the bank ready for an update."""
 
     def _judge(self, local: int | None) -> tuple[Array, Array]:
-        """Covariance and error estimate by which a measurement is gated."""
+        """Covariance and error estimate for the gate of a measurement."""
         return self._covs[0], self._dxs[0]
 
     def _kept(self) -> list[tuple[Array, float]]:
@@ -230,7 +230,7 @@ class FederatedFilter(Estimator):
         return [(self._covs[0], 1.0)]
 
     def _fold(self, local: int | None, i: Innovation) -> str:
-        """Take an innovation that has passed in, of a local filter or of all; its outcome."""
+        """Fold an innovation that passed its gate into one local filter or all; its outcome."""
         raise NotImplementedError
 
     def _take_back(self, local: int) -> None:
@@ -238,7 +238,7 @@ class FederatedFilter(Estimator):
         raise NotImplementedError
 
     def _leave_out(self, local: int) -> None:
-        """Take what an isolated local filter knows out of the master."""
+        """Remove an isolated local filter's information from the master."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ parts of an update
@@ -264,7 +264,7 @@ class FederatedFilter(Estimator):
         )
 
     def _isolate(self, local: int, reason: str) -> bool:
-        """Leave a local filter out, if the others can do without it; whether that was done."""
+        """Isolate a local filter, if the others suffice; True if done."""
         if not (self.options.fault_detection and self._faults.may_isolate(local, self.t_ns)):
             return False
         self._faults.isolate(local, reason)
@@ -289,7 +289,7 @@ class FederatedFilter(Estimator):
     # ------------------------------------------------------------------ snapshots
 
     def _kept_arrays(self) -> tuple[Array, ...]:
-        """Arrays that a snapshot holds beside those of every filter."""
+        """Arrays of a snapshot beside those of every filter."""
         return (self._factors,)
 
     def _own_snapshot(self) -> object:
@@ -304,7 +304,7 @@ class FederatedFilter(Estimator):
     # ------------------------------------------------------------------ feedback
 
     def _feed_back_published(self) -> None:
-        """Take the published estimate out of the navigation state, unless it is to be carried."""
+        """Feed back the published estimate, unless feedback is held."""
         if self._holding:
             return
         self._feed_back(self._dxs[0])
@@ -315,10 +315,10 @@ class FederatedFilter(Estimator):
         """The navigation state has been corrected by `x` (n,): so are estimates of its error."""
 
     def hold(self) -> None:
-        """From now on estimate without feedback: errors are carried along with the state."""
+        """Estimate without feedback from now on; errors propagate beside the state."""
         self._holding = True
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._holding = False
         self._feed_back_published()

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 def information(p: Array) -> Array:
-    """P^-1 (n, n) of a covariance, computed with its diagonal scaled to 1.
+    """Information P^-1 (n, n) of a covariance, computed with its diagonal scaled to 1.
 
     Raises `numpy.linalg.LinAlgError` if P is not positive definite.
     """
@@ -35,7 +35,7 @@ def information(p: Array) -> Array:
 
 
 def fuse_uncorrelated(estimates: Array, covariances: Array) -> tuple[Array, Array]:
-    """x_g (n,) and P_g (n, n) of `estimates` (k, n) with `covariances` (k, n, n).
+    """Fused x_g (n,) and P_g (n, n) of `estimates` (k, n) with `covariances` (k, n, n).
 
     Raises `numpy.linalg.LinAlgError` if a covariance is not positive definite.
     """
@@ -48,7 +48,8 @@ def fuse_uncorrelated(estimates: Array, covariances: Array) -> tuple[Array, Arra
 def fuse_correlated(
     x_1: Array, p_11: Array, x_2: Array, p_22: Array, p_12: Array
 ) -> tuple[Array, Array]:
-    """x_g (n,) and P_g (n, n) of two estimates (n,) with covariances and cross-covariance (n, n).
+    """Fused x_g (n,) and P_g (n, n) of two estimates (n,) with covariances and cross-covariance (n,
+    n).
 
     Raises `numpy.linalg.LinAlgError` if the two are the same estimate (D is singular).
     """

@@ -67,7 +67,7 @@ class FaultDetection:
         self.records = [Record()] * count
 
     def reset(self) -> None:
-        """Everybody is believed, nobody has been heard."""
+        """Reset: all local filters are trusted, without measurements."""
         self.records = [Record()] * len(self.records)
 
     def is_isolated(self, local: int) -> bool:
@@ -86,14 +86,14 @@ class FaultDetection:
         return self._passes(window, self._pass)
 
     def worst(self, statistics: dict[int, float], degrees: int) -> int | None:
-        """The filter whose difference from the others fails worst, if one does."""
+        """Filter whose difference from the others fails worst; None if none fails."""
         if len(statistics) < FEWEST_TO_COMPARE:
             return None
         local = max(statistics, key=lambda i: statistics[i])
         return local if statistics[local] > gate_threshold(self._pass, degrees) else None
 
     def may_isolate(self, local: int, t_ns: int) -> bool:
-        """True if another filter is believed and was heard lately."""
+        """True if another trusted filter had a recent measurement."""
         return any(
             i != local and not r.reason and t_ns - r.received_ns <= RECENT_NS
             for i, r in enumerate(self.records)

@@ -1,4 +1,4 @@
-r"""Federated filter whose local filters go on after a fusion: `no_reset` and `rescale`.
+r"""Federated filter whose local filters continue after a fusion: `no_reset` and `rescale`.
 
 Only the published covariance B and the transition matrix Phi are propagated through the samples; at
 an update the local filters, common to which is all the process noise but its share, follow:
@@ -63,8 +63,8 @@ class NoResetFilter(CarriedFilter):
         self._mark()
 
     def local(self, name: str) -> tuple[Array, Array]:
-        """Error estimate (n,) and covariance (n, n) of a local filter, relative to the navigation
-        state that all share; copies."""
+        """Copies of a local filter's error estimate (n,) and covariance (n, n), relative to the
+        common navigation state."""
         n, i = self.model.size, self.names.index(name)
         bank, dxs = self._bank.copy(), self._bank_dxs.copy()
         carry(bank, dxs, self._bank_shares, self._phi, self._before, self._covs[0])
@@ -126,7 +126,7 @@ class NoResetFilter(CarriedFilter):
         )
 
     def _take_over(self, updated: int | None) -> None:
-        """Publish what was fused; local filters as the mode says."""
+        """Publish the fused estimate; local filters follow the mode."""
         publish(self._covs[0], self._dxs[0], self._order, self._fused, self._estimate)
         if self._rescales and updated is not None:
             self._hand_over(updated)
@@ -139,7 +139,8 @@ class NoResetFilter(CarriedFilter):
         self._feed_back_published()
 
     def _hand_over(self, k: int) -> None:
-        """Filter k gives what it does not retain to the master's own estimate, the last one."""
+        """Move the information that filter k does not retain to the master's estimate, the last
+        one."""
         kept = self.options.retained
         for part in (self._infos, self._vectors):
             part[-2] += (1.0 - kept) * part[k]
@@ -148,7 +149,7 @@ class NoResetFilter(CarriedFilter):
         self._bank[k] /= kept
 
     def _bound(self, k: int) -> None:
-        """Give filter k a little of what all others know, and let these give it up."""
+        """Bound filter k by a little information of all others, which lose it."""
         for part in (self._infos, self._vectors):
             part[k] += LITTLE * (part[-1] - part[k])
         self._set(k)

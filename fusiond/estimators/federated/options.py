@@ -1,4 +1,4 @@
-"""Options of a federated filter, and which measurements belong to which of its local filters."""
+"""Options of a federated filter, and the assignment of measurements to local filters."""
 
 from __future__ import annotations
 

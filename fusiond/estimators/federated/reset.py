@@ -74,4 +74,4 @@ class ResetFilter(FederatedFilter):
         self._share_out(self._nominal)
 
     def _leave_out(self, local: int) -> None:
-        """Nothing: what is published has taken no part in this update."""
+        """Do nothing: the published estimate took no part in this update."""

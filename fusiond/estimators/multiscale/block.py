@@ -55,7 +55,7 @@ class Window(NamedTuple):
     ends: Indices
 
     def followed_by(self, other: Window, dropped: int = 0) -> Window:
-        """These epochs without the oldest ones, then those of `other`."""
+        """Epochs without the oldest, followed by those of `other`."""
         row = self.ends[dropped - 1] if dropped else 0
         join = np.concatenate
         return Window(
@@ -69,7 +69,7 @@ class Window(NamedTuple):
         )
 
     def measured_again(self, u: Array, z: Array, h: Array, r: Array) -> Window:
-        """The same epochs, the last one with further rows and a new `u` (n,)."""
+        """Same epochs, the last one with further rows and a new `u` (n,)."""
         us, ends = self.u.copy(), self.ends.copy()
         us[-1] = u
         ends[-1] += len(z)
@@ -279,7 +279,7 @@ def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> N
     allocates=True,
 )
 def rebase(w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array) -> None:
-    """Take the oldest epoch's `u` off `u`, `z` and the blocks' `means` (M, M n), in place.
+    """Subtract the oldest epoch's `u` from `u`, `z` and the blocks' `means` (M, M n), in place.
 
     t_(j+1) = Phi_j t_j solves the states' own equation, so t may be taken off all alike; from u of
     the oldest epoch it leaves only the window's own corrections, and no number grows with time.

@@ -143,7 +143,7 @@ class MultiscaleEstimator(Estimator):
         self._since_epoch()
 
     def _since_epoch(self) -> None:
-        """Nothing has happened since the last epoch."""
+        """Reset the input since the last epoch."""
         self._covs[0], self._dxs[1], self._carrying = 0.0, 0.0, False
         self._phi[:] = np.eye(len(self._phi))
 
@@ -176,7 +176,7 @@ class MultiscaleEstimator(Estimator):
         return nis, y
 
     def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
-        """Rows that pass are folded in, or none.
+        """Update by all rows, or by none.
 
         They are judged on the newest element alone, which is all that they look at. Where the
         receiver has set its clock, blocks that reach back before it are given up.
@@ -223,7 +223,7 @@ class MultiscaleEstimator(Estimator):
         return mean, cov
 
     def _commit(self, o: _Open, total: Array, h: Array, r: Array) -> None:
-        """Keep a block that was updated with total = h y + v, and what it says of now."""
+        """Store a block updated with total = h y + v, and its present state."""
         n, u, last = self.model.size, o.u, self._window
         mean, self._posterior = self._newest(o)
         if self._holding:
@@ -247,12 +247,12 @@ class MultiscaleEstimator(Estimator):
         self._since_epoch()
 
     def _append(self, epoch: Window, starting: bool) -> None:
-        """One epoch more; in place of the oldest unless the start still gathers them."""
+        """Append an epoch, replacing the oldest unless the start still collects them."""
         last = self._window
         self._window = epoch if last is None else last.followed_by(epoch, 0 if starting else 1)
 
     def _next_block(self, last: Window, block: Block) -> Block:
-        """The block that ends now, after `block`, updated with all that was measured before."""
+        """Block that ends now, after `block`, updated with all earlier measurements."""
         n, m = self.model.size, len(self._w)
         phi = np.concatenate((last.phi[1:], self._phi[None, :n, :n]))
         q = np.concatenate((last.q[1:], self._covs[:, :n, :n]))
@@ -274,7 +274,7 @@ class MultiscaleEstimator(Estimator):
         return blocks
 
     def _rebase(self, blocks: list[Block]) -> None:
-        """Keep the blocks, with small numbers in them (`rebase`)."""
+        """Rebase the stored blocks to small numbers (`rebase`)."""
         assert self._window is not None
         window = self._window
         means = np.array([b.mean for b in blocks])
@@ -293,11 +293,11 @@ class MultiscaleEstimator(Estimator):
         return since
 
     def hold(self) -> None:
-        """From now on estimate without feedback: errors are carried along with the state."""
+        """Estimate without feedback from now on; errors propagate beside the state."""
         self._holding = True
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._holding = False
         self._feed_back(self._dxs[0])
         self._dxs[1] += self._dxs[0]
@@ -310,7 +310,7 @@ class MultiscaleEstimator(Estimator):
         return (*kept, self._posterior, self._epoch_ns, self._carrying, self._phi.copy())
 
     def _own_restore(self, extra: object) -> None:
-        """Back to what `_own_snapshot` gave."""
+        """Restore the state of `_own_snapshot`."""
         assert isinstance(extra, tuple)
         self._window, self._blocks, self._starts, self._posterior = extra[:4]
         self._epoch_ns, self._carrying, phi = extra[4:]

@@ -30,7 +30,8 @@ ORTHONORMAL_TO = 1e-6
 
 @lru_cache
 def wavelet_matrix(name: str, scales: int) -> Array:
-    """W (M, M) of a wavelet by its PyWavelets name for N = `scales`, rows from fine to coarse.
+    """Matrix W (M, M) of a wavelet by its PyWavelets name for N = `scales`, rows from fine to
+    coarse.
 
     ValueError for a name that is unknown or not an orthonormal wavelet's. Read-only.
     """

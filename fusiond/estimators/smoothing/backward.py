@@ -65,9 +65,9 @@ Indices = NDArray[np.int64]
 
 
 class Smoothed(NamedTuple):
-    """At nodes (m): smoothed `error` (m, 10) after the node's rows, navigation errors and offset in
-    time, and its `covariance` (m, 10, 10); of what is published the correction `before` and
-    `after` the node's feedback (m, 9) and the `variance` (m, 9): position, velocity, roll, pitch,
+    """Smoothed nodes (m): `error` (m, 10) after the node's rows, navigation errors and offset in
+    time, and its `covariance` (m, 10, 10); the correction of the published solution `before` and
+    `after` the node's feedback (m, 9) and its `variance` (m, 9): position, velocity, roll, pitch,
     yaw."""
 
     t_ns: Indices
@@ -84,7 +84,7 @@ class Smoothed(NamedTuple):
 
 
 class Corrections(NamedTuple):
-    """Of `Smoothed`, by the same names."""
+    """Corrections from `Smoothed`, by the same names."""
 
     t_ns: Indices
     before: Array
@@ -104,7 +104,7 @@ def joined(parts: Sequence[Corrections]) -> Corrections:
 
 @compiled("void(f8[::1], f8[::1], f8, f8[::1], f8[::1])", forceinline=True)
 def _published(d: Array, nav: Array, tau: float, step: Array, out: Array) -> None:
-    """Write the correction `out` (9,) of what is published, of the error `d` (10,)."""
+    """Write the correction `out` (9,) of the published solution for the error `d` (10,)."""
     late = d[CORE_SIZE]
     for i in range(3):
         a = step[STEP_SMOOTH_N + i]
@@ -140,8 +140,8 @@ def _back(
     after: Array,
     variance: Array,
 ) -> None:
-    """Go back over nodes with `lam` (n,) and `big` (n, n), lambda and Lambda, in place; the arrays
-    of `Smoothed` are written. A body is laid out as fusiond.estimators.smoothing.node says."""
+    """Run backward over nodes with `lam` (n,) and `big` (n, n), lambda and Lambda, in place; write
+    the arrays of `Smoothed`. fusiond.estimators.smoothing.node defines a body's layout."""
     n, count = lam.shape[0], pairs.shape[1]
     g, turned = np.empty(n), np.empty((n, n))
     half = np.empty((PUBLISHED, n))
@@ -255,7 +255,7 @@ def _back(
 
 
 class Smoother:
-    """Goes back over the nodes of one start, block by block from the last.
+    """Smoother that runs backward over the nodes of one start, block by block.
 
     What is smoothed is by the clock and the axes that the start was `published` by.
     """
@@ -265,7 +265,7 @@ class Smoother:
         self._lambda, self._capital = np.zeros(model.size), np.zeros((model.size, model.size))
 
     def back(self, nodes: Nodes) -> Smoothed:
-        """The smoothed errors at `nodes`, which precede those of the call before."""
+        """Smoothed errors at `nodes`, which precede those of the call before."""
         count = len(nodes.t_ns)
         smoothed = Smoothed(
             nodes.t_ns,
@@ -297,8 +297,8 @@ def correct(
     sigma: Array,
 ) -> int:
     """Correct recorded solutions `nav` (r, 10) and `sigma` (r, 9) at `times` (r,) ns, ascending, in
-    place, by what is smoothed at nodes (m,); how many, which are the first: none later than the
-    last node. A solution at a node's instant is the one before the node."""
+    place, by smoothed nodes (m,); the number corrected: those not later than the last node. A
+    solution at a node's instant is the one before the node."""
     done, node, empty, d = 0, 1, np.empty(0), np.empty(CORE_SIZE)
     for row in range(times.shape[0]):
         while node < t_ns.shape[0] and t_ns[node] < times[row]:

@@ -1,4 +1,4 @@
-r"""Node of a filter at an instant, so that a smoother can come back to it.
+r"""Node: a filter's state at an instant, for the smoother.
 
 A node is an instant t_j at which measurements were fused, or one between them where they are far
 apart:
@@ -50,7 +50,7 @@ class Nodes(NamedTuple):
     ops: Array
 
     def first(self, count: int) -> Nodes:
-        """The first `count` of them."""
+        """First `count` nodes."""
         rows = int(self.counts[:count].sum())
         return Nodes(self.t_ns[:count], self.bodies[:count], self.counts[:count], self.ops[:rows])
 
@@ -93,8 +93,9 @@ def write_body(
     time_slot: int,
     body: Array,
 ) -> None:
-    """Write `body` of P and Phi (width, width), dx and what was fed back (n,), nav (10,),
-    parameters (n,), step (28,); Phi is then the identity again, and nothing was fed back."""
+    """Write `body` of P and Phi (width, width), dx and the fed back estimate (n,), nav (10,),
+    parameters (n,), step (28,); then reset Phi to the identity and the fed back estimate to zero.
+    """
     n = xi.shape[0]
     at = 0
     for i in range(PUBLISHED):

@@ -1,6 +1,5 @@
-"""The Kalman filter with a tape: it does what it does and leaves nodes behind. It crosses each
-sample alone (fusiond.estimators.block_covariance): its sigmas are those of that filter within 1e-4
-of them.
+"""Kalman filter that records nodes for the smoother. It propagates each sample alone
+(fusiond.estimators.block_covariance): its sigmas equal the other filter's within 1e-4 of them.
 
 Nodes hang on each other, the newest in front. A snapshot holds the newest of its instant, so a
 rewind takes the tape back with the state, and what was written since is forgotten with it: the tape
@@ -39,7 +38,7 @@ NEVER = 1 << 62
 
 
 class Node:
-    """A node and the one before it; `number` counts from the start of the tape."""
+    """Node and its predecessor; `number` counts from the start of the tape."""
 
     __slots__ = ("body", "number", "ops", "previous", "t_ns")
 
@@ -49,7 +48,7 @@ class Node:
 
 
 class _Kept(NamedTuple):
-    """Of a snapshot."""
+    """State of a snapshot."""
 
     newest: Node | None
     ops: tuple[Array, ...]
@@ -79,7 +78,7 @@ class TapedKalman(TiltAxesFilter):
         super().__init__(model, gap_s, faults)
         self.newest: Node | None = None
         self.rewound = NEVER
-        """The oldest sample that was taken back since somebody set this to `NEVER`."""
+        """Oldest sample that a rewind has revoked since the last reset to `NEVER`."""
         self.on_ended = on_ended
         self._before: Array = np.zeros_like(self._covs[0])
         self._rows: Innovation | NotApplicable = NotApplicable("")
@@ -93,7 +92,7 @@ class TapedKalman(TiltAxesFilter):
     # ------------------------------------------------------------------ the tape
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
-        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), and with an empty tape."""
+        """Initialise at `t_ns` with nav (10,), parameters (n,), P (n, n), and an empty tape."""
         self.end()
         super().initialise(t_ns, sample, nav, xi, covariance)
         self._phi[:], self._fed_back[:] = np.eye(len(self._phi)), 0.0
@@ -101,7 +100,7 @@ class TapedKalman(TiltAxesFilter):
         self._close()
 
     def publish_by(self, published: Published) -> None:
-        """From the next start on: a tape is of one clock and one unit."""
+        """Publish so from the next start on: a tape has one clock and one unit."""
         self.end()
         super().publish_by(published)
 
@@ -115,7 +114,7 @@ class TapedKalman(TiltAxesFilter):
         self.on_ended(newest)
 
     def _close(self) -> None:
-        """A node of what has happened since the last."""
+        """Close a node with the input since the last one."""
         body = np.empty(self._body_size)
         dx = self._dxs[0]
         write_body(
@@ -127,7 +126,7 @@ class TapedKalman(TiltAxesFilter):
         self._ops, self._closed_ns = [], self.t_ns
 
     def _fold(self, held: Array, z: Array, h: Array, r: Array) -> None:
-        """Rows that were folded into `_before`, with the estimate `held` (n,) until then."""
+        """Fold rows, already in `_before`, with the held estimate `held` (n,) before them."""
         ops = np.empty((len(z), 2 * len(held) + 2))
         write_rows(self._before, held, z, h, r, ops)
         self._ops.append(ops)
@@ -206,7 +205,7 @@ class TapedKalman(TiltAxesFilter):
         self._close()
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         self._fed_back += self._dxs[0]
         super().release()
         self._close()
@@ -234,8 +233,8 @@ class TapedKalman(TiltAxesFilter):
 
 
 def nodes_of(newest: Node, after: Node | None, upto_ns: int) -> tuple[Nodes, Node | None]:
-    """The nodes up to `newest` that follow `after` (None: all) and are not later than `upto_ns`,
-    oldest first; and the last of them, None where there are none."""
+    """Nodes after `after` (None: all) up to `newest` and `upto_ns`, oldest first; and the last of
+    them, None without any."""
     found: list[Node] = []
     node: Node | None = newest
     while node is not None and node is not after:

@@ -61,7 +61,7 @@ class UnscentedEstimator(KalmanEstimator):
         return outcome
 
     def release(self) -> None:
-        """Feed back what was carried."""
+        """Feed back the held estimate."""
         before = self.nav.copy()
         super().release()
         if self.propagation:

@@ -94,7 +94,7 @@ def split(cov: Array, root: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])")
 def error_of(nav: Array, true: Array, scale: Array, out: Array) -> None:
-    """Write `out` (9,), the error of `nav` (10,) that `feed_back` would make `true` (10,) of.
+    """Write `out` (9,), the error of `nav` (10,) from which `feed_back` would make `true` (10,).
 
     `scale` (2,): metres a rad of latitude and longitude at `nav`.
     """
@@ -121,7 +121,7 @@ def error_of(nav: Array, true: Array, scale: Array, out: Array) -> None:
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])", allocates=True)
 def turn_attitude(cov: Array, before: Array, after: Array) -> None:
-    """Turn `cov` (width, width) for the feedback that made nav `after` (10,) of `before`."""
+    """Rotate `cov` (width, width) for the feedback that changed nav `before` to `after` (10,)."""
     d, scale = np.zeros(CORE_SIZE), np.ones(2)
     error_of(before, after, scale, d)
     x, y, z = d[0], d[1], d[2]

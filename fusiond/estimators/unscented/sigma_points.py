@@ -94,7 +94,7 @@ def spread_states(
     xis: Array,
     steps: Array,
 ) -> None:
-    """Write the true states that the errors dx, dx + s L_1, dx - s L_1, dx + s L_2 ... would mean.
+    """Write the true states for the errors dx, dx + s L_1, dx - s L_1, dx + s L_2 ...
 
     navs (2m + 1, 10), xis (2m + 1, n), steps (2m + 1, 28): rates and forces with their own sensor
     errors taken out.

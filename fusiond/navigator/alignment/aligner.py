@@ -47,7 +47,8 @@ HEADING_SOURCES: dict[str, HeadingSource] = {
 
 
 SAID_NS = 100_000_000
-"""While nothing but samples comes, what is missing is said anew so often: as people read it."""
+"""Interval at which the missing condition is reported again while only samples arrive: reading
+speed."""
 
 
 class Aligner:
@@ -67,7 +68,8 @@ class Aligner:
         self._track = Track(options, model)
         self._journal = Journal(on_event)
         self._news, self._said = True, -1
-        """True if anything has come since the reason was said, and when (`SAID_NS`) that was."""
+        """True if input has arrived since the last report, and the instant of that report
+        (`SAID_NS`)."""
         self._basis = Basis(options, noise, model, saved, self.known, self._track)
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:

@@ -13,7 +13,8 @@ from fusiond.navigator.saved_state import SavedState
 
 
 class Basis(NamedTuple):
-    """Options, the IMU's noise, the filter's model, the saved state, what has come in."""
+    """Input of a start: options, the IMU's noise, the filter's model, the saved state, the
+    evidence."""
 
     options: AlignmentOptions
     noise: ImuNoise

@@ -87,7 +87,7 @@ class Along(NamedTuple):
 
 
 def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Heading from the course over ground, forward or backward as the IMU felt it."""
+    """Heading from the course over ground, forward or backward as sensed by the IMU."""
     known = by.known
     # A fix of before the first sample is one of a gap: nothing was felt since.
     sensed = (f for f in reversed(known.fixes) if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns)
@@ -124,8 +124,8 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 def _moved_off(
     by: Basis, imu: ImuBuffer, standstill: Standstill, velocity: VelocityCandidate, place: Place
 ) -> Start | str | None:
-    """A start, why not yet, or None where what was felt since the quiet began to end is not the
-    velocity: it was no rest."""
+    """Start of a vehicle that has moved off; a reason to wait; or None if the motion sensed since
+    the end of rest does not match the velocity, so that there was no rest."""
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
     f = sensed_motion.sensed(
@@ -180,8 +180,8 @@ def _moved_off(
 
 
 def _level_sd(by: Basis, seconds: float, turned: float, lat: float) -> float:
-    """Sigma (rad) of a level carried on by the gyros since a rest: white noise, what the rate bias
-    seen at rest lacks, and on the axes of before the Earth's level rate and what is not square."""
+    """Sigma (rad) of a level that the gyros have carried on since a rest: white noise, the error of
+    the rate bias at rest, and on the earlier axes the Earth's level rate and misaligned axes."""
     n = by.noise
     aside = 2.0 * abs(math.sin(0.5 * turned))
     return math.sqrt(
@@ -209,7 +209,7 @@ def _sensed_sd(by: Basis, g: float, seconds: float, turned: float, speed: float)
 def _along(
     options: AlignmentOptions, velocity: VelocityCandidate, rate: Array, backward: bool
 ) -> Along:
-    """Direction of the antenna's motion, in a body that turns and does not slide."""
+    """Direction of the antenna's motion in a body that turns and does not slide."""
     no_slip = options.no_slip_m
     known = no_slip is not None
     arm = np.array(velocity.lever) - np.array(no_slip if no_slip is not None else (0.0, 0.0, 0.0))
@@ -242,7 +242,7 @@ def _reversing(by: Basis, velocity: VelocityCandidate) -> str:
 
 @immutable()
 class Ways:
-    """Measured velocities against what the IMU felt; what fits best is asked for each way."""
+    """Fits of velocities to sensed motion, one for each direction of travel."""
 
     sensed: sensed_motion.Sensed
     _past: sensed_motion.Past
@@ -272,8 +272,8 @@ def ways(
     g: float,
     sd_delay_s: float = 0.0,
 ) -> Ways:
-    """Of velocities in order of time, `latest` the last; they are late by 0 to within
-    `sd_delay_s`."""
+    """Fits of velocities in order of time to sensed motion; `latest` is the last. Their delay is
+    between 0 and `sd_delay_s`."""
     f = sensed_motion.sensed(past, m.instants, sensed_motion.rate_before_motion(past, m))
     return Ways(f, past, m, latest, options, noise, g, sd_delay_s)
 
@@ -281,7 +281,7 @@ def ways(
 def _on_the_move(
     by: Basis, imu: ImuBuffer, latest: Fix, place: Place, since_ns: int
 ) -> Start | None:
-    """By the velocities from `since_ns` on."""
+    """Start in motion by the velocities from `since_ns` on."""
     velocity = latest.velocity
     shortest, longest = MOTION_NS
     oldest = max(velocity.t_ns - longest, imu.oldest_ns, since_ns)
@@ -326,7 +326,7 @@ def _on_the_move(
 
 
 def _sd_delay_s(by: Basis, velocity: VelocityCandidate) -> float:
-    """One sigma of how late a receiver's velocities are; 0 where that is not estimated."""
+    """One sigma of the delay of a receiver's velocities; 0 if not estimated."""
     return float(sum(by.model.initial[slot] for slot in by.model.slots_of(velocity.time)))
 
 
@@ -346,7 +346,7 @@ def _build(
     rested: tuple[tuple[Array, float], Levelled] | None = None,
     fitted: Fitted | None = None,
 ) -> Start:
-    """With the antenna's velocity taken to the body; `rested`: bias and level of a standstill."""
+    """Start by the antenna's velocity in the body; `rested`: bias and level of a standstill."""
     bias, levelled = (None, None) if rested is None else rested
     velocity, sd = velocity_of(candidate)
     velocity = velocity - dcm @ np.cross(rate, candidate.lever)

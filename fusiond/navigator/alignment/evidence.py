@@ -1,4 +1,4 @@
-"""Data of an alignment: rest seen by the IMU, and what the measurements offered."""
+"""Data for alignment: rest detected by the IMU, and initial values from measurements."""
 
 from __future__ import annotations
 
@@ -101,32 +101,32 @@ class AlignmentEvidence:
         self._options, self._noise, self._saved = options, noise, saved
         self._event = on_event
         self.why = ""
-        """Reason to wait, beyond what the aligner sees itself."""
+        """Reason to wait, beyond those that the aligner finds itself."""
         self.poor_claims: dict[str, str] = {}
-        """Reason why a claimed heading, by its origin, is no start."""
+        """Reason why a claimed heading, by its origin, cannot start navigation."""
         self.reported: set[str] = set()
-        """Events that the operator has heard."""
+        """Events already reported."""
         self.upside_down = False
         self.tried_ns = 0
         """Instant of the last fix that a course was tried with."""
         self.moving_since_ns = 0
-        """The first fix since which all were fast enough for a course."""
+        """First fix since which every speed was high enough for a course."""
         self.rest_evidence = RestEvidence()
         self.standstill: Standstill | None = None
         """The last standstill, also when the vehicle has moved off since."""
         self.left: Standstill | None = None
-        """The last standstill that one could level by and that has ended."""
+        """Last finished standstill that was long enough for levelling."""
         self.ever_moved = False
         self.unexplained = np.zeros(3)
-        """The largest rates (3,) of quiet windows that no bias of the data sheet explains: a turn,
-        or a gyro that is not what its sheet says."""
+        """Largest rates (3,) of quiet windows beyond the data sheet's bias: a turn, or a gyro
+        outside its data sheet."""
         self.heading: HeadingCandidate | None = None
         self.compass: HeadingCandidate | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
         self.contradicted_ns: int | None = None
-        """The last fix at which positions had moved otherwise than the velocities of their
-        receiver, and not by chance: which of those before it were wrong nobody knows."""
+        """Last fix at which positions contradicted their receiver's velocities beyond chance; which
+        earlier ones were wrong is unknown."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -209,15 +209,15 @@ class AlignmentEvidence:
         return self._at_rest
 
     def levelled(self) -> Standstill | None:
-        """The standstill that the vehicle is in, once it is long enough to level by."""
+        """Present standstill, once long enough for levelling."""
         s = self.standstill
         if s is None or not self._at_rest or s.seconds < self._options.levelling_s:
             return None
         return s if self.rested(s, ANY_TIME_NS) else None
 
     def rested(self, s: Standstill, until_ns: int = 0) -> bool:
-        """True if no measured speed contradicts a standstill, up to its end or later; nor the way
-        between positions, where no speed was measured."""
+        """True if no measured speed contradicts a standstill up to its end or later, nor a
+        displacement of positions where no speed was measured."""
         end_ns = max(s.end_ns, until_ns)
         seen = self.rest_evidence.measured(s.start_ns, end_ns)
         if math.isfinite(seen.sd):
@@ -226,7 +226,7 @@ class AlignmentEvidence:
         return slope <= max(self._options.rest_speed_m_s, CONTRADICTION_SIGMAS * sd)
 
     def confirmed_rest(self, s: Standstill) -> bool:
-        """True if a standstill that nothing contradicts was measured to be one."""
+        """True if speeds confirm an uncontradicted standstill."""
         if self.seen_at_rest(s):
             return True
         return CONTRADICTION_SIGMAS * self._way(s.start_ns, s.end_ns)[1] < SLOWEST_M_S
@@ -249,20 +249,20 @@ class AlignmentEvidence:
         return math.isfinite(seen.sd) and not seen.contradicts
 
     def doubted(self, why: str) -> str:
-        """Set the reason why there is no start yet; `why` back."""
+        """Set the reason why there is no start yet; returns it."""
         self.why = why
         return why
 
     def report(self, code: str, text: str) -> str:
-        """The same, and an event the first time."""
+        """Set the reason, and report an event the first time."""
         if code not in self.reported:
             self.reported.add(code)
             self._event(code, text)
         return self.doubted(text)
 
     def position_confirms(self, latest: Fix) -> bool:
-        """True if the positions have moved as the velocities say, so far that the opposite would be
-        seen, and do not run away from them."""
+        """True if the positions confirm the direction of the velocities, over a distance that would
+        expose the opposite, without divergence."""
         way, before, trend = np.zeros(2), self.fixes[0], NO_TREND
         first = before.position
         if before is latest:
@@ -296,7 +296,7 @@ class AlignmentEvidence:
         return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 
     def _keep(self, fix: Fix) -> None:
-        """In order of validity."""
+        """Insert a fix in order of validity."""
         oldest = max(fix.velocity.t_ns, self.fixes[-1].velocity.t_ns if self.fixes else 0)
         kept = self.fixes[bisect_left(self.fixes, oldest - FIXES_NS, key=_instant) :]
         insort(kept, fix, key=_instant)
@@ -312,7 +312,7 @@ class AlignmentEvidence:
             self.report("imu_upside_down", reason("imu_upside_down"))
 
     def _turns(self, w: Window) -> bool:
-        """True if the rate of quiet windows can be no bias that the data sheet allows."""
+        """True if the rate of quiet windows exceeds any bias of the data sheet."""
         n = self._noise
         prior = n.rate_bias_initial**2 + n.rate_bias_instability**2
         free = n.rate_noise**2 / self._options.window_s + self._options.rate_sd_rad_s**2
@@ -325,7 +325,7 @@ class AlignmentEvidence:
         return False
 
     def place(self) -> Place | None:
-        """Position (rad, rad, m) to start at, the fix it came from, and its sigmas."""
+        """Position (rad, rad, m) to start at, its fix, and its sigmas."""
         if self._position is not None:
             return self.place_of(self._position)
         reported = self._reported()
@@ -346,7 +346,7 @@ class AlignmentEvidence:
         return Place(p, where, max(p.sd[:2]), sd_height)
 
     def _reported(self) -> tuple[tuple[float, float, float | None], float] | None:
-        """Position (rad, rad, m) by the configuration or the saved state , and one sigma (m)."""
+        """Position (rad, rad, m) by the configuration or the saved state, and one sigma (m)."""
         if self._options.position is not None:
             return self._options.position, self._options.position_sd_m
         if self._saved is not None:

@@ -65,14 +65,14 @@ class Mixture(NamedTuple):
 
 @dataclass(slots=True)
 class Cell:
-    """A filter that has started, and how likely it is."""
+    """Started filter and its probability."""
 
     filter: InvariantFilter
     weight: float
 
 
 class HeadingBank:
-    """Runs cells that have started at `t_ns`, with so many `positions` fused."""
+    """Bank of filters with different headings, started at `t_ns` after `positions` fixes."""
 
     def __init__(
         self, cells: list[Cell], t_ns: int, positions: int, max_reverse_m_s: float
@@ -89,7 +89,7 @@ class HeadingBank:
 
     @property
     def lost(self) -> bool:
-        """No cell explains what is measured."""
+        """True if no filter explains the measurements."""
         return not self._cells or self._refused >= MOST_REFUSED
 
     @property
@@ -99,7 +99,7 @@ class HeadingBank:
     def advance(
         self, imu: ImuBuffer, measurements: Sequence[AidingMeasurement], until_ns: int
     ) -> None:
-        """To `until_ns`, with `measurements` that are valid until then, in their order."""
+        """Advance to `until_ns`, with `measurements` up to then in order of validity."""
         for measurement in measurements:
             if measurement.t_ns < self._received_ns.get(measurement.source, 0) + INTERVAL_NS:
                 continue
@@ -159,7 +159,7 @@ class HeadingBank:
         self._prune()
 
     def _drop_backward(self) -> None:
-        """Nothing drives backward so fast."""
+        """Drop filters that drive backward at an implausible speed."""
         for cell in self._cells:
             f = cell.filter
             ahead = dcm_from_quaternion(f.nav[Q0:])[:, 0]

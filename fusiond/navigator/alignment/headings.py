@@ -32,7 +32,7 @@ from fusiond.navigator.reasons import reason
 HEADING_AGE_NS = 2_000_000_000
 SAVED, CONFIGURED, COMPASS = "saved state", "configured heading", "compass"
 CLAIMS = (SAVED, CONFIGURED, COMPASS)
-"""Headings that nothing measured at the start, or a magnet may have bent."""
+"""Headings without a measurement at the start, or exposed to magnetic disturbance."""
 # A claim that is poorer than this is no start where driving tells the heading: the filter would
 # find it as well, but what it says until then helps nobody.
 POOR_SD_RAD = math.radians(15.0)
@@ -77,8 +77,8 @@ def _at_standstill(
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Start by the saved heading of a parked vehicle, while it has not moved since: neither by
-    itself nor on a ferry, which the first fix tells."""
+    """Start by the saved heading of a parked vehicle, unless it has moved since: by itself, or on a
+    ferry, as the first fix shows."""
     if by.saved is None or by.known.ever_moved:
         return None
     fix, where, sd, _ = place
@@ -106,7 +106,7 @@ def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Latest heading candidate, while it is fresh."""
+    """Start by the latest heading of a dual antenna, while fresh."""
     if by.known.heading is None or imu.latest_ns - by.known.heading.t_ns > HEADING_AGE_NS:
         return None
     return _at_standstill(
@@ -115,7 +115,7 @@ def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Compass candidate, while it is fresh, until the vehicle has shown it to be wrong."""
+    """Start by a compass heading, while fresh, unless motion has refuted it."""
     candidate = by.known.compass
     if candidate is None or imu.latest_ns - candidate.t_ns > HEADING_AGE_NS:
         return None
@@ -124,7 +124,7 @@ def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """The direction of the Earth's rate, once the standstill is long enough for it."""
+    """Start by the direction of the Earth's rate, after a long enough standstill."""
     standstill = by.known.standstill
     if (
         standstill is None

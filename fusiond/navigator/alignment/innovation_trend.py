@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Offset(NamedTuple):
-    """A position's innovation north and east (m), and one sigma of the measurement (m)."""
+    """Innovation of a position, north and east (m), and one sigma of the measurement (m)."""
 
     north: float
     east: float
@@ -15,7 +15,7 @@ class Offset(NamedTuple):
 
 
 class Trend(NamedTuple):
-    """Sums over innovations of a position (m) against time (s), for a line by least squares."""
+    """Sums for a least-squares line through position innovations (m) over time (s)."""
 
     n: int = 0
     t: float = 0.0
@@ -27,7 +27,7 @@ class Trend(NamedTuple):
     sd: float = 0.0
 
     def with_one(self, z: Offset, t_s: float) -> Trend:
-        """With one innovation more."""
+        """Sums with one more innovation."""
         return Trend(
             self.n + 1,
             self.t + t_s,
@@ -41,7 +41,7 @@ class Trend(NamedTuple):
 
     @property
     def slope(self) -> tuple[float, float]:
-        """Drift rate (m/s), and the sigma of one of its axes; infinite where nothing is known."""
+        """Drift rate (m/s), and sigma of one axis; infinite without data."""
         spread = self.tt - self.t * self.t / self.n if self.n else 0.0
         if spread <= 0.0:
             return 0.0, math.inf

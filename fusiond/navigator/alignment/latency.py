@@ -1,4 +1,4 @@
-r"""Delay of a receiver's fixes, told by the IMU alone.
+r"""Search for the delay of a receiver's fixes, by the IMU alone.
 
 The velocities of the last seconds are compared with what the IMU has felt
 (fusiond.navigator.alignment.motion_fit), as if each had been true by tau before its stamp.
@@ -122,14 +122,13 @@ class Found(NamedTuple):
 
 @dataclass(slots=True)
 class _Received:
-    """Aiding measurements of one device measurement as stamped, and its velocities once asked
-    for."""
+    """Aiding measurements of one device measurement as stamped; its velocities on demand."""
 
     measurements: tuple[AidingMeasurement, ...]
     found: list[Epoch] | None = None
 
     def epochs(self) -> list[Epoch]:
-        """Its velocities, each with its position."""
+        """Velocities with their positions."""
         if self.found is None:
             candidates = [candidate for m in self.measurements for candidate in m.candidates()]
             position = next((o for o in candidates if isinstance(o, PositionCandidate)), None)
@@ -141,8 +140,8 @@ class _Received:
 
 @dataclass(slots=True)
 class _Receiver:
-    """The last measurements of a receiver, how late they are taken to be (ns), and what speaks for
-    another delay since when (ns)."""
+    """Receiver: last measurements, assumed delay (ns), and start (ns) of the evidence for another
+    one."""
 
     received: deque[_Received] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
     delay_ns: int = 0
@@ -175,8 +174,8 @@ class _Receiver:
 
 
 class LatencySearch:
-    """Keeps the last fixes of each receiver as they were stamped, and how late each was found to
-    be; `on_event(code, text)` hears of it."""
+    """Search for each receiver's delay over its last fixes; `on_event(code, text)` receives the
+    results."""
 
     def __init__(
         self,
@@ -189,7 +188,7 @@ class LatencySearch:
         self._event = on_event
         self._receivers: dict[str, _Receiver] = {}
         self.on_time: set[str] = set()
-        """Known receivers whose stamps are taken as they are."""
+        """Known receivers whose stamps need no correction."""
         self.waiting: deque[tuple[str, Sequence[AidingMeasurement]]] = deque(maxlen=MOST_WAITING)
         """Measurements of receivers that are `on_time`, taken in when somebody looks."""
         self._due_ns = self._fitted_ns = 0
@@ -197,7 +196,7 @@ class LatencySearch:
         self._looks: deque[int] = deque(maxlen=MOST_LOOKS)
 
     def _catch_up(self) -> None:
-        """Take in what waits."""
+        """Process waiting measurements."""
         while self.waiting:
             source, measurements = self.waiting.popleft()
             self._receivers[source].received.append(_Received(tuple(measurements)))
@@ -205,8 +204,7 @@ class LatencySearch:
     def receive(
         self, source: str, measurements: Sequence[AidingMeasurement]
     ) -> Sequence[AidingMeasurement]:
-        """Aiding measurements of one device measurement, moved to the instants at which they were
-        true."""
+        """Shift aiding measurements of one device measurement to their instants of validity."""
         self._catch_up()
         receiver = self._receivers.get(source)
         if receiver is None:
@@ -222,7 +220,7 @@ class LatencySearch:
         return [_earlier(m, delay_ns) for m in measurements] if delay_ns else measurements
 
     def kept(self) -> list[AidingMeasurement]:
-        """The last measurements of all receivers, at the instants at which they were true."""
+        """Last measurements of all receivers, at their instants of validity."""
         self._catch_up()
         return [
             _earlier(measurement, receiver.delay_ns)
@@ -232,12 +230,12 @@ class LatencySearch:
         ]
 
     def due(self, t_ns: int) -> bool:
-        """True if it is time to look again, or to go on with it."""
+        """True if a search is due or in progress."""
         return self._looking is not None or not 0 < self._due_ns - t_ns <= SEARCHED_NS
 
     @property
     def looking(self) -> bool:
-        """True if a look has begun and not ended."""
+        """True during a search."""
         return self._looking is not None
 
     def stop(self) -> None:
@@ -246,7 +244,7 @@ class LatencySearch:
 
     @property
     def suspects(self) -> str:
-        """Text on a receiver whose delay is suspected, in words; empty where none is."""
+        """Text on a receiver with a suspected delay; empty without one."""
         for source, receiver in self._receivers.items():
             if receiver.suspected is not None:
                 delay = receiver.suspected
@@ -274,11 +272,11 @@ class LatencySearch:
         return None
 
     def _doubted_ns(self, t_ns: int) -> int:
-        """The last instant, before what the looks of now go by, at which something did not fit."""
+        """Last contradiction before the data of the present search (ns)."""
         return max((look for look in self._looks if look <= t_ns - LOOKED_NS), default=0)
 
     def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
-        """`look` at all that there is now, a fit at a time."""
+        """Run `look` on all present data, one fit at a time."""
         self._catch_up()
         t_ns = imu.latest_ns
         self._due_ns = t_ns + EVERY_NS
@@ -379,8 +377,7 @@ def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityCandidate], PositionCa
 def _bottom(
     cost: Callable[[float], Fitting], about_s: float
 ) -> Generator[None, None, Delay | None]:
-    """The bottom of a valley of costs by parabolas, and the sigma that its bend means; None where
-    it is none."""
+    """Minimum of costs by parabolas, and the sigma of its curvature; None without a minimum."""
     sd = math.inf
     for h in NEAR_S:
         before, _ = yield from cost(about_s - h)

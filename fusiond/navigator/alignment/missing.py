@@ -1,4 +1,4 @@
-"""Reasons why there is no start: what is missing, and what to do.
+"""Reasons why navigation has not started: the missing condition and the remedy.
 
 One sentence: what is missing, then what each allowed source of a heading waits for. It goes out as
 `why`; a change of it is an event, `not_aligned`, once it has lasted for `SETTLED_NS`. Numbers that
@@ -30,7 +30,7 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Journal:
-    """Tells changes of the reason; `on_event(code, text)` hears them."""
+    """Reporter of changes of the reason, through `on_event(code, text)`."""
 
     def __init__(self, on_event: Callable[[str, str], None]) -> None:
         self._event = on_event

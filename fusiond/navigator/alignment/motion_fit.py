@@ -80,7 +80,7 @@ def fit(
     sd_yaw: float,
     sd_delay_s: float = 0.0,
 ) -> Fit:
-    """Best fit from `f`, with `yaw` (rad) at the last fix to within `sd_yaw`.
+    """Best fit from `f`, with `yaw` (rad) at the last fix and its sigma `sd_yaw`.
 
     Velocities are delayed by 0, to within `sd_delay_s`."""
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
@@ -107,8 +107,8 @@ def fit(
 
 
 class Asked(NamedTuple):
-    """The IMU's noise, gravity, heading (rad) at the last fix, one sigma of the priors (10,) and of
-    the velocities' offset in time (s)."""
+    """Fit's constants: IMU noise, gravity, heading (rad) at the last fix, one sigma of the priors
+    (10,) and of the velocities' offset in time (s)."""
 
     noise: ImuNoise
     g: float
@@ -150,7 +150,7 @@ def _parts(m: Measured, rate_sd: float) -> list[Measured]:
 
 
 def _descend(f: Sensed, m: Measured, asked: Asked, here: Guess) -> Descent:
-    """By Gauss-Newton from a guess, begun at `f`."""
+    """Minimise by Gauss-Newton from a guess with fit `f`."""
     of, rows = f.of, 3 * len(m.velocity) + PRIORS
     z, slopes, guess = np.empty(rows), np.empty((rows, SOUGHT)), here.packed()
     converged = descend(
@@ -163,7 +163,7 @@ def _descend(f: Sensed, m: Measured, asked: Asked, here: Guess) -> Descent:
 
 
 class Guess(NamedTuple):
-    """Attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, offset in time in
+    """Guess: attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, offset in time in
     sigmas, velocity (3,) at the first fix."""
 
     last: Array
@@ -172,7 +172,7 @@ class Guess(NamedTuple):
     first: Array
 
     def since(self, m: Measured) -> Guess:
-        """As a guess of what began with the first of `m`."""
+        """Guess for a span that starts at the first of `m`."""
         return self._replace(first=m.velocity[0])
 
     def packed(self) -> Array:
@@ -181,6 +181,6 @@ class Guess(NamedTuple):
 
     @staticmethod
     def of(packed: Array) -> Guess:
-        """Unpacked."""
+        """Unpack a guess."""
         delay = float(packed[DELAY])
         return Guess(packed[:BIASES].reshape(3, 3), packed[BIASES:DELAY], delay, packed[FIRST:])

@@ -6,7 +6,7 @@ import math
 
 from drivers.immutable import immutable
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 
 # Faster (m/s) than a road vehicle reverses: a reverse gear ends at 10 to 25 km/h in a car.
 # A train drives either way.
@@ -44,7 +44,7 @@ class AlignmentOptions:
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
-    """From `[alignment]` and `[constraints.zero_velocity]`."""
+    """Options of alignment from `[alignment]` and `[constraints.zero_velocity]`."""
     a, rest = config.alignment, config.constraints.zero_velocity
     no_slip = config.constraints.non_holonomic
     position = a.position_deg_m

@@ -1,4 +1,4 @@
-r"""Position jumps of a receiver against its own velocities.
+r"""Position jumps of a receiver, detected by its own velocities.
 
     r_k = p_k - p_k-1 - (v_k + v_k-1) / 2 (t_k - t_k-1)
 
@@ -48,14 +48,14 @@ SHOWING_M_S = 5.0
 
 
 class Epoch(NamedTuple):
-    """A measurement's velocity and, where it has one, its position."""
+    """Velocity of a measurement and, if available, its position."""
 
     velocity: VelocityCandidate
     position: PositionCandidate | None
 
 
 def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
-    """Of epochs in order of time those since the last leap."""
+    """Epochs, in order of time, since the last position jump."""
     steps = _steps(epochs)
     if steps is None or not (looked := steps.dt_s <= LONGEST_S).any():
         return epochs
@@ -67,10 +67,10 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
 
 
 def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:
-    """True if a receiver cannot have become later by `by_s` within what a look goes by, nor have
-    been so before: its positions have followed its velocities all the way, and before that these
-    had changed by as much as shows a delay. What follows `doubted_ns`, when something did not
-    fit, shows none as long: what is begun anew by late fixes agrees with them for a while."""
+    """True if the receiver's delay cannot have grown by `by_s` within the data, nor have been
+    larger before: its positions have followed its velocities, which earlier changed by enough to
+    show a delay. Data after a contradiction at `doubted_ns` is no proof, since a solution restarted
+    by delayed fixes agrees with them for a while."""
     steps = _steps(epochs)
     if steps is None:
         return False
@@ -87,8 +87,8 @@ def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool
 
 
 def velocities_alone(epochs: Sequence[Epoch], by_s: float) -> bool:
-    """True if of fixes whose velocities are later by `by_s` than they were (earlier, below 0) the
-    positions are nearer to have stayed."""
+    """True if velocities are delayed by `by_s` more than before (negative: less), and positions fit
+    the old delay better."""
     steps = _steps(epochs)
     if steps is None or (steps.dt_s > LONGEST_S).any():
         return False
@@ -99,8 +99,8 @@ def velocities_alone(epochs: Sequence[Epoch], by_s: float) -> bool:
 
 
 class _Steps(NamedTuple):
-    """From each epoch to the next (k,): length, what the positions are off (k, 2) by, and the mean
-    velocity (k, 2), north and east."""
+    """Steps between epochs (k,): length, position error (k, 2), and mean velocity (k, 2), north and
+    east."""
 
     dt_s: Array
     off_m: Array
@@ -108,7 +108,7 @@ class _Steps(NamedTuple):
 
 
 def _steps(epochs: Sequence[Epoch]) -> _Steps | None:
-    """None where there are none, or no positions."""
+    """Steps between epochs; None without steps or positions."""
     if len(epochs) < 2 or any(epoch.position is None for epoch in epochs):
         return None
     places = [(e.position.lat_rad, e.position.lon_rad) for e in epochs if e.position is not None]

@@ -74,7 +74,7 @@ HOW = "positions on the way"
 
 
 def bank_model(model: Model, options: AlignmentOptions) -> Model:
-    """The vehicle's model, with the angle between driving and facing where it has none."""
+    """Vehicle's model, with the angle between course and heading if it lacks one."""
     if model.slots_of(MOUNTING):
         return model
     try:
@@ -86,7 +86,7 @@ def bank_model(model: Model, options: AlignmentOptions) -> Model:
 
 
 class Track:
-    """Measurements of a vehicle without heading, and the bank that it leads to."""
+    """Measurements of a vehicle without heading, and the bank of filters started from them."""
 
     def __init__(self, options: AlignmentOptions, model: Model) -> None:
         self._options = options
@@ -169,7 +169,7 @@ class Track:
         place: Place,
         until_ns: int,
     ) -> HeadingBank | None:
-        """A bank, where there is something to begin with: the end of a rest, or the first fix."""
+        """Start a bank from the end of a rest or the first fix; None without either."""
         if place.fix is not None and place.fix.height_m is not None:
             place = place._replace(sd_height=ANYWHERE_M)  # the bank is told the fixes themselves
         left = self._left or known.left
@@ -236,7 +236,7 @@ class Track:
         return cells
 
     def _on_the_move(self, imu: ImuBuffer, place: Place, t_ns: int, weight: float) -> list[Cell]:
-        """Cells of a vehicle of unknown speed on a road of unknown slope."""
+        """Filters for a vehicle of unknown speed on a road of unknown slope."""
         where, sd = self._place(place.where, t_ns)
         place = Place(None, where, sd, place.sd_height)
         cells = []
@@ -267,8 +267,8 @@ class Track:
         return Cell(found, weight)
 
     def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:
-        """Position (rad, rad, m) of a moving vehicle at an instant, and one sigma (m): where it was
-        at the fix before, as far as it may have driven since, or about `where` it is now."""
+        """Position (rad, rad, m) of a moving vehicle at an instant, and one sigma (m): the last fix
+        with the distance driven since, or about its position `where`."""
         fixes = [
             o
             for a in self._measurements
@@ -285,7 +285,7 @@ class Track:
     def _with_slip(
         self, due: list[AidingMeasurement], begin_ns: int, until_ns: int
     ) -> list[AidingMeasurement]:
-        """Measurements that are due, and that the vehicle does not slide, twice a second."""
+        """Due measurements, and the no-slip constraint twice a second."""
         lever = self._options.no_slip_m or (0.0, 0.0, 0.0)
         first = (begin_ns // SLIP_NS + 1) * SLIP_NS
         own: list[AidingMeasurement] = [

@@ -20,7 +20,7 @@ REST_VELOCITY_SD = np.full(3, 0.1)
 def rest_bias(
     noise: ImuNoise, standstill: Standstill, dcm: Array, lat: float, sd_yaw: float = 0.0
 ) -> tuple[Array, float]:
-    """Rate bias (3,) seen at rest and its sigma.
+    """Rate bias (3,) at rest and its sigma.
 
     Of the Earth's level rate w a heading that is off by y, one sigma s, takes out the wrong part,
     w (cos y - 1, sin y): w y is the start's to correlate, the rest, half of it an axis, is

@@ -1,4 +1,4 @@
-r"""Preintegrated motion and measurements, since the first of some fixes.
+r"""Preintegrated motion with measurements, since the first of several fixes.
 
 Integrals of the gyros and accelerometers in the axes of the first fix, with their slopes by the
 sensors' biases, for fusiond.navigator.alignment.motion_fit.
@@ -28,7 +28,7 @@ AROUND_NS = 100_000_000
 # A velocity below so many of its sigmas is none.
 STILL_SIGMAS = 3.0
 MOST_FIXES = 20
-"""Of the fixes, evenly: more add little, for their changes are alike."""
+"""Most fixes of a fit, evenly spaced; nearby ones add little."""
 
 
 class Past(Protocol):
@@ -46,7 +46,7 @@ class Past(Protocol):
 
 @immutable()
 class Span:
-    """A `Past` that stays as it is."""
+    """Immutable `Past`."""
 
     times: NDArray[np.int64]
     samples: Array
@@ -77,7 +77,7 @@ class Stretch(NamedTuple):
     means: Array
 
     def sensed(self, biases: Array) -> Sensed:
-        """Less biases (6,) of force and rate."""
+        """Sensed motion without biases (6,) of force and rate."""
         k = len(self.counts)
         gained, turned, slopes = np.empty((k, 3)), np.empty((k, 3, 3)), np.empty((k, 3, 6))
         integrate_sensed(self.times, self.samples, biases, self.counts, gained, turned, slopes)
@@ -85,9 +85,9 @@ class Stretch(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """Integrals over a stretch from its first fix to each of k, with biases (6,) of force and rate
-    taken off: gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the
-    velocity by the biases (k, 3, 6)."""
+    """Integrals from the first fix to each of k, without biases (6,) of force and rate: gained
+    velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, derivatives of the velocity by
+    the biases (k, 3, 6)."""
 
     of: Stretch
     gained: Array
@@ -97,20 +97,20 @@ class Sensed(NamedTuple):
 
     @property
     def rates(self) -> Array:
-        """At the fixes (k, 3), less their biases."""
+        """Rates (k, 3) at the fixes, without biases."""
         rates: Array = self.of.means[:, :3] - self.biases[3:]
         return rates
 
     @property
     def turns(self) -> Array:
-        """Slopes (3, 3) of the last attitude, a rotation vector in the axes of the first, by rate
-        bias: those of the velocity by force bias."""
+        """Derivatives (3, 3) of the last attitude, a rotation vector in the axes of the first, by
+        rate bias: those of the velocity by force bias."""
         turns: Array = self.slopes[-1][:, :3]
         return turns
 
 
 def span_since(imu: ImuBuffer, t_ns: int) -> Span:
-    """A copy of the samples from an instant on, and of what `samples_at` it looks at."""
+    """Copy of the samples from an instant on, and of the input of `samples_at`."""
     first = max(0, imu.index_after(t_ns - AROUND_NS) - 1)
     return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
 
@@ -130,9 +130,8 @@ def measured(fixes: Sequence[VelocityCandidate], most: int) -> Measured:
 
 
 def rate_before_motion(past: Past, m: Measured) -> Array:
-    """Mean rate (3,) over the first of the fixes, as long as they say that it stands: what a
-    linearisation about no bias would have to find in the dark, 60 deg of turning for 3 deg/s in
-    20 s. Nothing if it never stood."""
+    """Mean rate (3,) over the first fixes, while they show rest. A linearisation about zero bias
+    would not converge: 3 deg/s turn by 60 deg in 20 s. Zero without a rest."""
     beyond = np.abs(m.velocity) > STILL_SIGMAS * m.sd
     moves = beyond[:, 0] | beyond[:, 1]
     stood = int(np.argmax(moves)) if moves.any() else len(moves)
@@ -144,7 +143,7 @@ def rate_before_motion(past: Past, m: Measured) -> Array:
 
 
 def samples_at(past: Past, t_ns: int) -> Array:
-    """Mean (6,) of the samples around an instant, as many as there are."""
+    """Mean (6,) of the available samples around an instant."""
     first = max(0, past.index_after(t_ns - AROUND_NS) - 1)
     end = max(first + 1, past.index_after(t_ns + AROUND_NS))
     mean: Array = past.samples[first:end].mean(axis=0)
@@ -161,7 +160,7 @@ def stretch(past: Past, instants: NDArray[np.int64]) -> Stretch:
 
 
 def sensed(past: Past, instants: NDArray[np.int64], rate: Array) -> Sensed:
-    """Sensed motion from the first of instants (k,) to each, less a rate bias (3,)."""
+    """Sensed motion from the first of instants (k,) to each, without a rate bias (3,)."""
     return stretch(past, instants).sensed(np.concatenate((np.zeros(3), rate)))
 
 

@@ -54,8 +54,8 @@ UNKNOWN_HEIGHT_SD_M = 6000.0 / math.sqrt(3.0)
 
 
 class Place(NamedTuple):
-    """The fix that a position came from, the position (rad, rad, m), one sigma (m) horizontally
-    and of its height; a height that is not known is 0."""
+    """Position (rad, rad, m) with its fix, one sigma (m) horizontally and of its height; an unknown
+    height is 0."""
 
     fix: PositionCandidate | None
     where: Array
@@ -64,7 +64,8 @@ class Place(NamedTuple):
 
 
 def as_geodetic(metres: Array, lat: float) -> Array:
-    """A short way north, east, down (3,) in m as latitude, longitude (rad) and height (m)."""
+    """Convert a short vector north, east, down (3,) in m to latitude, longitude (rad) and height
+    (m)."""
     n, e, d = metres
     return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
 
@@ -100,7 +101,7 @@ class Fitted(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """A measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
+    """Measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
 
     candidate: VelocityCandidate
     rate: Array
@@ -130,7 +131,7 @@ class Start:
 
     @property
     def origin(self) -> str:
-        """Of the heading, before the gap that it was carried over."""
+        """Origin of the heading before a gap."""
         return self.how.partition(RESTARTED)[0]
 
     @property
@@ -157,7 +158,7 @@ def build_start(
     moves: Moves | None = None,
     heading: HeadingCandidate | None = None,
 ) -> Start:
-    """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
+    """Start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
     at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors as
@@ -209,8 +210,8 @@ def build_start(
 
 
 def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
-    """Heading error and what it shares with the device's: an innovation of 0
-    (fusiond.aiding.compass) says phi_D = e - d dev; else the next readings would prove dev = 0."""
+    """Correlate the heading error with the device's by an innovation of 0 (fusiond.aiding.compass),
+    phi_D = e - d dev; otherwise further readings would prove dev = 0."""
     shared = [
         (slot, rate)
         for block, rates in heading.shared
@@ -258,8 +259,8 @@ def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
 def _take_fitted(
     model: Model, p: Array, xi: Array, fitted: Fitted, force: Array, time: list[int]
 ) -> None:
-    """Take biases, and the offset of slots `time` (0 or 1), as fitted, with the covariance that
-    they share with the attitude; what P has of attitude already is added to it.
+    """Set biases, and the offset of slots `time` (0 or 1), to the fitted values, with their
+    covariance with the attitude; P's attitude covariance is added to it.
 
     What was felt as a force bias is b + s f, of which f (3,) is all but gravity: where the model
     has the scale factor s, b is known no better than s f, and cov(b, s) = -f var(s).
@@ -286,7 +287,7 @@ def _take_fitted(
 
 
 def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
-    """A start of a vehicle that stands, whose heading may be any.
+    """Start at rest with an unknown heading.
 
     The rate that was felt is that of a vehicle at rest, whatever its heading: as much of the
     Earth's level rate w as psi puts on the east axis is in the bias, db = w psi (C^T)_E, or
@@ -303,7 +304,7 @@ def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Star
 
 
 def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> None:
-    """Take the rate bias seen at rest, where it is better known than the sheet says."""
+    """Set the rate bias at rest, where it is better known than by the data sheet."""
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
         prior = p[slot, slot]

@@ -39,11 +39,10 @@ class StartCheck:
         self._unproven = bool(self._claim) and not start.confirmed
         self._since_ns: int | None = None
         self.unconfirmed = ""
-        """Condition of the heading that nothing has shown, in words; empty where there is no such
-        thing. A configured heading is a hypothesis until the first motion, and so is one that was
-        saved without it; another that was saved was measured, before the vehicle was parked. And
-        what looks like driving backward is driving forward with an IMU that is mounted the other
-        way, until it goes forward as well."""
+        """Unproven condition of the heading, as text; empty without one. A configured heading is a
+        hypothesis until the first motion, as is one saved without motion; another saved heading was
+        measured before the vehicle was parked. Apparent driving backward is driving forward with a
+        reversed IMU until the vehicle drives forward, too."""
         self._say()
 
     def _say(self) -> None:
@@ -55,8 +54,8 @@ class StartCheck:
     def refuted(
         self, t_ns: int, nav: Array, covariance: Array, measured: RestEvidence, doubted: bool
     ) -> tuple[str, str] | None:
-        """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
-        the start was wrong. `doubted`: it has not fitted the measurements since."""
+        """Code and text of the event if the solution nav (10,) with P (n, n) at `t_ns` refutes the
+        start. `doubted`: it has not fitted the measurements since."""
         axes = dcm_elements(nav[Q0:])
         v_n, v_e, v_d = nav[VN : VN + 3].tolist()
         backward = -(axes[0] * v_n + axes[3] * v_e + axes[6] * v_d)
@@ -86,10 +85,9 @@ class StartCheck:
         sd_yaw: float,
         doubted: bool,
     ) -> tuple[str, str] | None:
-        """A heading that was configured or saved, against the measured course, forward or backward:
-        a filter with a wrong heading gates the velocity that says so. Once it has doubted its
-        motion for that, it turns towards the course by and by, and so do its sensor errors, which
-        were right."""
+        """Check a configured or saved heading against the measured course, forward or backward: a
+        filter with a wrong heading gates the velocities that contradict it. Once it has doubted its
+        motion, it slowly turns towards the course and corrupts correct sensor errors."""
         north, east, sd_speed = velocity
         speed = math.hypot(north, east)
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:

@@ -100,17 +100,16 @@ class Intake:
         return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
 
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Start receivers without a fix so far from these sums."""
+        """Resume receivers without a fix so far from these sums."""
         self._sections.fixes_shown = fixes_shown
 
     def count_drifts(self, drifts: DriftLevels) -> None:
-        """From now on typed drifts count as much as they say."""
+        """Set the weights of the configured drifts from now on."""
         self._sections.drifts = drifts
 
     def extra_blocks(self) -> list[Block]:
-        """Blocks that the measurements need in the model beside its own blocks: errors that
-        successive measurements share. Of a block that two sources need, the first says the
-        noise."""
+        """Blocks of the model for the measurements: errors that successive measurements share. The
+        first source determines the noise of a common block."""
         blocks: dict[str, Block] = {}
         for source, section in self._sections.aiding.items():
             for kind in KINDS:

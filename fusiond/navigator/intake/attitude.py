@@ -1,4 +1,4 @@
-"""Attitude, also of a star tracker, which may be mounted askew."""
+"""Attitude, also of a star tracker, which may be misaligned."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from drivers.measurements import Attitude
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import Aiding, AttitudeAiding, StarTrackerAiding
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
 

@@ -1,4 +1,4 @@
-"""Bearings of known points, as a radar sees them."""
+"""Bearings of known points, as from a radar."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from drivers.measurements import Bearing
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.aiding import SarAiding
-from fusiond.configuration.settings import ARCSEC, DEG
+from fusiond.configuration.si_units import ARCSEC, DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
 

@@ -23,14 +23,14 @@ from fusiond.aiding.compass import (
     disturbance,
 )
 from fusiond.configuration.aiding import CompassAiding
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.blocks import Block
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 CELL_DEG = 0.1
 LEAST_FIELD_NT = 6000.0
-"""Horizontal: below it lies the caution zone of the World Magnetic Model around its poles, where it
-warns of compasses."""
+"""Least horizontal field: the caution zone of the World Magnetic Model around its poles, where
+compasses are unreliable, lies below it."""
 _MODEL = "wmm/WMM_2025.COF"
 
 
@@ -67,8 +67,8 @@ def _declination(o: CompassAiding, sections: Sections) -> float | str:
 
 @lru_cache(maxsize=64)
 def declination(lat: int, lon: int, year: int, month: int) -> float | str:
-    """East of true north (rad), in the middle of a month, at a cell: so many `CELL_DEG` north of
-    the equator and east of Greenwich."""
+    """Declination east of true north (rad) in the middle of a month, at a cell of `CELL_DEG`
+    counted from the equator and Greenwich."""
     try:
         from pygeomag.geomag import GeoMag  # noqa: PLC0415  (extra `[compass]`)
     except ImportError:
@@ -85,7 +85,7 @@ def declination(lat: int, lon: int, year: int, month: int) -> float | str:
 
 
 def blocks(source: str, section: CompassAiding, sections: Sections) -> list[Block]:
-    """Deviation, and what disturbs for some seconds."""
+    """Blocks of the deviation, and of disturbances that last for seconds."""
     of_vehicle, passing = _names(source, section, sections)
     sd_rad = section.disturbance_sd_deg * DEG
     return [

@@ -44,20 +44,20 @@ FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
 """Quality of fixes by carrier phase against a base station."""
 PHASE_SD_M = 0.1
-"""Nor has code, whatever its corrections, a sigma this small: a tenth of the best chip's noise."""
+"""Least credible sigma of code, whatever the corrections: a tenth of the best chip's noise."""
 FIX_BIAS = "gnss_bias"
 PHASE_SHARE = 0.5
-"""Share of the stated variance of a fix by carrier phase that the next ones share, beside what each
-has of its own: multipath and what is left of the atmosphere last for minutes (115 s over baselines
-up to 10 km: Miller, O'Keefe, Gao, Time correlation in GNSS positioning over short baselines, J.
-Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided. It is a part of the state
-that fixes by code share, and so has that one's correlation time, `bias_correlation_s`: longer."""
+"""Share of a carrier-phase fix's stated variance that further fixes share, beside the noise of
+each: multipath and residual atmosphere last for minutes (115 s over baselines up to 10 km: Miller,
+O'Keefe, Gao, Time correlation in GNSS positioning over short baselines, J. Surv. Eng. 138, 2012).
+Receivers do not state the division of their sigma. The error is part of the state of code fixes and
+has its correlation time, `bias_correlation_s`, which is longer."""
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
 OPERATOR_GATE = 1.0 - 1e-9
 Motion = tuple[tuple[float, ...], tuple[float, ...]]
-"""Velocity (m/s) north, east, and down where it is measured, and one sigma of each."""
+"""Velocity (m/s) north, east, and down if measured, and one sigma of each."""
 
 
 class _Receiver(NamedTuple):
@@ -74,11 +74,12 @@ class _Receiver(NamedTuple):
     bias: tuple[str, ...]
     markov: str
     holds: bool
-    """True if the model has states for what its fixes share: its section is configured."""
+    """True if the model has states for the shared errors of its fixes: its section is configured.
+    """
     shares_stated: bool
-    """True if the section says what fixes share, beside what they state."""
+    """True if the section states the shared error of fixes."""
     shared_m: tuple[float, float]
-    """One sigma of the states of that, horizontal and down."""
+    """One sigma of the shared states, horizontal and down."""
 
 
 def _receiver(source: str, sections: Sections) -> _Receiver:
@@ -96,7 +97,7 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
 def measurements_of(
     m: PositionFix, sections: Sections, when: Instants
 ) -> list[AidingMeasurement] | str:
-    """Position, and velocity where it is measured and used.
+    """Position, and velocity if measured and used.
 
     `raw_is_used`: the receiver's raw data are the measurement, not its fixes.
     """
@@ -191,14 +192,14 @@ def _by_phase(m: PositionFix, sections: Sections) -> bool:
 
 
 def _by_dop(m: PositionFix, o: GnssAiding) -> Vector3:
-    """The range error times DOP, of a receiver that states nothing credible."""
+    """Sigmas from range error times DOP, for a receiver without credible ones."""
     error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
     horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
     return horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP)
 
 
 def _velocity(m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssAiding) -> Motion:
-    """North, east, and down where it is measured, and one sigma of each."""
+    """Velocity north, east, and down if measured, and one sigma of each."""
     north, east, down = v_ned
     v = (north, east) if down is None else (north, east, down)
     horizontal, rounding, sds = o.velocity_sd_m_s, m.rounding_sd_v_m_s, []
@@ -220,7 +221,7 @@ def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
 
 
 def _with_geoid(share: Vector3, geoid_sd_m: float, o: GnssAiding) -> Vector3:
-    """The same with what is not known of the geoid in a height above the sea, which fixes share."""
+    """Shares with the geoid's uncertainty in a height above the sea, which fixes share."""
     north, east, down = share
     return north, east, math.hypot(down, geoid_sd_m / o.bias_down_sd_m)
 
@@ -247,9 +248,8 @@ def _shares(
     sections: Sections,
     level_m: float,
 ) -> Shares | None:
-    """Division of a fix's variance, as this receiver's fixes and velocities have shown, those by
-    code and those by phase each; None of one that states no velocity with it. `level_m`: one sigma
-    of a horizontal axis."""
+    """Division of a fix's variance, as shown by this receiver's fixes and velocities, separately
+    for code and phase; None without velocities. `level_m`: one sigma of a horizontal axis."""
     known = sections.fix_errors.get((m.source, by_phase))
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants

@@ -1,4 +1,4 @@
-"""Heading, as two antennas or a compass measure it."""
+"""Heading from two antennas or a compass."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from drivers.measurements import Heading
 from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import HeadingAiding
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
 def measurements_of(m: Heading, sections: Sections, when: Instants) -> list[AidingMeasurement]:
-    """The heading, with the section's sigma where the device states none, and what rounding
-    adds."""
+    """Heading, with the section's sigma where the device states none, and its rounding error."""
     o = sections.of(m.source, HeadingAiding)
     sd_rad = math.hypot((m.sd_rad or o.sd_deg * DEG) * o.sigma_scale, m.rounding_sd_rad)
     # One receiver may send position and heading of the same instant: two names.

@@ -21,7 +21,7 @@ from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
 def measurements_of(m: Height, sections: Sections, when: Instants) -> list[AidingMeasurement] | str:
-    """The height, with the section's sigma where the device states none, and what rounding adds.
+    """Height, with the section's sigma where the device states none, and its rounding error.
 
     `weather_unknown`: a barometer's height is off by the weather, 100 m and more, for hours alike;
     without a section of kind `barometer`, whose states know that error, its sigma would be a lie.
@@ -52,7 +52,7 @@ def blocks(source: str, section: BarometerAiding, sections: Sections) -> list[Bl
 
 
 def _names(source: str, section: BarometerAiding, sections: Sections) -> tuple[str, str, str]:
-    """Its blocks, in that order."""
+    """Names of the source's blocks, in order."""
     return (
         sections.own(BAROMETER_OFFSET, source, section),
         sections.own(BAROMETER_SCALE, source, section),

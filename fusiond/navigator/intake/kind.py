@@ -19,7 +19,8 @@ S = TypeVar("S", bound=Aiding)
 
 
 class Instants(NamedTuple):
-    """Of a measurement: valid at `t_ns`, give or take `sd_time_s`, seen at `seen_ns` (0: then)."""
+    """Instants of a measurement: valid at `t_ns` with sigma `sd_time_s`, seen at `seen_ns` (0: at
+    `t_ns`)."""
 
     t_ns: int
     sd_time_s: float
@@ -27,7 +28,7 @@ class Instants(NamedTuple):
 
 
 def raw_receivers(aiding: Mapping[str, AnyAiding]) -> dict[str, RawGnss]:
-    """By name. Their code is imported where there is one: to load it takes a start's time."""
+    """Raw receivers by name, whose code is imported on demand since loading it is slow."""
     raw = {name: each for name, each in aiding.items() if isinstance(each, RawAiding)}
     if not raw:
         return {}
@@ -51,28 +52,28 @@ class Sections:
         self.place: tuple[float, float] | None = None
         """Latitude and longitude (rad) of the last fix."""
         self.by_code: set[tuple[str, int]] = set()
-        """Receivers and the qualities under which they have stated a sigma of code."""
+        """Receivers and the qualities of fixes for which they have stated a sigma of code."""
         self.fix_errors: dict[tuple[str, bool], FixErrors] = {}
-        """Of each receiver whose fixes share an error, by code or by phase."""
+        """Shared errors of each receiver's fixes, by code or by phase."""
         self.fixes_shown: Mapping[str, tuple[float, ...]] = {}
-        """The same of another drive, by `shown_as`."""
+        """Shared errors from another drive, by `shown_as`."""
         self.drifts: DriftLevels | None = None
         """Levels of typed drifts; without them all of each counts."""
         self.utc_ns: int | None = None
-        """The last instant that a fix's stamp said with its date (POSIX)."""
+        """Last dated instant of a fix's stamp (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
         """True if large residuals weigh less: by default none does."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
         self.made: dict[tuple[str, object], Any] = {}
-        """By source and maker: what the sections alone say of it, for all that comes of it."""
+        """Constants of a section by source and maker."""
 
     def drift_counts(self, block: str, t_ns: int) -> float:
         """Factor of a typed drift that counts for a measurement of `t_ns`."""
         return 1.0 if self.drifts is None else self.drifts.counts(block, t_ns)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
-        """`gate_probability` by section, of what comes from now on."""
+        """Set `gate_probability` by section for further measurements."""
         changed = {
             name: self.aiding[name].model_copy(update={"gate_probability": gate})
             for name, gate in gates.items()
@@ -84,7 +85,7 @@ class Sections:
             self.receivers[name].gate = gates[name]
 
     def of(self, source: str, kind: type[S]) -> S:
-        """The source's own section, else the one named after the kind, else its defaults."""
+        """Section of the source, else of the kind, else defaults."""
         section = self._found.get((source, kind))
         if not isinstance(section, kind):
             names = (source, str(kind.model_fields["kind"].default))
@@ -94,8 +95,7 @@ class Sections:
         return section
 
     def robust(self, source: str) -> bool:
-        """True if the section that a measurement of the source was made with, as `of` found it,
-        wants large residuals to weigh less."""
+        """True if the section of a measurement's source enables robust weights."""
         section: Aiding | None = self.aiding.get(source)
         if section is None:
             used = (found for (name, _), found in self._found.items() if name == source)

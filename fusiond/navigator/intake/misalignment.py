@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from fusiond.configuration.aiding import Misaligned
-from fusiond.configuration.settings import ARCSEC
+from fusiond.configuration.si_units import ARCSEC
 from fusiond.models.blocks import Block, misalignment
 from fusiond.navigator.intake.kind import Sections
 
@@ -19,7 +19,7 @@ def misalignment_block(block: str, source: str, section: Misaligned, sections: S
 
 
 def misalignment_blocks(block: str) -> Callable[[str, Misaligned, Sections], list[Block]]:
-    """Blocks that a source of the kind adds whose block is `block`."""
+    """Misalignment blocks of a source of the kind, named `block`."""
 
     def blocks(source: str, section: Misaligned, sections: Sections) -> list[Block]:
         name = misalignment_block(block, source, section, sections)

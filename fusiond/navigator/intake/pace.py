@@ -1,4 +1,4 @@
-r"""Rate limits of sources: what comes faster than its kind can is not believed.
+r"""Rate limits of sources: measurements faster than their kind allows are refused.
 
 A bucket of tokens for a source and kind of measurement:
 
@@ -44,10 +44,9 @@ RATES: Mapping[type, tuple[float, str]] = {
     Height: (200.0, "heights"),
     Bearing: (50.0, "bearings"),
 }
-"""The most that a source may send in a second, and what it sends."""
+"""Largest rate (measurements a second) and description of a source's kind."""
 BURST = 5.0
-"""As many at once are chance: stamps of arrival jitter, and a line that stood still for a moment
-hands over what has gathered."""
+"""Measurements allowed at once: arrival stamps jitter, and a line that paused delivers a burst."""
 CALM_NS = 1_000_000_000
 
 
@@ -60,7 +59,7 @@ class Pace:
         self._fast_ns: dict[tuple[str, type], int] = {}
 
     def refusal(self, m: Measurement | RawGnssEpoch, t_ns: int) -> str | None:
-        """`too_often`, or None where `m`, valid at `t_ns`, comes as its kind may."""
+        """Refusal `too_often`, or None if `m`, valid at `t_ns`, respects its kind's rate."""
         kind = type(m)
         if kind not in RATES:
             return None

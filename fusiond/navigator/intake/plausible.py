@@ -31,21 +31,22 @@ from drivers.raw.messages import RawGnssEpoch
 from fusiond.configuration.plausibility import Plausibility
 
 LATITUDE_RAD = (-math.radians(89.9), math.radians(89.9))
-"""Within 11 km of a pole north turns by a degree each 200 m: this navigation's axes end there."""
+"""Largest latitude, 11 km from a pole, where north turns by a degree each 200 m: the navigation
+frame ends there."""
 LONGITUDE_RAD = (-math.pi, 2.0 * math.pi)
 """Devices count from -180 to 180 or from 0 to 360 deg."""
 
 SIGMA_RAD = (1e-6, math.pi)
 """0.2 arcsec: the best star trackers state one arcsecond; beyond a half turn nothing is said."""
 LEAST_SPEED_SD_M_S = 1e-3
-"""A hundredth of what a good receiver or wheel sensor has."""
+"""Least credible sigma: a hundredth of a good receiver's or wheel sensor's."""
 LEAST_CLASS_M = 1.0
 """The precision classes of RDSS are 20 and 100 m."""
 
 
 def refusal(m: Measurement | RawGnssEpoch, limits: Plausibility) -> str | None:
-    """The name of why `m` cannot be true, None where it can. Raw ranges are held against theirs
-    satellite by satellite, by their decoder and by the range model."""
+    """Name of the implausible value in `m`; None if plausible. Raw ranges are checked satellite by
+    satellite, by their decoder and by the range model."""
     match m:
         case PositionFix():
             return (
@@ -113,7 +114,7 @@ def _speed(velocity: Iterable[float | None], limits: Plausibility) -> str | None
 
 
 def _sigma(stated: Iterable[float | None], limits: tuple[float, float]) -> str | None:
-    """0 is what devices print that know none."""
+    """Check a sigma, of which 0 means unknown on many devices."""
     refused, (least, most) = None, limits
     for s in stated:
         if s and not least <= s <= most:

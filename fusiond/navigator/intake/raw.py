@@ -7,7 +7,7 @@ import math
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
-from fusiond.configuration.settings import clock_noise
+from fusiond.configuration.si_units import clock_noise
 from fusiond.models.blocks import Block, carrier_blocks, clock_blocks, position_bias, shared_error
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
@@ -33,7 +33,8 @@ height. An epoch alone says little of them beyond their sigma. What lasts is in 
 
 
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
-    """A clock offset a system, drift, errors that ranges share, and the carriers' anchor."""
+    """Blocks of raw ranges: a clock offset for each system, drift, shared errors of ranges, and the
+    carrier anchor."""
     from fusiond.aiding.pseudorange import (  # noqa: PLC0415 - as fusiond.navigator.raw_gnss
         RANGE_BIAS,
         RANGE_SHARED,

@@ -27,7 +27,7 @@ _ERRORS = WHEEL_DRIFT, WHEEL_SCALE, WHEEL_LATENCY, WHEEL_ROUNDING
 
 
 def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[AidingMeasurement]:
-    """The speed, with the section's sigma where the device states none, and what rounding adds."""
+    """Speed, with the section's sigma where the device states none, and its rounding error."""
     o = sections.of(m.source, WheelAiding)
     sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
     drift, scale, latency, rounding = sections.each_own(_ERRORS, m.source, o)

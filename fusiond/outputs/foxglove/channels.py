@@ -24,7 +24,7 @@ from fusiond.outputs.topics import EVENT, EVENTS, NAV, REPLY, TOPICS, Topic
 
 _DIAGONAL_KNOWN = 2
 NO_HEIGHT_SD_M = 3464.0
-"""One sigma of an altitude of 0 where no height is known: roads are within 6 km of that."""
+"""Sigma of an altitude of 0 where no height is known: roads are within 6 km of it."""
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 _NUMBER = {"type": "number"}
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -64,7 +64,7 @@ _LOG = _object(
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One channel: `payload(message)` makes of a message of `topic` what is sent, None nothing.
+    """Channel: `payload(message)` converts a message of `topic`; None sends nothing.
 
     `schema()` is made when somebody asks for it: those of all topics take 0.05 s.
     """
@@ -96,7 +96,7 @@ def _json(value: dict[str, Any]) -> bytes:
 
 
 def location_fix(message: Message) -> bytes | None:
-    """`foxglove.LocationFix`; None without a dated position."""
+    """Convert `nav` to `foxglove.LocationFix`; None without a dated position."""
     if not isinstance(message, NavMessage) or not usable(message) or message.t_ms is None:
         return None
     sd = [known(x) for x in (message.sd_e_m, message.sd_n_m, message.sd_d_m)]
@@ -119,7 +119,7 @@ def location_fix(message: Message) -> bytes | None:
 
 
 def frame_transforms(message: Message) -> bytes | None:
-    """`foxglove.FrameTransforms`: the body's attitude in a frame that moves along with it."""
+    """Convert `nav` to `foxglove.FrameTransforms`: attitude in a frame that moves with the body."""
     if not isinstance(message, NavMessage) or not usable(message) or message.t_ms is None:
         return None
     angles = [known(x) for x in (message.roll_deg, message.pitch_deg, message.yaw_deg)]

@@ -1,4 +1,4 @@
-"""Serves Foxglove, Lichtblick and whoever speaks their WebSocket protocol; needs `websockets`.
+"""WebSocket server for Foxglove, Lichtblick and compatible viewers; needs `websockets`.
 
 A message is encoded once for all its viewers. Each viewer has a place for each of its
 subscriptions, in which a newer message replaces one that has not been sent: a slow one waits for
@@ -40,7 +40,7 @@ else:
     _MISSING = None
 
 MOST_VIEWERS = 32
-"""Each is a person who looks."""
+"""Most viewers, each of whom is a person."""
 MOST_EVENTS = 32
 """Events that may wait for the task; the latest of every other topic does."""
 ORIGIN_EVENT_S = 60.0
@@ -131,7 +131,7 @@ class FoxgloveServer:
         return Viewer(self, client)
 
     async def _distribute(self) -> None:
-        """From the places of the tick to those of the viewers."""
+        """Distribute messages from the tick's places to the viewers."""
         while True:
             await self._queued.wait()
             self._queued.clear()

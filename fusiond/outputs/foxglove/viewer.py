@@ -1,4 +1,4 @@
-"""One viewer's connection: the WebSocket, what it has subscribed to and what waits for it."""
+"""Connection of one viewer: WebSocket, subscriptions and waiting messages."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ if TYPE_CHECKING:
 
 PROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 MOST_SUBSCRIPTIONS = 4 * len(CHANNELS)
-"""Foxglove has one for each channel that its layout shows, whatever the number of its panels."""
+"""Most subscriptions; Foxglove has one for each displayed channel, whatever the number of panels.
+"""
 MOST_REQUEST_BYTES = 8192
 """Four subscriptions to every channel have 2.5 kB."""
 _SLICE_BYTES = 128
 """Handed to the parser at once: 21 of the smallest frames, between two looks at the allowance."""
 _ON_THEIR_WAY_BYTES = 8192
-"""As much as the kernel takes at once (SO_SNDBUF of a connection)."""
+"""Bytes that the kernel accepts at once (SO_SNDBUF of a connection)."""
 _DATA = struct.Struct("<BIQ")
 _OPCODE_DATA = 1
 _BY_ID = {channel.id: channel for channel in CHANNELS}
@@ -40,7 +41,7 @@ _LOG.setLevel(logging.CRITICAL)
 
 
 class Data(NamedTuple):
-    """A message as all its viewers get it."""
+    """Message as sent to every viewer."""
 
     t_ns: int
     payload: bytes
@@ -60,7 +61,7 @@ def loopback(origin: str) -> bool:
 
 
 class Viewer:
-    """`channels` counts its subscriptions to each."""
+    """Viewer; `channels` counts its subscriptions to each channel."""
 
     def __init__(self, server: FoxgloveServer, client: Client) -> None:
         self._server, self._client = server, client
@@ -79,7 +80,7 @@ class Viewer:
     # ------------------------------------------------------------------ to the viewer
 
     def put(self, channel: Channel, data: Data) -> None:
-        """A message for every subscription to its channel."""
+        """Queue a message for every subscription to its channel."""
         for number, subscribed in self._subscriptions.items():
             if subscribed is channel:
                 self._wait(number, data)
@@ -90,7 +91,7 @@ class Viewer:
         self._waiting[number] = data
 
     def _send_waiting(self) -> None:
-        """While little is on its way: a frame, made for this viewer alone."""
+        """Send waiting frames while little is in flight; frames are built for this viewer alone."""
         while (
             self._socket.state is OPEN
             and self._waiting
@@ -170,7 +171,7 @@ class Viewer:
             self._report(f'{{"op":"status","level":1,"message":"not understood: {why}"}}')
 
     def _carry_out(self, asked: Any) -> None:
-        """Raises `ValueError`, `TypeError` or `KeyError` for what is no request."""
+        """Execute a request. Raises `ValueError`, `TypeError` or `KeyError` for an invalid one."""
         if asked["op"] == "subscribe":
             wanted = [
                 (int(each["id"]), _BY_ID[each["channelId"]]) for each in asked["subscriptions"]

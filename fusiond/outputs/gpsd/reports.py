@@ -20,9 +20,9 @@ from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 
 PROTOCOL = (3, 14)
-"""Of gpsd 3.22."""
+"""Protocol version of gpsd 3.22."""
 _STATUS = {Mode.NAVIGATING: 6, Mode.COASTING: 5}
-"""STATUS_GNSSDR: satellites and dead reckoning; STATUS_DR: dead reckoning."""
+"""Status codes STATUS_GNSSDR (satellites and dead reckoning) and STATUS_DR (dead reckoning)."""
 _SYSTEMS = {"G": (0, 0), "E": (2, 300), "C": (3, 400)}
 """gnssid of u-blox, and where gpsd's own numbers start: GPS 1, Galileo 301, BeiDou 401."""
 _NO_FIX, _FIX_2D, _FIX_3D = 1, 2, 3
@@ -56,7 +56,7 @@ def version(release: str) -> Report:
 
 
 def device(path: str, activated: str | None) -> Report:
-    """The one device there is; `activated` is when it was, in UTC."""
+    """Report of the only device; `activated` is its start in UTC."""
     report = {"class": "DEVICE", "path": path, "driver": "fusiond", "activated": activated}
     return known_only(report)
 
@@ -107,7 +107,7 @@ def tpv(path: str, nav: NavMessage, geoid_separation_m: float | None) -> Report:
 
 
 def att(path: str, nav: NavMessage) -> Report | None:
-    """Attitude; None while it is not known."""
+    """Report of the attitude; None while unknown."""
     if not usable(nav) or known(nav.yaw_deg) is None:
         return None
     return {
@@ -122,7 +122,7 @@ def att(path: str, nav: NavMessage) -> Report | None:
 
 
 def gst(path: str, nav: NavMessage) -> Report | None:
-    """One sigma of position and velocity; None while there is no position."""
+    """Report of one sigma of position and velocity; None without a position."""
     if not usable(nav):
         return None
     return {
@@ -139,7 +139,7 @@ def gst(path: str, nav: NavMessage) -> Report | None:
 
 
 def sky(path: str, t_utc: str | None, seen: SkyHealth) -> Report:
-    """Satellites of the last epoch of a receiver's raw data, those that were refused as unused."""
+    """Report of the satellites of the last raw epoch; refused ones count as unused."""
     satellites = [_satellite(name, seen) for name in (*seen.used, *seen.refused)]
     return {
         "class": "SKY",

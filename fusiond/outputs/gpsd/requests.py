@@ -22,7 +22,7 @@ _ENDS = b";\r\n"
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """`?name` with its object; `argument` is None where there is none."""
+    """Request `?name` with its object; `argument` is None without one."""
 
     name: str
     argument: dict[str, Any] | None = None
@@ -36,7 +36,7 @@ class Malformed:
 
 
 class RequestReader:
-    """Takes what a client has sent, in pieces of any size."""
+    """Parser of a client's requests in pieces of any size."""
 
     def __init__(self) -> None:
         self._restart()

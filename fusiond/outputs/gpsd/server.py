@@ -144,7 +144,7 @@ class GpsdServer:
         return _Asking(self, client)
 
     def answer(self, watch: Watch, request: Request | Malformed) -> bytes:
-        """To one request; `watch` is what its client watches from now on."""
+        """Reply to a request; `watch` is the client's new subscription."""
         if isinstance(request, Request) and request.name == "POLL":
             self.counters["requests"] += 1
             return self._epoch.polled() if self._epoch is not None else encoded(_poll(None, {}))

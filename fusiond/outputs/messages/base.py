@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 Number = float | None
 LARGEST_INTEGER = 2**53 - 1
-"""Numbers that every reader of JSON takes as they were written (RFC 8259, section 6)."""
+"""Largest integer that every JSON reader preserves (RFC 8259, section 6)."""
 Count = Annotated[
     int,
     Field(ge=0),
@@ -30,7 +30,7 @@ def _within(low: float, high: float) -> WithJsonSchema:
 
 
 QuarterTurn = Annotated[float, _within(-90.0, 90.0)] | None
-"""Degrees, as those that follow: a latitude, a pitch."""
+"""Angle from -90 to 90 deg: a latitude, a pitch."""
 HalfTurn = Annotated[float, _within(-180.0, 180.0)] | None
 Turn = Annotated[float, _within(0.0, 360.0)] | None
 

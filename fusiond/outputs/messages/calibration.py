@@ -1,4 +1,4 @@
-"""`calibration`: mounting, lever arms, delays and scales as estimated."""
+"""Message `calibration`: estimated mounting, lever arms, delays and scales."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fusiond.outputs.messages.base import Message, stamp
 
 
 class CalibratedParameter(BaseModel):
-    """One parameter, in the unit that ends its name (none: a ratio)."""
+    """Calibrated parameter, in the unit at the end of its name (none: a ratio)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -31,7 +31,7 @@ class CalibrationMessage(Message):
 def calibration_message(
     utc_ns: int | None, parameters: Iterable[Parameter], settled: bool
 ) -> CalibrationMessage:
-    """`calibration` of what the navigator's watch has read; 1e-5 is 0.01 mm, 10 us, 0.04 arcsec."""
+    """Build `calibration` from the navigator's estimates; 1e-5 is 0.01 mm, 10 us, 0.04 arcsec."""
     t_utc, t_ms = stamp(utc_ns)
     return CalibrationMessage(
         t_utc=t_utc,

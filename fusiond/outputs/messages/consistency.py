@@ -1,4 +1,4 @@
-"""`consistency`: what the innovation tests say of each source's sigma."""
+"""Message `consistency`: results of the innovation tests of each source's sigma."""
 
 from __future__ import annotations
 

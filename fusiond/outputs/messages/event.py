@@ -1,4 +1,4 @@
-"""`event`: what an operator should know."""
+"""Message `event`: an operator's notice."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EventMessage(Message):
 
 
 def event_message(utc_ns: int | None, *, source: str, code: str, text: str) -> EventMessage:
-    """Event with level and advice of its code."""
+    """Build an event with level and advice of its code."""
     t_utc, t_ms = stamp(utc_ns)
     level, _, advice = entry_of(code)
     return EventMessage(

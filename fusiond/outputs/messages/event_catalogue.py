@@ -14,7 +14,7 @@ Level = Literal["info", "warning", "error"]
 
 
 class Entry(NamedTuple):
-    """One code; `advice` is the operator's next step, empty where there is nothing to do."""
+    """Event code; `advice` is the operator's next step, empty if none is needed."""
 
     level: Level
     meaning: str
@@ -22,7 +22,7 @@ class Entry(NamedTuple):
 
 
 def info(meaning: str, advice: str = "") -> Entry:
-    """Entry of something that is as it should be, or needs no haste."""
+    """Entry of a normal event, or one without urgency."""
     return Entry("info", meaning, advice)
 
 

@@ -1,4 +1,4 @@
-"""`events`: the last of `event`, for whoever comes later."""
+"""Message `events`: recent events for a later subscriber."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ class EventsMessage(Message):
 
 
 def events_message(events: Sequence[EventMessage]) -> EventsMessage:
-    """`events` of at least one event, in the order in which they happened."""
+    """Build `events` of at least one event, in order of occurrence."""
     last = tuple(events[-MOST_KEPT:])
     return EventsMessage(t_utc=last[-1].t_utc, t_ms=last[-1].t_ms, events=last)

@@ -1,4 +1,4 @@
-"""A fault that has been identified, as an object of `health` and `status`."""
+"""Identified fault, as an object of `health` and `status`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fusiond.outputs.messages.base import Number
 
 
 class FaultReport(BaseModel):
-    """One fault that is not over: what, how much, since when, how sure, what is done about it."""
+    """Active fault: kind, size, start, odds and action."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,4 +1,4 @@
-"""`fleet/<card>`: where another vehicle is, by its own report or by the centre."""
+"""Message `fleet/<card>`: position of another vehicle, by its own report or by the centre."""
 
 from __future__ import annotations
 

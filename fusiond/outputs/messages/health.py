@@ -1,4 +1,4 @@
-"""`health`: the devices and the outputs by name, the scheduler, the clock and the process."""
+"""Message `health`: devices and outputs by name, scheduler, clock and process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fusiond.outputs.messages.fault import FaultReport
 
 
 class SatelliteHealth(BaseModel):
-    """One satellite of that epoch."""
+    """Satellite of the last epoch."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -60,7 +60,7 @@ class BeamHealth(BaseModel):
 
 
 class SourceHealth(BaseModel):
-    """One device: what it is doing, and what became of its measurements."""
+    """Device: state and outcomes of its measurements."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -91,7 +91,7 @@ class SourceHealth(BaseModel):
 
 
 class OutputHealth(BaseModel):
-    """One way out: what it is doing, and what became of what it was given."""
+    """Output: state and outcomes of its messages."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -111,7 +111,7 @@ class SchedulerStatus:
     lateness_max_ms: float
     lateness_sum_s: float
     lateness_at_most: tuple[tuple[float, int], ...]
-    """Ticks that were no later than so many seconds, cumulative."""
+    """Cumulative count of ticks with at most this latency (s)."""
     gc_collections: int
     gc_forced: int
     gc_max_ms: float

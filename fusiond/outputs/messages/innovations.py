@@ -1,4 +1,4 @@
-"""`innovations`: how the latest measurements ended when the filter met them."""
+"""Message `innovations`: outcomes of the latest measurements in the filter."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from fusiond.outputs.messages.base import Count, Message, Milliseconds, Number, 
 
 
 class Innovation(BaseModel):
-    """One measurement. A late measurement rewinds the filter: a measurement after it comes again,
-    with the same source and `t_ms`, and the last one counts."""
+    """Innovation of one measurement. After a rewind by a delayed measurement, later measurements
+    come again with the same source and `t_ms`; the last one counts."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -23,7 +23,7 @@ class Innovation(BaseModel):
 
 
 class InnovationsMessage(Message):
-    """Those since the last message, in the order of their validity."""
+    """Innovations since the last message, in order of validity."""
 
     innovations: tuple[Innovation, ...]
 
@@ -31,6 +31,6 @@ class InnovationsMessage(Message):
 def innovations_message(
     utc_ns: int | None, innovations: Iterable[Innovation]
 ) -> InnovationsMessage:
-    """`innovations` of what has ended since the last."""
+    """Build `innovations` of the measurements since the last message."""
     t_utc, t_ms = stamp(utc_ns)
     return InnovationsMessage(t_utc=t_utc, t_ms=t_ms, innovations=tuple(innovations))

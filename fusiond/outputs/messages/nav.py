@@ -1,4 +1,4 @@
-"""`nav`: the solution with its sigma."""
+"""Message `nav`: the solution with its sigma."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class NavMessage(Message):
 
 
 def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
-    """`nav` of a solution whose instant is `utc_ns`; 1e-9 deg is 0.1 mm."""
+    """Build `nav` of a solution whose instant is `utc_ns`; 1e-9 deg is 0.1 mm."""
     t_utc, t_ms = stamp(utc_ns)
     s = solution
     return NavMessage(

@@ -1,4 +1,4 @@
-"""`reply`: the answer to a command."""
+"""Message `reply`: the result of a command."""
 
 from __future__ import annotations
 

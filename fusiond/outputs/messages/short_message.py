@@ -1,4 +1,4 @@
-"""`message`: a short message of an RDSS terminal, one of ours on its way or one that came."""
+"""Message `message`: a sent or received short message of an RDSS terminal."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ShortMessage(Message):
 
 
 def of_stage(stage: MessageStage, serial: int, utc_ns: int | None) -> ShortMessage:
-    """`message` of one of ours that has come so far."""
+    """Build `message` of a sent short message at its present stage."""
     t_utc, t_ms = stamp(utc_ns)
     return ShortMessage(
         t_utc=t_utc,

@@ -1,4 +1,4 @@
-"""`status`: what the solution is worth, and the counters since the daemon started."""
+"""Message `status`: navigation status, and counters since the daemon's start."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StatusMessage(Message):
 
 @dataclass(frozen=True, slots=True)
 class DaemonState:
-    """State of the daemon beside its solution; the defaults are those before the first tick.
+    """State of the daemon beside its solution; defaults: before the first tick.
 
     `since_utc_ns`: when the mode began; `mqtt`: the publisher's counters.
     """

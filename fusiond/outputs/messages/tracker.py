@@ -1,4 +1,4 @@
-"""`tracker`: where the vehicle is, seldom, by the names that Home Assistant gives its trackers."""
+"""Message `tracker`: the vehicle's position, seldom, in Home Assistant's terms."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from drivers.can.python_can import can
 
 
 class CanEncoder:
-    """Encodes what `decoder` takes apart; no bus and no clock."""
+    """Encoder, the inverse of `decoder`; no bus and no clock."""
 
     def __init__(self, decoder: CanDecoder[Any], source_address: int | None = None) -> None:
         # The bus carries the lowest identifier first.

@@ -1,4 +1,4 @@
-"""An IMU on a CAN bus, by the options of the driver that will read its frames."""
+"""IMU on a CAN bus, by the options of the driver that reads its frames."""
 
 from __future__ import annotations
 

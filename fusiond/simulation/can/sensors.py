@@ -61,7 +61,7 @@ SIM_BAROMETER = CanHeightOptions(
 
 
 class CanSensor:
-    """One sensor's epochs, sent on the bus as their time comes; it has the bus for itself."""
+    """Sender of one sensor's epochs on time, with a bus of its own."""
 
     def __init__(
         self,
@@ -77,13 +77,13 @@ class CanSensor:
         self._next = 0
 
     def plug(self) -> None:
-        """Put it (back) on the bus. Raises OSError, can.CanError."""
+        """Connect to the bus. Raises OSError, can.CanError."""
         if self._bus is None:
             interface, channel = self._where
             self._bus = can.Bus(interface=interface, channel=channel)
 
     def unplug(self) -> None:
-        """Take it off the bus: it falls silent."""
+        """Disconnect from the bus, which silences the sensor."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
@@ -95,7 +95,7 @@ class CanSensor:
         return float(arrivals[self._next]) if self._next < len(arrivals) else float("inf")
 
     def serve(self, t_s: float, counters: Counter[str]) -> None:
-        """Send what is due at `t_s`; counts `NAME_frames`, `NAME_lost`, `NAME_unplugged`."""
+        """Send the epochs due at `t_s`; counts `NAME_frames`, `NAME_lost`, `NAME_unplugged`."""
         while self.next_s <= t_s:
             k, self._next = self._next, self._next + 1
             if self._bus is None:
@@ -117,7 +117,7 @@ def can_sensors(
     seed: int,
     bus: tuple[str, str],
 ) -> dict[str, CanSensor]:
-    """The devices on board, by name (`star_tracker`, `sar`), on the bus (interface, channel)."""
+    """Devices on board by name (`star_tracker`, `sar`), on the bus (interface, channel)."""
     star_rng, sar_rng = sensor_streams(seed)
     devices = {}
     if star is not None:

@@ -51,7 +51,7 @@ def canyon(satellites: int | None = None, start_s: float = 0.0, length_s: float 
 
 
 def tunnel(start_s: float, length_s: float) -> Mask:
-    """Nothing comes through."""
+    """Mask of a tunnel, which blocks every signal."""
     return Mask("tunnel", start_s, length_s)
 
 

@@ -23,7 +23,7 @@ SEMICIRCLE = math.pi
 
 
 class Field(NamedTuple):
-    """One number on the wire."""
+    """Number in the message."""
 
     bits: int
     scale: float
@@ -122,7 +122,7 @@ def _accuracy_index(accuracy_m: float) -> int:
 
 
 def quantised(ephemeris: Ephemeris) -> Ephemeris:
-    """The ephemeris as a receiver decodes it from its message. Raises ValueError as `wire`."""
+    """Ephemeris after encoding and decoding. Raises ValueError as `wire`."""
     system, numbers = ephemeris.system, wire(ephemeris)
     values: dict[str, Any] = {
         name: f.decode(numbers.raw[name]) for name, f in FIELDS[system].items()
@@ -159,7 +159,7 @@ class Bits:
         return self
 
     def words(self, lengths: Iterable[int]) -> list[int]:
-        """Cut into words of these lengths. Raises ValueError unless they add up."""
+        """Split into words of these lengths. Raises ValueError unless they add up."""
         lengths = list(lengths)
         if sum(lengths) != self.length:
             raise ValueError(f"{self.length} bits, not {sum(lengths)}")

@@ -1,4 +1,4 @@
-r"""Navigation messages as a receiver hands them out: GPS LNAV, BeiDou D1 and D2, with their parity.
+r"""Navigation messages in a receiver's output: GPS LNAV, BeiDou D1 and D2, with parity.
 
     LNAV   subframe of 10 words, 24 data and 6 parity bits, Hamming (32, 26); 300 bits in 6 s
     D1     subframe of 10 words, word 1: 26 + 4, others 22 + 8; BCH (15, 11, 1), g = x^4 + x + 1;
@@ -25,7 +25,7 @@ LNAV_PREAMBLE = 0b10001011
 BEIDOU_PREAMBLE = 0b11100010010
 LNAV_PERIOD_S = 6
 D2_PERIOD_S = 3
-"""From one page of D2 subframe 1 to the next."""
+"""Interval of the pages of D2 subframe 1."""
 LEAP_SECONDS = 18
 """GPST - UTC since 2017-01-01, for the UTC part of LNAV page 18."""
 
@@ -187,7 +187,7 @@ def d2(
 
 
 def _split(w: Wire, name: str, upper: int, reserved: int) -> tuple[tuple[int, int], ...]:
-    """A field with its upper bits at the end of a page, `reserved` bits, its rest on the next."""
+    """Field with its upper bits at the end of a page, `reserved` bits, the rest on the next."""
     bits, value = FIELDS[w.system][name].bits, w.raw[name]
     low = bits - upper
     return (value >> low, upper), (0, reserved), (value & ((1 << low) - 1), low)

@@ -66,8 +66,8 @@ from fusiond.simulation.markov import gauss_markov, smooth_markov
 Array = NDArray[np.float64]
 
 START = (2400, 0.0)
-"""GPS week and second at the trajectory's 0 unless told: 2026-01-04, so that t_s is the second of
-the week, as in recorded drives."""
+"""Default GPS week and second at the trajectory's 0: 2026-01-04, so that t_s is the second of the
+week, as in recorded drives."""
 LEAP_SECONDS = 18
 _MS_M = SPEED_OF_LIGHT_M_S * 1e-3
 
@@ -78,9 +78,9 @@ GPS_ALPHA = (1.4e-8, 1.5e-8, -6.0e-8, -1.2e-7)
 GPS_BETA = (1.05e5, 9.8e4, -6.5e4, -3.3e5)
 BEIDOU_ALPHA = (2.4e-8, 4.5e-8, -3.0e-7, 4.2e-7)
 BEIDOU_BETA = (1.25e5, -3.3e4, 1.3e5, 1.3e5)
-"""Broadcast models of the same sky that miss by a third or so at noon."""
+"""Broadcast ionosphere of the same sky, in error by about a third at noon."""
 LEAST_IONOSPHERE = 0.1
-"""Of an ordinary day's: there is always some."""
+"""Least ionosphere, as a share of an ordinary day's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ class GnssRawOptions:
     signal_in_space_correlation_s: float = 1800.0
     wet_delay_sd_m: float = 0.04
     ionosphere_sd: float = 0.0
-    """Of the day's ionosphere, as a share of an ordinary one: models leave half of it."""
+    """One sigma of the day's ionosphere, as a share of an ordinary one: models leave half of it."""
     clock_offset_sd_m: float = 3000.0
     clock_drift_constant_sd_m_s: float = 20.0
     clock_drift_sd_m_s: float = 0.5
@@ -110,13 +110,13 @@ class GnssRawOptions:
     clock_noise_m_sqrt_s: float = 0.05
     inter_system_sd_m: float = 5.0
     reflections_per_hour: float = 0.0
-    """Rate at which a satellite begins to come by a wall alone, and no longer straight."""
+    """Rate at which a satellite's direct signal is lost and only a reflection remains."""
     reflection_m: tuple[float, float] = (3.0, 60.0)
-    """Length that its way has more then: uniform in the logarithm."""
+    """Additional path length of a reflection: uniform in the logarithm."""
     reflection_s: float = 20.0
     """Duration, in the mean; exponential."""
     latency_s: tuple[float, float] = (0.05, 0.1)
-    """From an epoch to its last byte, uniform."""
+    """Delay from an epoch to its last byte, uniform."""
 
     @property
     def systems(self) -> tuple[System, ...]:
@@ -221,8 +221,8 @@ class GnssRaw:
         self._reset = np.diff(whole, prepend=whole[:1]) != 0.0
 
     def begin(self, week: int, tow_s: float, sky: tuple[int, float] | None = None) -> None:
-        """Set GPS time at the trajectory's 0, and where the satellites stand then: as at GPS time
-        `sky`, if that is not the same."""
+        """Set GPS time at the trajectory's 0, and the satellites' positions: those of GPS time
+        `sky`, if different."""
         o = self.options
         self.start = week, tow_s
         sky_week, sky_tow_s = sky or self.start
@@ -238,7 +238,7 @@ class GnssRaw:
         return len(self.t_s)
 
     def broadcast(self, t_s: float, satellites: set[tuple[System, int]]) -> list[Ephemeris]:
-        """Messages of satellites (system, PRN) at `t_s`, as their messages carry it."""
+        """Messages of satellites (system, PRN) at `t_s`, as broadcast."""
         week, tow_s = self.gps_time(t_s)
         return [
             quantised(ephemeris(slot, week, tow_s, self._epoch_s))
@@ -252,8 +252,8 @@ class GnssRaw:
         return self.start[0] + int(weeks), tow_s
 
     def sky(self, k: int) -> tuple[Array, Array, Array, Array, Array]:
-        """Of all satellites at epoch `k`: azimuth, elevation (rad), range m, rate m/s, clock (n, 2)
-        in m and m/s."""
+        """All satellites at epoch `k`: azimuth, elevation (rad), range m, rate m/s, clock (n, 2) in
+        m and m/s."""
         week, tow_s = self.start[0], self.start[1] + float(self.t_s[k])
         tow_s -= float(self.clock_m[k]) / SPEED_OF_LIGHT_M_S
         lat, lon, height = (float(x) for x in self._antenna(k))

@@ -37,7 +37,7 @@ from fusiond.simulation.gnss.raw import GnssRaw
 
 RawFormat = Literal["ubx", "rtcm3"]
 FRAME_S = 30
-"""A frame of LNAV and D1, ten pages of D2 subframe 1, and how often RTCM ephemerides come."""
+"""Interval of a frame of LNAV and D1, of ten pages of D2 subframe 1, and of RTCM ephemerides."""
 
 
 class GnssRawStream:
@@ -64,11 +64,11 @@ class GnssRawStream:
         return data
 
     def repeat(self) -> None:
-        """Forget what was sent: all messages in view are due at once again, if they ever were."""
+        """Repeat all broadcast messages in view at once."""
         self._warm = self._is_warm
 
     def _locks_ms(self, k: int, signals: tuple[RawSignal, ...]) -> list[int]:
-        """For how long each signal has been tracked; one that was away starts anew."""
+        """Tracking time of each signal; it restarts after a loss."""
         now = float(self.receiver.t_s[k])
         names = [(s.satellite, s.signal) for s in signals]
         self._locked_s = {name: self._locked_s.get(name, now) for name in names}
@@ -106,7 +106,7 @@ class GnssRawStream:
     def _blocks(
         self, satellite: Ephemeris, before: float, now: float, everything: bool
     ) -> Iterator[tuple[int, ...]]:
-        """Blocks that ended after `before` and not after `now`, or a whole frame just over."""
+        """Blocks that ended after `before` and not after `now`, or a whole frame just completed."""
         period = D2_PERIOD_S if satellite.message == "d2" else LNAV_PERIOD_S
         system = satellite.system
         week, own_now = system_time(system, *self.receiver.gps_time(now))
@@ -124,7 +124,7 @@ class GnssRawStream:
                 yield frame[place]
 
     def _frame(self, satellite: Ephemeris, week: int, begin: int) -> tuple[tuple[int, ...], ...]:
-        """All blocks of the frame that begins at second `begin` of the system's own week.
+        """Blocks of the frame that begins at second `begin` of the system's own week.
 
         Made once, with the ephemeris of its first block: a frame holds no two.
         """

@@ -58,7 +58,7 @@ class GnssOptions:
 
 @dataclass(frozen=True, slots=True)
 class GnssFix:
-    """One epoch: validity and arrival (s of the trajectory), degrees, m, m/s; NED sigmas."""
+    """Epoch: validity and arrival (s of the trajectory), degrees, m, m/s; NED sigmas."""
 
     t_s: float
     t_arrival_s: float
@@ -102,7 +102,7 @@ class GnssReceiver:
 
     @property
     def sd_ned_m(self) -> Vector3:
-        """One sigma of a fix, north, east, down, as GST states it."""
+        """One sigma of a fix, north, east, down, as stated by GST."""
         o = self.options
         h = math.hypot(o.white_sd_m[0], o.correlated_sd_m[0])
         return h, h, math.hypot(o.white_sd_m[1], o.correlated_sd_m[1])
@@ -184,13 +184,13 @@ class GnssReceiver:
 
 
 def sentence(fields: Iterable[str]) -> bytes:
-    """`$fields*checksum` with the XOR of what stands between `$` and `*`."""
+    """Format `$fields*checksum` with the XOR of the characters between `$` and `*`."""
     body = ",".join(fields).encode("ascii")
     return b"$%s*%02X\r\n" % (body, reduce(xor, body))
 
 
 def _minutes(degrees: float, width: int) -> str:
-    """ddmm.mmmmmmm: seven decimals are 0.2 mm; rounding carries into the degrees."""
+    """Format ddmm.mmmmmmm: seven decimals are 0.2 mm; rounding carries into the degrees."""
     units = round(abs(degrees) * 600_000_000)
     whole, rest = divmod(units, 600_000_000)
     return f"{whole:0{width}d}{rest // 10_000_000:02d}.{rest % 10_000_000:07d}"

@@ -64,7 +64,7 @@ def crc24q(data: bytes) -> int:
 
 
 def frame(message: Bits) -> bytes:
-    """One RTCM 3 frame."""
+    """Encode one RTCM 3 frame."""
     payload = message.to_bytes()
     body = bytes((PREAMBLE,)) + len(payload).to_bytes(2, "big") + payload
     return body + crc24q(body).to_bytes(3, "big")
@@ -105,7 +105,7 @@ def ephemeris_frame(ephemeris: Ephemeris) -> bytes:
 
 
 def msm7(epoch: RawGnssEpoch, locks_ms: Sequence[int], station: int = 0) -> bytes:
-    """All frames of an epoch; `locks_ms` (n,) since when each signal is tracked.
+    """Frames of an epoch; `locks_ms` (n,): tracking time of each signal.
 
     A system without a signal sends none. Raises ValueError for more than 64 satellite and signal
     pairs of a system, KeyError for a signal without a place in the mask.
@@ -183,6 +183,6 @@ def _rate(s: RawSignal, rough_m_s: int | None) -> int:
 
 
 def _lock(lock_ms: int) -> int:
-    """DF407: 2^n (i - 32 n) <= lock_ms, n such that i - 32 n is 32 to 63."""
+    """Lock indicator DF407: 2^n (i - 32 n) <= lock_ms, n such that i - 32 n is 32 to 63."""
     n = max(0, lock_ms.bit_length() - 6)
     return min(_MAX_LOCK, (lock_ms >> n) + 32 * n)

@@ -35,7 +35,7 @@ _MAX_LOCK_MS = 64_500
 
 
 def frame(message_class: int, message_id: int, payload: bytes) -> bytes:
-    """One UBX frame."""
+    """Encode one UBX frame."""
     body = struct.pack("<BBH", message_class, message_id, len(payload)) + payload
     a = b = 0
     for byte in body:
@@ -50,7 +50,7 @@ def signal_id(system: System, prn: int, signal: str) -> int:
 
 
 def sfrbx(system: System, prn: int, words: Sequence[int]) -> bytes:
-    """RXM-SFRBX with a subframe heard on GPS L1 C/A or BeiDou B1I."""
+    """RXM-SFRBX with a subframe received on GPS L1 C/A or BeiDou B1I."""
     broadcast_on = {"G": "1C", "C": "2I", "E": "1C"}[system]
     head = (
         GNSS_ID[system],

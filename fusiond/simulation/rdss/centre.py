@@ -33,13 +33,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class RdssOptions:
-    """The terminal, its card and the errors of the centre's answers; one sigma, each axis."""
+    """Terminal, card and errors of the centre's replies; one sigma on each axis."""
 
     family: Family = "4.0"
     user: int = 242286
     service_frequency_s: int = 10
     comm_level: int = 3
-    """Of the card: how long a message may be; 0 allows none."""
+    """Communication level of the card, which limits a message's length; 0 allows none."""
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     precision_class_m: Literal[20, 100] = 20
     error_sd_m: float | None = None
@@ -47,33 +47,34 @@ class RdssOptions:
     satellites_deg: tuple[float, float] = LONGITUDES_DEG
     """Longitudes of the two geostationary satellites, east positive."""
     range_sd_m: float = 15.3
-    """Of a slant range after differential correction, as the paper's 8 and 13 m are together."""
+    """One sigma of a slant range after differential correction: the paper's 8 and 13 m together."""
     error_correlation_s: float = 0.0
     """Correlation time of the error between fixes; 0: independent."""
     height_sd_m: float = 10.0
     """Error of the centre's terrain model, used when the request gives no height."""
     height_anomaly_m: float = -14.0
     response_s: float = 0.05
-    """From the request's last byte to the burst: the instant the fix is for."""
+    """Time from the request's last byte to the burst, the instant of the fix."""
     delay_s: tuple[float, float] = (0.6, 5.0)
     """Least and greatest time from the burst to the fix on the serial line."""
     mean_delay_s: float | None = 1.5
     """Mean of the delay, which is exponential above its least value; None: the delay is uniform."""
     reply_s: float = 0.05
-    """From a command to its answer or feedback."""
+    """Time from a command to its reply or feedback."""
     zone_h: int = 0
-    """Zone of the time of day of fixes and of SJXX, 0 (UTC) or 8; BDZDA prints UTC (NMEA 0183)."""
+    """Time zone of the time of day of fixes and of SJXX, 0 (UTC) or 8; BDZDA prints UTC (NMEA
+    0183)."""
     fraction_s: float = 0.01
     """Unit of the fraction byte of family 4.0: 0.01 or 0.1."""
     bds3_feedback: bool = False
     """BDFKI in the BDS-3 form (family 2.1)."""
     drop_probability: float = 0.0
-    """A request left the antenna and nothing comes back."""
+    """Probability that a request leaves the antenna without a reply."""
     refuse_probability: float = 0.0
     """A request is refused by chance: no beam at this moment or, as often, the service frequency
     is not reached because another host of the card has used it."""
     mute_probability: float = 0.0
-    """A request or a message is swallowed by a terminal that is busy: no feedback, no burst."""
+    """Probability that a busy terminal swallows a request or message: no feedback, no burst."""
     convoy: bool = False
     """True for a convoy: another vehicle reports its place, sends texts and confirms those that ask
     for it (simulation.rdss.network)."""
@@ -83,7 +84,7 @@ class RdssOptions:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedFix:
-    """A fix on its way: instants in s of the trajectory; position in degrees and metres."""
+    """Fix under way: instants in s of the trajectory; position in degrees and metres."""
 
     t_s: float
     t_arrival_s: float
@@ -139,7 +140,7 @@ class RdssCentre:
         )
 
     def _horizontal(self, place: Array, height_error_m: float) -> Array:
-        """Error (2,) north and east at a geodetic place (3,), of the fix's height error."""
+        """Error (2,) north and east at a geodetic position (3,), from the fix's height error."""
         o = self._options
         if o.error_sd_m is not None:
             return o.error_sd_m * self._unit
@@ -153,25 +154,25 @@ class RdssCentre:
         return np.linalg.cholesky(beside_height) @ self._unit + by.height * height_error_m
 
     def dropped(self) -> bool:
-        """True if this request is lost on the way."""
+        """True if this request is lost."""
         return bool(self._rng.random() < self._options.drop_probability)
 
     def mute(self) -> bool:
-        """True if the terminal says nothing to this one."""
+        """True if the terminal ignores this request."""
         p = self._options.mute_probability
         return p > 0.0 and bool(self._rng.random() < p)
 
     def refused(self) -> Literal["no_beam", "other_host"] | None:
-        """True if and why this request is refused by chance."""
+        """Reason why this request is refused by chance; falsy for none."""
         p = self._options.refuse_probability
         if p == 0.0 or self._rng.random() >= p:
             return None
         return "no_beam" if self._rng.random() < 0.5 else "other_host"
 
     def other_burst_s(self, t_s: float) -> float:
-        """Instant of the other host's burst: what is left to wait is whole seconds."""
+        """Instant of the other host's burst; the remaining wait is in whole seconds."""
         return t_s - float(self._rng.integers(0, self._options.service_frequency_s))
 
     def foreign(self) -> bool:
-        """True if somebody else's fix comes along with this one."""
+        """True if another card's fix arrives with this one."""
         return bool(self._rng.random() < self._options.foreign_probability)

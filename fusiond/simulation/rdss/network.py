@@ -1,4 +1,4 @@
-"""Short messages between simulated cards: a delay, losses, damage, and a vehicle of a convoy.
+"""Simulated short messages between cards: delay, loss, damage, and another vehicle of a convoy.
 
 A terminal that joins has its messages carried to the card that they name; what is for a card that
 nobody has is counted and lost, as it is in the real network.
@@ -44,7 +44,7 @@ class MessageNetwork:
     _terminals: dict[int, RdssTerminal] = field(default_factory=dict)
 
     def join(self, terminal: RdssTerminal) -> None:
-        """Carry this terminal's messages, and others' to it."""
+        """Connect a terminal, whose messages are carried to and from others."""
         self._terminals[terminal.options.user] = terminal
         terminal.carry = self.carry
 
@@ -87,7 +87,7 @@ class ConvoyVehicle:
         ahead.carry = self._receive
 
     def tick(self, t_s: float) -> None:
-        """Say what is due."""
+        """Deliver due messages."""
         if t_s >= self._next_report_s:
             self._next_report_s = t_s + self.REPORT_S
             self._say(carried(sealed(REPORT, encode_report(self._report(t_s))), "binary"), t_s)

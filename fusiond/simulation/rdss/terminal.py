@@ -1,4 +1,4 @@
-"""An RDSS user terminal as its host sees it, in both wire families; no I/O and no clock.
+"""RDSS user terminal as its host sees it, in both wire families; no I/O and no clock.
 
 `receive` takes what the host wrote, `take` hands out what the terminal has said by an instant. A
 position request that is accepted is answered by a feedback and, 0.6 to 5 s later, by the position
@@ -98,7 +98,7 @@ class RdssTerminal:
     # ------------------------------------------------------------------ bytes and instants
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take what the host wrote by the instant `t_s`."""
+        """Receive the host's bytes up to the instant `t_s`."""
         for message in self._decoder.feed(data):
             self.counters[type(message).__name__] += 1
             self._answer(message, t_s)
@@ -137,7 +137,7 @@ class RdssTerminal:
         self._say(t_s + self.options.reply_s, notice)
 
     def hand_over(self, text: Text, due_s: float) -> None:
-        """A message has come for this card; it is printed with the centre's time."""
+        """Deliver a message for this card; it is printed with the centre's time."""
         local = self._local(due_s, self.options.zone_h)
         self.counters["texts"] += 1
         self._say(due_s, replace(text, minute_of_day=local.hour * 60 + local.minute))
@@ -151,7 +151,7 @@ class RdssTerminal:
     def _repeat(
         self, name: str, t_s: float, period_s: int, action: Callable[[float], None]
     ) -> None:
-        """Do it now and, where a period is given, again and again."""
+        """Execute an action now and, with a period, repeatedly."""
         self._periodic.pop(name, None)
         action(t_s)
         if period_s > 0:
@@ -232,7 +232,7 @@ class RdssTerminal:
         return _EPOCH + timedelta(milliseconds=10 * hundredths)
 
     def _refusal(self, t_s: float) -> tuple[Outcome, float | None] | None:
-        """Reason why nothing can be sent, in the order in which a terminal looks."""
+        """Reason why nothing can be sent, in the terminal's order of checks."""
         binary = self.options.family == "4.0"
         if self.silent:
             return (Outcome.SILENCE_OR_LIFTED if binary else Outcome.SILENCE), None

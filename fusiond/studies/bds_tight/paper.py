@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
@@ -54,7 +54,7 @@ Array = NDArray[np.float64]
 WEST_M, UP_M = 200.0, 40.0
 REST_S, RAMP_S, TURN_S, WINDING_DEG = 20.0, 20.0, 40.0, 40.0
 SPEED_M_S, CLIMB_DEG = 0.525688, 10.05798
-"""With these it ends 200.0 m west and 40.0 m up, 3.4 m north."""
+"""Speed and climb of a path that ends 200.0 m west and 40.0 m up, 3.4 m north."""
 IMU = Imu(
     rate_hz=RATE_HZ,
     gyro_noise_deg_sqrt_h=0.05,
@@ -106,7 +106,7 @@ COLUMNS = {
 
 
 def way() -> Path:
-    """The way from the origin to 200 m west and 40 m up, winding."""
+    """Winding path from the origin to 200 m west and 40 m up."""
     end = DURATION_S - REST_S - RAMP_S
     begin = REST_S + RAMP_S
     turns = np.arange(begin, end, TURN_S)
@@ -122,7 +122,7 @@ def way() -> Path:
 
 @lru_cache(maxsize=1)
 def truth() -> Truth:
-    """That way, sampled at the IMU's rate."""
+    """Truth of that path, sampled at the IMU's rate."""
     lat, lon, height = ORIGIN_DEG_M
     return Truth(way(), (lat * DEG, lon * DEG, height), RATE_HZ, DURATION_S)
 
@@ -234,12 +234,12 @@ def _figures(traces: Sequence[Trace], counted: NDArray[np.bool_]) -> dict[str, A
 
 
 def _rms(errors: Array) -> float:
-    """Of the lengths of the vectors (n, k) that are there."""
+    """RMS length of the finite vectors (n, k)."""
     return math.sqrt(float(np.nanmean(np.square(errors).sum(axis=1))))
 
 
 def _course(traces: Sequence[Trace]) -> dict[str, list[float | None]]:
-    """Root mean square over the runs of position, velocity and heading at each epoch."""
+    """RMS over the runs of position, velocity and heading at each epoch."""
     error = np.array([t.error for t in traces])
     parts = {"position m": slice(6, 9), "velocity m/s": slice(3, 6), "heading deg": slice(2, 3)}
     out: dict[str, list[float | None]] = {}

@@ -40,7 +40,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.constellation import slots
@@ -71,19 +71,20 @@ IMU = Imu(rate_hz=RATE_HZ, gyro_scale_ppm=1e-6, accel_scale_ppm=1e-6)
 Without errors of scale, which the model `ins15` does not have. Paper 003 prints no figures."""
 LEVER = (0.4, -0.3, -1.2)
 STRETCH_S = (200.0, 400.0)
-"""Open sky before it long enough to find the IMU's biases, and after it to see the recovery."""
+"""Open sky before the stretch, long enough to estimate the IMU's biases, and after it for the
+recovery."""
 COUNTED_S = 30.0
 """Errors count from here: velocity has found the heading since the start at rest, which ends after
 20 s."""
 CASES: dict[str, int | None] = {"open": None, "canyon2": 2, "canyon3": 3, "canyon4": 4}
 START_SD = (10.0, 15.0, 0.2, 0.2, 2.0)
-"""One sigma of the start: horizontal position and height (m) as of a first fix, velocity (m/s),
-tilt and heading (deg) as of a levelling and a compass."""
+"""One sigma of the start: horizontal position and height (m) of a first fix, velocity (m/s), tilt
+and heading (deg) of levelling and a compass."""
 RAW = RawAiding(systems=("C",), lever_arm_m=LEVER)
 LOOSE = GnssAiding(lever_arm_m=LEVER, bias_sd_m=RAW.bias_sd_m, bias_down_sd_m=RAW.bias_down_sd_m)
 ORBIT_ERRORS_M = (0.6, 0.3, 0.0)
-"""Of orbits and clocks: BeiDou-3's as published (fusiond.gnss.plan), which the study's cases have;
-and half of it and none, which show what makes NEES."""
+"""Errors of orbits and clocks: BeiDou-3's as published (fusiond.gnss.plan), for the cases; half of
+them and none, to explain the NEES."""
 OPTIONS = GnssRawOptions(
     rate_hz=1.0,
     signals=(("C", "2I"),),
@@ -94,13 +95,13 @@ OPTIONS = GnssRawOptions(
     clock_drift_correlation_s=300.0,
     clock_noise_m_sqrt_s=RAW.clock_phase_m_sqrt_s,
 )
-"""Orbit and clock errors are as large as the filter takes them to be. The receiver clock's drift is
-paper 003's first-order Markov process, of which it prints no figures: q = 2 sigma^2 / tau is the
-density of the random walk that the daemon assumes by default (a temperature-compensated crystal),
-so that for less than 300 s the filter's clock is the simulated one. All else is the simulator's
-default."""
+"""Options of the simulation. Orbit and clock errors match the filter's assumption. The receiver
+clock's drift is paper 003's first-order Markov process, for which it prints no figures: q = 2
+sigma^2 / tau is the density of the daemon's default random walk (a temperature-compensated
+crystal), so that for less than 300 s the filter's clock is the simulated one. All else is the
+simulator's default."""
 MOST_PDOP = 25.0
-"""A fix of a worse geometry is none: an output mask as receivers have, chosen for this study."""
+"""Largest PDOP of a valid fix, as in receivers' output masks; chosen for this study."""
 ROWS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white", "receiver", "coasting")
 COMPARED = ("tight_ekf", "loose", "loose_white", "receiver")
 """Rows of the smaller orbit errors."""
@@ -120,8 +121,8 @@ class Trace:
 
 @dataclass(slots=True)
 class CaseRun:
-    """One run of a case: its rows, the number of satellites that are seen (n,) and the PDOP (n,) of
-    what least squares solves, NaN where it does not."""
+    """Run of a case: its rows, the number of visible satellites (n,) and the PDOP (n,) of the
+    least-squares solution, NaN without one."""
 
     traces: dict[str, Trace]
     satellites: Array
@@ -159,7 +160,7 @@ def in_stretch(t_s: Array) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1)
 def _true_states() -> tuple[Array, Array]:
-    """At 0 and each epoch: navigation states (n + 1, 10) and the antenna's ECEF position (n + 1,
+    """Navigation states (n + 1, 10) at 0 and each epoch, and the antenna's ECEF position (n + 1,
     3)."""
     t_s = np.r_[0.0, epochs()]
     antenna = drive_truth().at(t_s, LEVER)
@@ -194,7 +195,7 @@ class Receiver:
         self.pdop = math.nan
 
     def solve(self, epoch: RawGnssEpoch) -> SinglePoint | None:
-        """Position and velocity of an epoch, or nothing."""
+        """Position and velocity of an epoch, or None."""
         found = single_point(self._model, epoch, self._guess)
         self.pdop = math.nan if isinstance(found, str) else found.dops.pdop
         if isinstance(found, str) or not found.consistent or self.pdop > MOST_PDOP:
@@ -211,7 +212,7 @@ def broadcast(simulated: GnssRaw) -> list[Ephemeris | Klobuchar]:
 
 
 def fix(found: SinglePoint, t_ns: int) -> PositionFix:
-    """The receiver's message about its solution, with the sigmas that follow from its epoch."""
+    """Receiver's message of its solution, with the sigmas of its epoch."""
     lat, lon, height = to_geodetic(*(float(v) for v in found.position))
     axes = ned_axes(lat, lon)
     velocity = sd_velocity = None
@@ -290,7 +291,7 @@ def _filter_trace(
     samples: Array,
     unit_error: Array,
 ) -> Trace:
-    """One filter, live: its error after each epoch."""
+    """Trace of one live filter: its error after each epoch."""
     intake = Intake({row.aiding.kind: row.aiding})
     model = make_model("ins15", imu_noise(IMU), *intake.extra_blocks())
     horizontal, height, velocity, tilt, heading = START_SD
@@ -348,5 +349,5 @@ def _empty(n: int) -> Trace:
 def monte_carlo(
     runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[list[dict[str, CaseRun]]]:
-    """All runs, in order, on two processes."""
+    """Runs in order, on two processes."""
     return on_processes(partial(simulate, seed), runs, progress)

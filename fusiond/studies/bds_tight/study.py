@@ -51,12 +51,12 @@ Booleans = NDArray[np.bool_]
 DEFAULT_RUNS = 50
 DOF, NAV_DOF = 3, 9
 LIMIT_M = 10.0
-"""Horizontal accuracy, 95 %, that counts as available, chosen for this study: a solution that does
-not claim it for itself is there, but of little use on a road."""
+"""Horizontal accuracy, 95 %, that counts as available, chosen for this study: a solution that
+claims less is of little use on a road."""
 GROWTH_S = (30.0, 60.0, STRETCH_S[1] - STRETCH_S[0])
-"""The first is the time for which the claim on three satellites is made."""
+"""Times of growth; the claim on three satellites refers to the first."""
 CLAIM = 1.0 / 3.0
-"""With three satellites for 30 s an error is said to grow to at most this part of coasting's."""
+"""Claimed error with three satellites for 30 s, at most this part of coasting's."""
 PAPER = {
     "source": "paper 003: BDS/INS tight coupling, UKF, 500 s",
     "duration_s": 500.0,
@@ -169,7 +169,7 @@ def _rms(values: Array) -> float:
 
 
 def _or_none(values: Array, figure: Callable[[Array], Any]) -> float | None:
-    """A figure of the values that are there, None without any."""
+    """Statistic of the values that exist, None without any."""
     there = values[np.isfinite(values)]
     return float(figure(there)) if there.size else None
 
@@ -185,7 +185,7 @@ def _growth(traces: Sequence[Trace], few: Booleans) -> dict[str, float]:
 
 
 def _orbit_figures(case: str, runs: Sequence[CaseRun]) -> dict[str, Any]:
-    """Of the stretch, or of all that counts under the open sky."""
+    """Figures of the stretch, or of all counted epochs under the open sky."""
     t_s = epochs()
     which = t_s >= COUNTED_S if CASES[case] is None else in_stretch(t_s)
     found = {}
@@ -215,7 +215,7 @@ def _series(runs: Sequence[CaseRun]) -> dict[str, Any]:
 def _finding(
     cases: dict[str, Any], three: dict[str, Any], orbits: Sequence[dict[str, Any]], most: float
 ) -> str:
-    """One sentence; `most` is what a mean NEES may be."""
+    """Finding as one sentence; `most` is the largest acceptable mean NEES."""
 
     def off(case: str, row: str, key: str = "horizontal_rms_m") -> str:
         return f"{cases[case][row]['stretch'][key]:.1f}"
@@ -267,7 +267,7 @@ def _own_finding(own: dict[str, Any]) -> str:
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """All epochs; the stretch with its growth; the smaller orbit errors."""
+    """Tables: all epochs; the stretch with its growth; the smaller orbit errors."""
     low, high = result["nees_interval"]
     first, last = result["stretch_s"]
     header = ["case", "row", "horizontal m", "vertical m", "NEES", "available", "solution"]
@@ -345,7 +345,7 @@ TITLES = {
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Horizontal RMS and mean NEES over time, one row a case, to `path`."""
+    """Plot the horizontal RMS and mean NEES over time, one row a case, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     series = result["series"]

@@ -1,4 +1,4 @@
-"""Run the fault matrix, or one of the studies beside it.
+"""Command line of the fault matrix and its related studies.
 
 They are: single rows, how well faults are detected, how often none is one, faults that happen now
 and then, what they cost in service, how soon any test could tell them, how sharp sigma is, and what
@@ -39,7 +39,7 @@ Row = dict[str, Any]
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the requested study."""
     parser = argparse.ArgumentParser(prog="python -m fusiond.studies.faults", description=__doc__)
     parser.add_argument("--only", choices=tuple(EVERY), metavar="NAME", help="one fault")
     parser.add_argument("--phase", choices=ALL, help="one phase")
@@ -111,7 +111,7 @@ STUDIES = {
     "bounds": lambda drives, asked: (partial(bound_run, share=asked.seeds), bound_jobs(drives)),
     "real": lambda data, _: (real_run, real_jobs(data)),
 }
-"""By option: what makes a row, and of what."""
+"""Studies by option: function of a row, and its input."""
 
 
 def _recorded(asked: argparse.Namespace) -> list[dict[str, Any]]:
@@ -125,7 +125,7 @@ def _recorded(asked: argparse.Namespace) -> list[dict[str, Any]]:
 def _run(
     one: Callable[[Any], dict[str, Any]], wanted: Sequence[Any], workers: int
 ) -> list[dict[str, Any]]:
-    """`one` of each that is wanted; a row that is lost is said on standard error."""
+    """Run `one` for each input; a lost row is reported on standard error."""
 
     def tell(done: int, total: int) -> None:
         if sys.stderr.isatty():

@@ -1,4 +1,4 @@
-r"""Bounds: how soon any test could tell a fault, and how large the error is until then.
+r"""Bounds: the earliest possible detection of a fault, and the largest error before it.
 
 All that a filter knows of a fault is in its whitened innovations y. A fault adds a signature s_k to
 them: the difference of the innovations of two runs with the same noise, with the fault and without
@@ -74,7 +74,7 @@ class Trusted:
 
 
 def jobs(drives: int) -> list[Job]:
-    """All faults of the service study, and the rows that lie."""
+    """Jobs: all faults of the service study, and the rows with lies."""
     found = [Job(f, r, k) for k in range(drives) for r in RECEIVERS for f in FAULTS]
     return found + [Job(fault, phase, drive) for fault, phase, drive in ROWS]
 
@@ -115,13 +115,13 @@ def _drive(receiver: str, number: int, share: Share) -> tuple[Config, Truth, Rec
 
 @lru_cache(maxsize=1)
 def _sound(receiver: str, number: int, share: Share) -> Trusted:
-    """The same with nothing wrong, as long as any fault lasts."""
+    """Fault-free run over the longest duration of a fault."""
     config, truth, recording = _drive(receiver, number, share)
     return trusted(config, recording, truth, BEGINS_S[1] + LASTS_S)
 
 
 def _row(job: Job) -> tuple[Config, Truth, Recording]:
-    """A drive of the matrix, in its phase."""
+    """Row of the matrix for a drive, in its phase."""
     fault = placed(MATRIX[job.fault], job.drive)
     truth, recording = fault.drive.recorded(VEHICLE, 0)
     outage = PHASES[job.where].outage_s  # type: ignore[index]
@@ -129,7 +129,7 @@ def _row(job: Job) -> tuple[Config, Truth, Recording]:
 
 
 def trusted(config: Config, recording: Recording, truth: Truth, end_s: float) -> Trusted:
-    """A run until `end_s` whose filter takes in all that comes."""
+    """Run until `end_s` of a filter that accepts all measurements."""
     found: dict[tuple[int, str], tuple[float, ...]] = {}
 
     def trust(navigator: Navigator) -> None:
@@ -152,7 +152,7 @@ def trusted(config: Config, recording: Recording, truth: Truth, end_s: float) ->
 
 
 def bound(sound: Trusted, faulty: Trusted, begin_s: float, end_s: float) -> dict[str, Any]:
-    """Of two runs with the same noise, one of them with a fault from `begin_s` to `end_s`."""
+    """Bound from two runs with the same noise, one with a fault from `begin_s` to `end_s`."""
     times, gained = information(sound, faulty, begin_s)
     run = sound.run
     difference = np.abs(faulty.run.errors - run.errors)
@@ -189,6 +189,6 @@ def information(sound: Trusted, faulty: Trusted, begin_s: float) -> tuple[Array,
 
 
 def _first(times: Array, gained: Array, least: float) -> float | None:
-    """The first instant at which so much is known."""
+    """First instant with the required information."""
     at = int(np.searchsorted(gained, least))
     return float(times[at]) if at < len(times) else None

@@ -1,4 +1,4 @@
-"""Hours in which a fault of the library happens now and then, and what is told while none does.
+"""Long runs with occasional faults of the library: reports during faults and between them.
 
 The vehicles of `hours`, with the same noise for the same seed. Faults are those that alter a
 recording over a window and need no other drive or configuration; the seed draws which, and when:
@@ -50,11 +50,11 @@ from fusiond.studies.faults.recording import GNSS, SECOND, Recording, town
 from fusiond.studies.faults.runs import navigate
 
 APART_S = (180.0, 480.0)
-"""Least and most between the begins of two faults, and before the first."""
+"""Least and largest interval between the starts of two faults, and before the first."""
 LASTS_S = (20.0, 60.0)
-"""Least and most of those that last to the end of the matrix's drive."""
+"""Least and largest duration of faults that last to the end of the matrix's drive."""
 SETTLED_S = 60.0
-"""Time after a fault's end within which events count as its own."""
+"""Time after a fault's end within which events belong to it."""
 JUDGED_S = 100.0
 """A hundred fixes of one a second."""
 RECEIVERS = (GNSS, SECOND)
@@ -63,7 +63,7 @@ NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
 
 @dataclass(frozen=True, slots=True)
 class Happening:
-    """A fault of the library from `begin_s` to `end_s`, of all receivers but one it may spare."""
+    """Fault of the library from `begin_s` to `end_s`, on all receivers but one it may spare."""
 
     fault: str
     begin_s: float
@@ -71,7 +71,7 @@ class Happening:
     spares: str | None = None
 
     def put_into(self, whole: Recording) -> Recording:
-        """The recording with it."""
+        """Recording with the fault."""
         alter = EVERY[self.fault].alter
         assert alter is not None
         if self.spares is not None:
@@ -80,7 +80,7 @@ class Happening:
 
 
 def faults_of(kind: Kind) -> tuple[str, ...]:
-    """The names of those that can happen to a vehicle, at any time."""
+    """Names of the faults that can affect a vehicle at any time."""
     return tuple(
         name
         for name, fault in EVERY.items()
@@ -123,7 +123,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         return not any(h.begin_s <= t_s <= h.end_s + settled_s for h in happened)
 
     def quiet(t_s: float, settled_s: float = SETTLED_S) -> bool:
-        """By the mode of the last whole second before."""
+        """True if quiet at an instant, by the mode of the last whole second before."""
         row = math.ceil(t_s) - 2
         return 0 <= row < len(modes) and modes[row] == NAVIGATING and calm(t_s, settled_s)
 
@@ -161,7 +161,8 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
 
 
 def _figures(course: Course, h: Happening, until_s: float) -> dict[str, Any]:
-    """Of a fault, as if the course ended before the next: beside one in which nothing is told."""
+    """Figures of a fault, as if the course ended before the next, compared with a course without a
+    report."""
     before = [s.mode for s in course.samples if s.t_s < h.begin_s]
     samples = [s for s in course.samples if h.begin_s <= s.t_s < until_s]
     events = [
@@ -183,8 +184,8 @@ def _figures(course: Course, h: Happening, until_s: float) -> dict[str, Any]:
 
 
 def by_fault(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line a fault, of the hours of `faulty_hour_of`, in the library's order; noticed and
-    recovered from can be what begins while the mode is `navigating`."""
+    """Figures of `faulty_hour_of`, one line a fault in the library's order; faults that start in
+    mode `navigating` can be noticed and recovered from."""
     happened = [fault for row in found for fault in row["faults"]]
     lines = []
     for name in EVERY:

@@ -1,4 +1,4 @@
-"""Hours in which nothing is wrong: how often something is told all the same.
+"""Fault-free hours: the rate of false reports.
 
 Vehicles of `KINDS`, each hour with its own noise of the configuration: IMU at 50 Hz, receivers at
 1 Hz, RDSS every 11 s. What is told once the mode has been `navigating` is a false alarm, and stands
@@ -53,13 +53,13 @@ from fusiond.studies.faults.recording import (
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
 FALSE = 1.0 / (1.0 + math.exp(DECIDED))
-"""Probability that a fault which is identified is none."""
+"""Probability that an identified fault is false."""
 HOUR_S = 3600.0
 RATE_HZ, GNSS_HZ = 50.0, 1.0
 LIMITS_M = (40.0, 40.0)
-"""As of study `protection`."""
+"""Alert limits, as in study `protection`."""
 BEGUN = 0.015e-3
-"""False verdicts begun an innovation with a window of 100 (docs/consistency.md)."""
+"""False verdicts an innovation with a window of 100 (docs/consistency.md)."""
 CONFIDENCE = 0.99
 CORRECTED = ("sensor_fault", "fault_over")
 """Events of faults that are taken out of the state."""
@@ -67,7 +67,7 @@ USUAL = (
     *("aligned", "calibrated", "readmitted", "protection_restored", "verdict_consistent"),
     *("imu_sound", "imu_units_well"),
 )
-"""Events that say nothing is wrong, or no more."""
+"""Events without a fault, or at its end."""
 MOTORWAY_LEGS = (
     Leg(60),
     Leg(20, turn_deg=25.0),
@@ -92,7 +92,7 @@ def around_town(duration_s: float) -> Path:
 
 
 def on_motorway(duration_s: float) -> Path:
-    """A bend to find the heading by, and then 24 to 33 m/s for ever."""
+    """Drive with a bend to find the heading, then at 24 to 33 m/s."""
     off = (Leg(8, speed_m_s=14.0), Leg(12), Leg(8, turn_deg=90.0), Leg(15, speed_m_s=33.0))
     rounds = int(duration_s / sum(leg.duration_s for leg in MOTORWAY_LEGS)) + 1
     legs = (Leg(REST_S), *off, *MOTORWAY_LEGS * rounds)
@@ -100,14 +100,14 @@ def on_motorway(duration_s: float) -> Path:
 
 
 def parked(duration_s: float) -> Path:
-    """Once around the town, and then at rest, the engine off."""
+    """Drive once around the town, then parked with the engine off."""
     legs = (Leg(REST_S), *TOWN_LEGS, Leg(8, speed_m_s=0.0), Leg(duration_s))
     return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A vehicle and what it does for an hour; one of two receivers has alert limits, too."""
+    """Vehicle and its hour; one of two receivers has alert limits, too."""
 
     drive: Drive
 
@@ -125,7 +125,7 @@ class Kind:
         return with_wheels(config) if self.drive.wheels else config
 
     def recorded(self, config: Config, seed: int, duration_s: float) -> tuple[Truth, Recording]:
-        """The truth and what the sensors say of it."""
+        """Truth and simulated sensor data."""
         truth, recording = replace(self.drive, duration_s=duration_s).recorded(config, seed)
         if self.drive.wheels:
             return truth, _drifting(recording, config, np.random.default_rng([seed, 2]))
@@ -133,7 +133,7 @@ class Kind:
 
 
 def _drifting(recording: Recording, config: Config, rng: np.random.Generator) -> Recording:
-    """With the drift of wheel speeds that the filter has as a state."""
+    """Add the drift of wheel speeds that the filter has as a state."""
     section = config.aiding["wheel"]
     assert isinstance(section, WheelAiding)
     speeds = [r for r in recording.received if isinstance(r.measurement, WheelSpeed)]
@@ -206,13 +206,13 @@ def beyond_s(stated: Sequence[Sequence[float]]) -> dict[str, int]:
 
 
 def resident_mb() -> float:
-    """Of this process, MB of 10^6 bytes."""
+    """Resident memory of this process, MB of 10^6 bytes."""
     pages = int(File("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def named(code: str, text: str) -> str:
-    """An event with the source that it is about."""
+    """Name of an event with its source."""
     if code.startswith("verdict_"):
         return f"{code} {text.rpartition(' ')[2]}"
     return f"{code} {text.partition(' ')[0]}" if code == "isolated" else code
@@ -233,9 +233,9 @@ def tests_of(received: Iterable[Received]) -> dict[str, int]:
 
 
 def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """By kind and alarm: how often it was told, in 24 hours with the exact interval of a Poisson
-    count at 99 %, and what is stated for so many tests; a verdict's of those that it may tell of,
-    where a row has them as `judged`."""
+    """Rates by kind and alarm: occurrences in 24 hours with the exact interval of a Poisson count
+    at 99 %, and the stated rate for so many tests; for verdicts the tests are in `judged`, if
+    present."""
     lines = []
     for name in dict.fromkeys(row["kind"] for row in found):
         rows = [row for row in found if row["kind"] == name]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.studies.faults.recording import Recording
 
@@ -23,7 +23,7 @@ YAW_AXIS = 2
 
 
 def saturated(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Every axis at its full scale."""
+    """Saturate every axis at its full scale."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s)] = [RATE_RANGE_RAD_S] * 3 + [FORCE_RANGE_M_S2] * 3
     return replace(r, samples=samples)
@@ -37,7 +37,7 @@ def stuck(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def all_zero(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """All six axes say zero."""
+    """Set all six axes to zero."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s)] = 0.0
     return replace(r, samples=samples)
@@ -57,8 +57,8 @@ def bias_step(
     size: float = BIAS_STEP_RAD_S,
     axis: int = YAW_AXIS,
 ) -> Recording:
-    """A gyro (axis 0 to 2, rad/s) or an accelerometer (3 to 5, m/s^2) is off by another `size`: by
-    1 deg/s that of the yaw axis."""
+    """Offset a gyro (axis 0 to 2, rad/s) or an accelerometer (3 to 5, m/s^2) by `size`; default: 1
+    deg/s on the yaw axis."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s), axis] += size
     return replace(r, samples=samples)
@@ -67,14 +67,14 @@ def bias_step(
 def scaled_axis(
     r: Recording, begin_s: float, length_s: float, axis: int, factor: float
 ) -> Recording:
-    """An axis, numbered as in `bias_step`, says `factor` times what it should."""
+    """Multiply an axis, numbered as in `bias_step`, by `factor`."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s), axis] *= factor
     return replace(r, samples=samples)
 
 
 def noisy(r: Recording, begin_s: float, length_s: float, times: float) -> Recording:
-    """White noise, `times` what there is from sample to sample in the window."""
+    """Add white noise, `times` the sample-to-sample noise, in the window."""
     samples, window = r.samples.copy(), r.window(begin_s, length_s)
     sd = np.diff(samples[window], axis=0).std(axis=0) / math.sqrt(2.0)
     noise = np.random.default_rng(0).standard_normal((int(window.sum()), 6))
@@ -83,7 +83,7 @@ def noisy(r: Recording, begin_s: float, length_s: float, times: float) -> Record
 
 
 def half_rate(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A sample for each two, the mean of them."""
+    """Halve the rate; each sample is the mean of two."""
     samples, window = r.samples.copy(), r.window(begin_s, length_s)
     second = np.flatnonzero(window)[1::2]
     samples[second] = 0.5 * (samples[second] + samples[second - 1])
@@ -93,14 +93,14 @@ def half_rate(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def stamps_off(r: Recording, begin_s: float, length_s: float, off_s: float) -> Recording:
-    """All stamps of the window lie so far ahead, behind where it is negative."""
+    """Shift all stamps of the window ahead, or back if negative."""
     stamps = r.stamps.copy()
     stamps[r.window(begin_s, length_s)] += round(off_s * 1e9)
     return replace(r, stamps=stamps)
 
 
 def clock_fast(r: Recording, begin_s: float, length_s: float, ppm: float) -> Recording:
-    """The clock of the stamps goes faster from the begin of the window on."""
+    """Speed up the clock of the stamps from the window's start."""
     stamps, window = r.stamps.copy(), r.window(begin_s, length_s)
     stamps[window] += np.rint((stamps[window] - begin_s * 1e9) * ppm * 1e-6).astype(np.int64)
     return replace(r, stamps=stamps)
@@ -109,7 +109,7 @@ def clock_fast(r: Recording, begin_s: float, length_s: float, ppm: float) -> Rec
 def mount_turned(
     r: Recording, begin_s: float, length_s: float, angle_rad: float = TURNED_RAD
 ) -> Recording:
-    """The unit has turned about its vertical axis, by 30 deg."""
+    """Rotate the unit about its vertical axis by 30 deg."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     samples, window = r.samples.copy(), r.window(begin_s, length_s)
@@ -123,14 +123,14 @@ def silent(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def gyro_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """One sample of the yaw gyro is far out of range."""
+    """Set one sample of the yaw gyro far out of range."""
     samples = r.samples.copy()
     samples[np.flatnonzero(r.window(begin_s, length_s))[0], YAW_AXIS] = SPIKE_RAD_S
     return replace(r, samples=samples)
 
 
 def small_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """One sample of the yaw gyro is off by what a shock may be."""
+    """Offset one sample of the yaw gyro by a shock's size."""
     samples = r.samples.copy()
     samples[np.flatnonzero(r.window(begin_s, length_s))[0], YAW_AXIS] += SMALL_SPIKE_RAD_S
     return replace(r, samples=samples)
@@ -144,7 +144,7 @@ def not_numbers(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def stamp_ahead(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """One sample's stamp lies ahead."""
+    """Shift one sample's stamp ahead."""
     stamps = r.stamps.copy()
     stamps[np.flatnonzero(r.window(begin_s, length_s))[0]] += round(STAMP_AHEAD_S * 1e9)
     return replace(r, stamps=stamps)

@@ -38,7 +38,7 @@ Verdict = Literal["crashed", "lie", "degraded and said so", "survived"]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One instant: mode, error/sigma of each of QUANTITIES where there is a solution, errors."""
+    """Instant: mode, error/sigma of each of QUANTITIES with a solution, errors."""
 
     t_s: float
     mode: str
@@ -48,7 +48,7 @@ class Sample:
 
     @property
     def beyond(self) -> bool:
-        """True if an error is published that sigma does not cover, in whatever mode."""
+        """True if a published error exceeds its sigma's bound, in any mode."""
         return any(not r <= MOST_SIGMA for r in self.ratios)
 
 
@@ -89,7 +89,7 @@ def longest_lie_s(samples: Sequence[Sample]) -> float:
 
 
 def noticed_s(course: Course, reference: Course, begin_s: float) -> float | None:
-    """Seconds from `begin_s` until the run says that something is different, None if never."""
+    """Seconds from `begin_s` to the first difference in the run's reports, None if never."""
     usual = {s.t_s: s.mode for s in reference.samples}
     times = [e.t_s for e in new_events(course, reference, begin_s)]
     times += [
@@ -99,7 +99,7 @@ def noticed_s(course: Course, reference: Course, begin_s: float) -> float | None
 
 
 def new_events(course: Course, reference: Course, begin_s: float) -> list[Event]:
-    """Events from `begin_s` on, beyond as many of each code as the reference has."""
+    """Events from `begin_s` on, beyond the reference's number of each code."""
     usual = Counter(e.code for e in reference.events if e.t_s >= begin_s)
     found = []
     for event in course.events:
@@ -170,5 +170,5 @@ def _largest(values: Iterable[float]) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """None for what JSON cannot hold."""
+    """Finite value; None for others, which JSON cannot hold."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Every fault of the matrix by its name: what it alters, for how long, and in which phases.
+"""Faults of the matrix by name: change, duration and phases.
 
 `aligning` begins at rest, before the first heading; `navigating` on a straight at 20 m/s with all
 measurements; `coasting` in an outage of all fixes, where the faults of IMU and wheels begin in its
@@ -33,7 +33,7 @@ Configure = Callable[[Config], Config]
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Start of faults, of IMU and wheels and of fixes, and the outage (start, end), in s."""
+    """Phase: start of faults of IMU, wheels and fixes, and the outage (start, end), in s."""
 
     imu_s: float
     fix_s: float
@@ -53,7 +53,8 @@ TOWN = Drive()
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """`alter` changes the recording for `length_s` from the phase's begin, or from `begin_s`.
+    """Fault: `alter` changes the recording for `length_s` from the phase's start, or from
+    `begin_s`.
 
     `configure` changes the configuration that the navigator gets, not the vehicle. With neither the
     drive itself is what may be taken for something else, and nothing is wrong.
@@ -67,8 +68,7 @@ class Fault:
     configure: Configure | None = None
     drive: Drive = TOWN
     turned_rad: float = 0.0
-    """By how much the IMU's forward axis is turned: its attitude is no less right than the
-    vehicle's, where a recording's is compared."""
+    """Rotation of the IMU's forward axis; the recorded attitude is compared in the rotated axes."""
 
     def begins_s(self, phase: PhaseName) -> float:
         """Start, s of the drive."""
@@ -90,7 +90,7 @@ def _creeping(speed_m_s: float, duration_s: float) -> Path:
 
 
 def _turning(rate_deg_s: float, duration_s: float) -> Path:
-    """Town speed, a stop at 80 s, and from 90 s a turn on the spot for a minute."""
+    """Drive at town speed, a stop at 80 s, and from 90 s a turn on the spot for a minute."""
     legs = (
         *_OFF,
         Leg(27),
@@ -111,7 +111,7 @@ def _reversing(duration_s: float) -> Path:
 
 
 def _smooth(duration_s: float) -> Path:
-    """After a bend straight on at a constant 20 m/s."""
+    """Drive straight after a bend at a constant 20 m/s."""
     legs = (*_OFF, Leg(8, speed_m_s=20.0), Leg(duration_s))
     return follow(legs, duration_s, course_deg=40.0)
 
@@ -125,7 +125,7 @@ def _axes(x: str, y: str, z: str, config: Config) -> Config:
 
 
 sideways = partial(_axes, "+y", "+x", "-z")
-"""As if the unit's forward axis pointed to the right."""
+"""True if the unit's forward axis points to the right."""
 
 
 def _heading_off(config: Config) -> Config:
@@ -135,19 +135,19 @@ def _heading_off(config: Config) -> Config:
 
 
 def with_wheels(config: Config) -> Config:
-    """With wheel speeds of the point that does not slide."""
+    """Configuration with wheel speeds of the point that does not slide."""
     section = WheelAiding(lever_arm_m=config.constraints.non_holonomic.lever_arm_m)
     return config.model_copy(update={"aiding": {**config.aiding, "wheel": section}})
 
 
 def with_second(config: Config) -> Config:
-    """With a second receiver, as the first."""
+    """Configuration with a second receiver like the first."""
     aiding = {**config.aiding, SECOND: config.aiding[GNSS]}
     return config.model_copy(update={"aiding": aiding})
 
 
 def with_spare(config: Config) -> Config:
-    """With a second inertial unit, turned by a quarter."""
+    """Configuration with a second inertial unit, rotated by a quarter turn."""
     spare = SpareImu(source="spare", axes=("+y", "+x", "-z"))
     return config.model_copy(update={"imu": config.imu.model_copy(update={"spare": spare})})
 

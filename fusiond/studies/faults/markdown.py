@@ -1,4 +1,4 @@
-"""Tables of Markdown and the numbers in them."""
+"""Markdown tables and their numbers."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def table(header: Iterable[str], lines: Iterable[tuple[str, ...]]) -> str:
 
 
 def number(value: float | None, none: str) -> str:
-    """Three figures of a value, `none` where there is none."""
+    """Value with three significant figures, `none` for None."""
     return none if value is None or math.isnan(value) else f"{value:.3g}"

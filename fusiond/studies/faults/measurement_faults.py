@@ -1,4 +1,4 @@
-"""Faults of what measurements the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
+"""Faults of the sensors other than the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ Velocity = tuple[float, float, float | None]
 def _changed(
     r: Recording, begin_s: float, length_s: float, kind: type[M], change: Callable[[M, float], M]
 ) -> Recording:
-    """`change(measurement, seconds since begin)` of each of a kind that is valid in the window."""
+    """Apply `change(measurement, seconds since start)` to the measurements of a kind that are valid
+    in the window."""
     received = []
     for item in r.received:
         m, since_s = item.measurement, item.t_ns * 1e-9 - begin_s
@@ -94,7 +95,7 @@ def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Position and velocity of each receiver's first fix of the window, at new instants."""
+    """Repeat each receiver's first position and velocity of the window at new instants."""
     first: dict[str, PositionFix] = {}
 
     def repeat(fix: PositionFix, _: float) -> PositionFix:
@@ -125,14 +126,13 @@ def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIF
 def carried_off(
     r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S
 ) -> Recording:
-    """Positions drift to the north and velocities go along, as a receiver's that is spoofed: what
-    is false agrees with itself."""
+    """Drift positions to the north with matching velocities, as a spoofed receiver's."""
     drifting = drift(r, begin_s, length_s, north_m_s)
     return velocity_bias(drifting, begin_s, length_s, north_m_s)
 
 
 def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: float) -> Recording:
-    """Velocities too fast to the north, positions as they are."""
+    """Offset velocities to the north; positions unchanged."""
 
     def faster(fix: PositionFix, _: float) -> PositionFix:
         assert fix.v_ned_m_s is not None
@@ -143,7 +143,8 @@ def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: floa
 
 
 def velocity_old(r: Recording, begin_s: float, length_s: float, age_s: float = 1.0) -> Recording:
-    """Positions on time, with the velocity of an epoch `age_s` before, or of the first."""
+    """Replace velocities by those of an epoch `age_s` before, or of the first; positions
+    unchanged."""
     said: dict[str, deque[tuple[float, Velocity]]] = {}
 
     def older(fix: PositionFix, since_s: float) -> PositionFix:
@@ -183,7 +184,7 @@ def late(r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S) 
 
 
 def false_burst(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A thousand positions a second, 450 m off, each at its own instant."""
+    """Insert a thousand positions a second, 450 m off, each at its own instant."""
     like = _fixes(r, begin_s, math.inf)[0].measurement
     assert isinstance(like, PositionFix)
     false = []
@@ -201,7 +202,7 @@ def tiny_sigma(r: Recording, begin_s: float, length_s: float, sd_m: float = TINY
 
 
 def small_sigma(r: Recording, begin_s: float, length_s: float, factor: float) -> Recording:
-    """Errors as always, and stated sigmas, of position and velocity, too small by a factor."""
+    """Divide stated sigmas of position and velocity by a factor; errors unchanged."""
 
     def smaller(fix: PositionFix, _: float) -> PositionFix:
         assert fix.sd_ned_m is not None
@@ -263,7 +264,7 @@ def repeated(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def from_future(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Fixes whose stamps lie 5 s ahead."""
+    """Stamp fixes 5 s ahead."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
     return r.with_received(
         [replace(item, t_ns=item.t_ns + AHEAD_NS) if item in moved else item for item in r.received]
@@ -271,8 +272,7 @@ def from_future(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Fixes 80 m off for 0.6 s, a tunnel for the rest of the window, and the first fix behind it
-    80 m off."""
+    """Offset fixes by 80 m for 0.6 s, then a tunnel, and a first fix behind it 80 m off."""
     burst = _changed(r, begin_s, MULTIPATH_S, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M))
     out_s = begin_s + length_s
     tunnel = burst.withheld(begin_s + MULTIPATH_S, out_s)
@@ -286,7 +286,7 @@ def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Reco
 
 
 def no_fix_yet(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Neither receiver nor terminal has a fix in the window."""
+    """Remove all fixes of receiver and terminal in the window."""
     return r.withheld(begin_s, begin_s + length_s)
 
 
@@ -300,12 +300,12 @@ def rdss_step(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def rdss_nan(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """RDSS fixes whose latitude is not a number."""
+    """Set the latitude of RDSS fixes to NaN."""
     return _changed(r, begin_s, length_s, DelayedFix, lambda fix, _: replace(fix, lat_rad=math.nan))
 
 
 def wheels_frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The first speed of the window for all of it."""
+    """Repeat the first speed of the window."""
     first: list[float] = []
 
     def repeat(m: WheelSpeed, _: float) -> WheelSpeed:
@@ -350,7 +350,7 @@ def wheels_delayed(r: Recording, begin_s: float, length_s: float, late_s: float)
 
 
 def absent(r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]) -> Recording:
-    """No measurement of these kinds, of none at all without them."""
+    """Remove the measurements of these kinds, or of all."""
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
     return r.with_received(
         [
@@ -364,14 +364,14 @@ def absent(r: Recording, begin_s: float, length_s: float, *kinds: type[Measureme
 def now_and_then(
     r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]
 ) -> Recording:
-    """Three seconds of each five without these kinds."""
+    """Remove these kinds for three seconds of each five."""
     for start_s in np.arange(begin_s, begin_s + length_s, 5.0).tolist():
         r = absent(r, start_s, 3.0, *kinds)
     return r
 
 
 def scattered(r: Recording, begin_s: float, length_s: float, sd_m: float) -> Recording:
-    """Positions scatter by `sd_m` to the north more than they say."""
+    """Scatter positions by `sd_m` to the north beyond their stated sigma."""
     rng = np.random.default_rng(0)
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, sd_m * rng.standard_normal())

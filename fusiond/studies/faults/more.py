@@ -1,11 +1,11 @@
-"""Faults beyond those of the matrix, for recorded drives: other sizes, and several at once."""
+"""Further faults for recorded drives: other sizes, and several at once."""
 
 from __future__ import annotations
 
 from functools import partial
 
 from drivers.measurements import DelayedFix, PositionFix, WheelSpeed
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.library import FAULTS, UNDER_WAY, Fault, sideways
@@ -115,4 +115,4 @@ MORE: dict[str, Fault] = {
 }
 
 EVERY = {**FAULTS, **MORE}
-"""Those of the matrix and these."""
+"""Faults of the matrix and of this module."""

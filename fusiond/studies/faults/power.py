@@ -16,7 +16,7 @@ from functools import partial
 from itertools import product
 from typing import Any
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S
@@ -138,6 +138,6 @@ def powers(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def largest(rows: list[dict[str, Any]], key: str) -> float | None:
-    """None where one of them is not finite."""
+    """Largest value of a key; None if one is not finite."""
     values = [row[key] for row in rows]
     return None if any(value is None for value in values) else max(values)

@@ -70,7 +70,7 @@ class Published:
 
     @property
     def ratios(self) -> Array:
-        """|error| / sigma (n, 9) as the judge has it: infinite where that is no comparison, zero
+        """Ratios |error| / sigma (n, 9) as in the judge: infinite without a valid comparison, zero
         where nothing is published."""
         with np.errstate(invalid="ignore", divide="ignore"):
             found = np.abs(self.errors) / self.sigmas
@@ -85,7 +85,7 @@ class Published:
         return self.beyond_in(JUDGED)
 
     def beyond_in(self, axes: tuple[int, ...]) -> Bools:
-        """The same of some columns."""
+        """Ratios beyond the bound in some columns."""
         found: Bools = np.any(self.ratios[:, axes] > MOST_SIGMA, axis=1)
         return found
 
@@ -95,7 +95,7 @@ class Published:
         return np.hypot(self.errors[:, 0], self.errors[:, 1])
 
     def sigma(self, quantity: str) -> Array:
-        """Stated sigma (n,) of a quantity, all its axes together."""
+        """Stated sigma (n,) of a quantity over all its axes."""
         found: Array = np.sqrt((self.sigmas[:, AXES[quantity]] ** 2).sum(axis=1))
         return found
 
@@ -113,8 +113,8 @@ def against(
     true_sd: Array | None = None,
     watch: Callable[[Navigator], None] | None = None,
 ) -> Published:
-    """The same against states at 10 Hz from 0.1 s on, known to `true_sd` (n, 9); `watch` may look
-    at the navigator then."""
+    """Compare with states at 10 Hz from 0.1 s on, known to `true_sd` (n, 9); `watch` receives the
+    navigator."""
     n = len(true.t_s)
     rows, modes = np.full((n, _FIGURES), math.nan), np.full(n, "", dtype="<U12")
 
@@ -144,14 +144,14 @@ def _wrapped(angles_rad: Array) -> Array:
 
 
 def longest_s(where: Bools) -> float:
-    """Longest unbroken time in which something holds."""
+    """Longest unbroken time in which a condition holds."""
     edges = np.diff(np.concatenate(([0], where.astype(np.int8), [0])))
     lengths = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     return float(lengths.max(initial=0)) * STEP_S
 
 
 def lasting_from(where: Bools, samples: int) -> int | None:
-    """The first row from which on it holds for so many; None where it never does."""
+    """First row from which a condition holds for so many; None if never."""
     kept = 0
     for row, holds in enumerate(where.tolist()):
         kept = kept + 1 if holds else 0

@@ -1,5 +1,4 @@
-"""Recorded drives with nothing wrong: what is told of them, and whether sigma is as large as the
-error where fixes are withheld or a reference is there.
+"""Fault-free recorded drives: false reports, and sigma against error in outages or by a reference.
 
 Each drive goes through the navigator by its class alone: what the owner of the vehicle knows, axes
 and class, and nothing of noise. Once as it is, and then with outages (`Drive.outages`), set by set.
@@ -47,9 +46,9 @@ PHASE = "steady"
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A folder of recorded tables, what is known of the vehicle, and sets of outages as begin, from
-    the first sample on, and length (s). `truth` is a table that is no measurement; without it the
-    fixes that are withheld are. `qualities` stand in the place of those that fixes state."""
+    """Folder of recorded tables, known parameters of the vehicle, and sets of outages as start,
+    from the first sample, and length (s). `truth` is a table that is not a measurement; without it
+    the withheld fixes are. `qualities` replace those that fixes state."""
 
     folder: str
     settings: dict[str, Any]
@@ -60,7 +59,7 @@ class Drive:
 
 
 BY_NMEA = {1: 4, 2: 5}
-"""Fixed and float ambiguities of RTKLIB as NMEA calls them."""
+"""Fixed and float ambiguities of RTKLIB as NMEA qualities."""
 _RTK: dict[str, Any] = {
     "imu": {"axes": ("-x", "+y", "-z"), "sensor_class": "mems", "rate_hz": 100.0},
     "aiding": {"gnss": {"lever_arm_m": (0.0, -0.05, 0.0)}},
@@ -70,7 +69,7 @@ _RTK: dict[str, Any] = {
 _EVERY_45_S = tuple(
     tuple((171.645 + shift_s + 45.0 * k, 15.0) for k in range(8)) for shift_s in (0, 9, 18, 27, 36)
 )
-"""Of README of the data: eight of 15 s, and four sets between them."""
+"""Outages of the data's README: eight of 15 s, and four sets between them."""
 DRIVES: dict[str, Drive] = {
     "drive_0708": Drive("drive_0708", _RTK, _EVERY_45_S),
     "drive_0708, quality 4": Drive("drive_0708", _RTK, _EVERY_45_S, qualities=BY_NMEA),
@@ -111,7 +110,7 @@ DRIVES: dict[str, Drive] = {
 
 @dataclass(frozen=True, slots=True)
 class RealJob:
-    """A drive of a folder of data with one set of its outages; as it is without."""
+    """Drive of a data folder with one set of its outages; None: without."""
 
     data: Path
     drive: str
@@ -119,7 +118,7 @@ class RealJob:
 
 
 def jobs(data: Path) -> list[RealJob]:
-    """Those of the drives that are there; ValueError where none is."""
+    """Jobs for the available drives; ValueError without any."""
     found = [
         RealJob(data, name, which)
         for name, drive in DRIVES.items()
@@ -177,7 +176,7 @@ def real_run(job: RealJob) -> dict[str, Any]:
 
 
 def _parts(windows: Sequence[tuple[float, float]], duration_s: float) -> list[tuple[float, float]]:
-    """Begin and end of each outage, of the whole where there is none."""
+    """Start and end of each outage, or of the whole without outages."""
     return [(at_s, at_s + length_s) for at_s, length_s in windows] or [(0.0, duration_s)]
 
 
@@ -196,7 +195,7 @@ class _Own:
             self.ratios.append(math.hypot(float(stated[0]), float(stated[1])) / own)
 
     def shares(self) -> dict[str, float | None]:
-        """Median, what 99 % of the time is not above, and the greatest."""
+        """Median, 99th percentile and maximum."""
         if not self.ratios:
             return {"median": None, "most_99": None, "most": None}
         half, most, all_of_it = np.percentile(self.ratios, (50.0, 99.0, 100.0)).tolist()
@@ -207,7 +206,8 @@ class _Own:
 def _read(
     folder: Path, wheels: bool, truth: str | None
 ) -> tuple[Recording, TrajectoryTable, float]:
-    """The recording by a clock that begins with its first sample, the reference, and the begin."""
+    """Read the recording, its clock starting at the first sample, with the reference and the
+    start."""
     path = next(p for p in (folder / "imu.csv", folder / "imu.csv.gz") if p.exists())
     imu = read_imu(path)
     stamps = np.rint(imu.t_s * 1e9).astype(np.int64)
@@ -238,7 +238,7 @@ def _of_quality(recording: Recording, qualities: Mapping[int, int]) -> Recording
 def _at_ticks(
     table: TrajectoryTable, begin_s: float, length_s: float
 ) -> tuple[States, Array, Bools]:
-    """Reference at each tick, its sigmas (n, 9), and the ticks at which it holds.
+    """Reference at each tick, its sigmas (n, 9), and the ticks at which it is valid.
 
     A sigma is zero where the reference states none; it holds near its own rows."""
     t_s = np.arange(1.0, math.floor(length_s * TICKS_PER_S) + 0.5) * STEP_S

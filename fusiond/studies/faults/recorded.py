@@ -31,7 +31,7 @@ from drivers.measurements import DelayedFix, Height, MonotonicStamp, PositionFix
 from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config, Imu
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.tables import TrajectoryTable, read_imu, read_solution
 from fusiond.navigation.solution import Solution
 from fusiond.offline.can_log import read_can_log
@@ -49,17 +49,17 @@ Array = NDArray[np.float64]
 LEAD_S = 120.0
 AFTER_S = 130.0
 OUTAGE_S = 20.0
-"""Before and behind the instant of a fault in phase `coasting`."""
+"""Outage before and after the instant of a fault in phase `coasting`."""
 ALIGNING_S = 5.0
 FUSED = (PositionFix, WheelSpeed, DelayedFix, Height)
 YAW = QUANTITIES.index("yaw")
 KINDS = ("gnss", "wheel", "rdss", "barometer")
-"""Tables of a folder that are fused where they are there."""
+"""Tables of a folder that are used if present."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedRow:
-    """A fault in a phase at an instant of a recording, s from its first sample."""
+    """Fault in a phase at an instant of a recording, s from its first sample."""
 
     fault: str
     phase: PhaseName
@@ -68,8 +68,7 @@ class RecordedRow:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Location of a recording (a folder of tables or a CAN log), its configuration, and the
-    smoothed solution of it."""
+    """Recording (a folder of tables or a CAN log) with its configuration and smoothed solution."""
 
     config: Path
     recording: Path
@@ -94,7 +93,7 @@ def smooth(place: Place) -> None:
 def recorded_rows(
     place: Place, instants_s: Sequence[float], only: str | None, phase: PhaseName | None
 ) -> list[RecordedRow]:
-    """The faults that this recording can have, at each instant."""
+    """Faults that this recording can have, at each instant."""
     _, recording = _read(place)
     wheels = any(isinstance(r.measurement, WheelSpeed) for r in recording.received)
     return [
@@ -136,7 +135,7 @@ def run_recorded(row: RecordedRow, place: Place) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Of a recording, from `from_s` on; its fault begins `lead_s` behind that."""
+    """Part of a recording from `from_s` on; its fault starts after `lead_s`."""
 
     from_s: float
     lead_s: float
@@ -154,7 +153,7 @@ def _part(row: RecordedRow, place: Place) -> _Part:
 
 @lru_cache(maxsize=4)
 def _unharmed(place: Place, part: _Part) -> Course:
-    """The same part with nothing wrong."""
+    """Result of the same part without a fault."""
     return _run(place, part, EVERY["none"], 0.0)
 
 
@@ -182,7 +181,7 @@ def _run(place: Place, part: _Part, fault: Fault, begin_s: float) -> Course:
 
 
 def _cut(r: Recording, from_s: float, length_s: float) -> Recording:
-    """Part of a recording, by a clock that begins there."""
+    """Part of a recording, on a clock that starts with it."""
     begin, end = round(from_s * 1e9), round((from_s + length_s) * 1e9)
     kept = r.without((r.imu_seen <= begin) | (r.imu_seen > end))
     received = [
@@ -192,7 +191,7 @@ def _cut(r: Recording, from_s: float, length_s: float) -> Recording:
 
 
 def _moved(item: Received, by_ns: int) -> Received:
-    """By a clock that is behind by so much."""
+    """Item on a clock that is behind by so much."""
     m, t, seen = item.measurement, item.t_ns - by_ns, item.seen_ns - by_ns
     assert isinstance(m, FUSED)
     return Received(t, seen, replace(m, t_seen_ns=seen, stamp=MonotonicStamp(t)))
@@ -204,7 +203,8 @@ def _tables(folder: Path) -> list[tuple[str, Path]]:
 
 @lru_cache(maxsize=1)
 def _read(place: Place) -> tuple[Config, Recording]:
-    """As if the unit were mounted as that of the simulated drives, whose axes the faults name."""
+    """Read a recording, rotated to the mounting of the simulated drives, whose axes the faults
+    name."""
     config = load_config(place.config)
     arrivals: list[Arrival] = []
     if place.recording.is_dir():
@@ -234,8 +234,8 @@ def _nominal(imu: Imu) -> Array:
 
 
 def _smoothed(place: Place, from_s: float, duration_s: float) -> tuple[States, Array]:
-    """Of each second of a part, and its sigmas (n, 9); of those before its begin there are none,
-    which no run can have navigated."""
+    """Smoothed solution of each second of a part, and its sigmas (n, 9); without those before its
+    start, where no run can navigate."""
     table, begin_s = _table(place)
     t_s = np.arange(1.0, duration_s + 0.5)
     there_s = t_s + begin_s + from_s
@@ -250,7 +250,7 @@ def _smoothed(place: Place, from_s: float, duration_s: float) -> tuple[States, A
 
 @lru_cache(maxsize=1)
 def _table(place: Place) -> tuple[TrajectoryTable, float]:
-    """The smoothed solution, and the first instant of the recording on its clock."""
+    """Smoothed solution, and the first instant of the recording on its clock."""
     config = load_config(place.config)
     imu = (
         read_imu(place.recording / "imu.csv")

@@ -1,4 +1,4 @@
-"""Sensor data of a drive, and when it came: what a fault alters."""
+"""Sensor data of a drive with arrival times, which faults alter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre
@@ -41,7 +41,7 @@ WHEEL_SD_M_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A measurement, the instant it was true and the instant it came (ns)."""
+    """Measurement with its instants of validity and arrival (ns)."""
 
     t_ns: int
     seen_ns: int
@@ -51,8 +51,7 @@ class Received:
 @dataclass(frozen=True, slots=True)
 class Recording:
     """IMU samples (n, 6) rate and force in sensor axes, their stamps (n,) and arrivals (n,) in ns,
-    and all else in order of arrival. `spare` holds the samples of a second unit, in its own axes,
-    and nothing else."""
+    and all else in order of arrival. `spare` has the samples of a second unit, in its own axes."""
 
     stamps: Stamps
     imu_seen: Stamps
@@ -66,7 +65,7 @@ class Recording:
         return (self.imu_seen >= begin) & (self.imu_seen < end)
 
     def without(self, lost: NDArray[np.bool_]) -> Recording:
-        """Without some of the samples."""
+        """Recording without some samples."""
         kept = ~lost
         return replace(
             self,
@@ -76,8 +75,8 @@ class Recording:
         )
 
     def withheld(self, begin_s: float, end_s: float) -> Recording:
-        """Without the measurements that are valid from `begin_s` to before `end_s`; wheels go
-        on."""
+        """Recording without measurements valid from `begin_s` to before `end_s`; wheels
+        continue."""
         begin, end = round(begin_s * 1e9), round(end_s * 1e9)
         return replace(
             self,
@@ -89,12 +88,12 @@ class Recording:
         )
 
     def with_received(self, received: list[Received]) -> Recording:
-        """With these measurements instead, in order of arrival."""
+        """Recording with these measurements instead, in order of arrival."""
         return replace(self, received=tuple(sorted(received, key=lambda r: r.seen_ns)))
 
 
 Alter = Callable[[Recording, float, float], Recording]
-"""Fault of a recording, from an instant (s) on, for so long (s)."""
+"""Fault of a recording, from an instant (s) on, for a duration (s)."""
 
 TOWN_LEGS = (
     Leg(8, speed_m_s=14.0),
@@ -115,7 +114,7 @@ TOWN_LEGS = (
 
 
 def town(duration_s: float) -> Path:
-    """Rest, town at 14 and 20 m/s with bends, a stop, and on."""
+    """Drive: rest, town at 14 and 20 m/s with bends, a stop, and on."""
     legs = (Leg(REST_S), *TOWN_LEGS, Leg(duration_s))
     return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
 
@@ -131,15 +130,15 @@ class Drive:
     second: bool = False
     """A second receiver, `SECOND` of the configuration, as good as the first."""
     places_alone: bool = False
-    """Receivers measure no velocity, or do not send it."""
+    """True if receivers send positions only."""
     gnss_rate_hz: float = 5.0
     duration_s: float = DURATION_S
 
     def recorded(
         self, config: Config, seed: int | np.random.SeedSequence
     ) -> tuple[Truth, Recording]:
-        """The truth, and what the sensors of the car of `fusiond simulate` say of it, mounted as
-        the configuration has them; the same seed says the same."""
+        """Truth and sensor data of the car of `fusiond simulate`, mounted as configured; equal
+        seeds give equal data."""
         car = replace(SCENARIOS["drive"], path=self.path).fitted(config)
         truth = car.truth(self.duration_s)
         sequence = np.random.SeedSequence(seed) if isinstance(seed, int) else seed

@@ -1,4 +1,4 @@
-"""One row of the matrix: a drive, its fault, the navigator that gets it, and what it says.
+"""Row of the matrix: a drive, its fault, the navigator and its output.
 
 The navigator is fed as the daemon feeds it: at each tick the samples that have come, then the
 measurements in order of arrival, then the filter as far as the IMU reaches.
@@ -59,8 +59,8 @@ VEHICLE = Config.model_validate(
         "estimator": {"model": "ins21"},
     }
 )
-"""`config/vehicle.toml` without its devices; a test holds them together. Its fixes share no
-error."""
+"""Configuration `config/vehicle.toml` without its devices, which a test compares. Its fixes share
+no error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Row:
 
 
 def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
-    """The matrix, or a part of it."""
+    """Matrix, or a part of it."""
     return [
         Row(name, p)
         for name, fault in FAULTS.items()
@@ -91,7 +91,7 @@ def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
 
 
 def placed(fault: Fault, drive: int | None) -> Fault:
-    """On the drawn drive of that number in place of the town, if it is one that happens there."""
+    """Fault on the drawn drive of that number instead of the town, if it can occur there."""
     if drive is None or fault.drive.path is not town:
         return fault
     own = fault.drive
@@ -117,7 +117,7 @@ def run_fault(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
 
 @lru_cache(maxsize=8)
 def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
-    """The same drive with nothing wrong."""
+    """Result of the same drive without a fault."""
     return course_of(Fault(drive=drive), phase, seed)
 
 
@@ -196,7 +196,7 @@ def driven(
 
 
 class _Units:
-    """Hands over the samples of a recording, of the unit that is used."""
+    """Source of a recording's samples, of the unit in use."""
 
     def __init__(
         self, config: Config, recording: Recording, on_event: Callable[[str, str, str], None]
@@ -239,7 +239,7 @@ def _said(source: str, r: Recording) -> list[ImuSample]:
 def compared(
     solution: Solution, true: States, row: int = 0, true_sd: Sequence[float] = (0.0,) * 9
 ) -> Sample:
-    """A solution against that row of true states, which are known to `true_sd` (m, m/s, rad)."""
+    """Compare a solution with that row of true states, known to `true_sd` (m, m/s, rad)."""
     t_s = solution.t_ns * 1e-9
     if solution.mode in (Mode.WAITING, Mode.ALIGNING):
         return Sample(t_s, str(solution.mode))

@@ -1,4 +1,5 @@
-"""Vehicles whose noise the filter is told: drives, receivers and IMUs of `sharpness` and `service`.
+"""Drives, receivers and IMUs of `sharpness` and `service`, with noise matched to the filter's
+settings.
 
 Everything a run draws comes from a `SeedSequence` of its drive's number and its share: drives of
 the share `looked` may be looked at while the code is changed, those of `scored` are only scored.
@@ -46,17 +47,17 @@ ENTROPY = 38
 RATE_HZ = 50.0
 SHARED_S = 60.0
 LEVER_SD_M = 1.0
-"""As `fusiond.configuration.aiding.UNKNOWN_LEVER_SD_M` of a lever arm that is not given."""
+"""Lever arm sigma, as `fusiond.configuration.aiding.UNKNOWN_LEVER_SD_M`."""
 AXLE_M = (-1.0, 0.0, 0.5)
 TYPICAL = 1.0 / 3.0
-"""Share of its class's biases in a typical unit, scales and angles, which are limits of data
-sheets; its noise is the class's."""
+"""Ratio of a typical unit's biases, scale factors and angles to the data sheet's limits; its noise
+is the class's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """One sigma of what a receiver's fixes are wrong by, (horizontal, down): `white_m` each of its
-    own, `shared_m` for `SHARED_S`."""
+    """One sigma of a receiver's errors, (horizontal, down): `white_m` independent, `shared_m` for
+    `SHARED_S`."""
 
     name: str
     quality: int
@@ -67,7 +68,7 @@ class Receiver:
 
     @property
     def options(self) -> GnssOptions:
-        """For the simulated one."""
+        """Options of the simulated receiver."""
         return GnssOptions(
             rate_hz=self.rate_hz,
             white_sd_m=self.white_m,
@@ -79,26 +80,26 @@ class Receiver:
 
     @property
     def section(self) -> dict[str, Any]:
-        """`[aiding.gnss]` that is told of it, but for the lever arm."""
+        """Matching section `[aiding.gnss]` without the lever arm."""
         level, down = self.shared_m
         shared = {"bias_sd_m": level, "bias_correlation_s": SHARED_S}
         return {**shared, **({"bias_down_sd_m": down} if down else {})}
 
 
 CODE = Receiver("code", 1, (1.5, 3.0), (0.08, 0.12))
-"""As of the prototype that the figures of issue and page are compared with."""
+"""Receiver of the prototype to which figures of issue and page refer."""
 SHARING = Receiver("code, shared errors", 1, (0.8, 1.6), (0.08, 0.12), (1.5, 3.0))
 RTK = Receiver("RTK", 4, (0.02, 0.04), (0.03, 0.05))
 _HALF = 0.5**0.5
 SHARING_RTK = replace(RTK, name="RTK, shared errors", shared_m=(0.02 * _HALF, 0.04 * _HALF))
-"""Of carrier phase the filter takes half of the variance that a fix states to be shared, beside it
-(`fusiond.navigator.intake.gnss.PHASE_SHARE`)."""
+"""Receiver of carrier phase, for which the filter assumes half of a fix's stated variance as shared
+beside it (`fusiond.navigator.intake.gnss.PHASE_SHARE`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A class of IMU, or the data sheet of `config/vehicle.toml`, and a receiver; whether its lever
-    arm is given, and what else is told."""
+    """Class of IMU, or the data sheet of `config/vehicle.toml`, with a receiver, a given or unknown
+    lever arm, and further settings."""
 
     sensor: SensorClass | Literal["data sheet"]
     receiver: Receiver
@@ -127,7 +128,7 @@ class Vehicle:
         )
 
     def unit(self) -> Config:
-        """The configuration whose IMU is the one on board."""
+        """Configuration with the IMU on board."""
         config = self.config()
         if self.told != "class" or self.sensor == "data sheet":
             return config
@@ -173,7 +174,7 @@ def drawing(share: Share, number: int, *what: int) -> np.random.Generator:
 
 
 def _stating(item: Received, vehicle: Vehicle) -> Received:
-    """With its quality and sigma."""
+    """Measurement with its quality and sigma."""
     fix, receiver = item.measurement, vehicle.receiver
     assert isinstance(fix, PositionFix)
     level, down = receiver.white_m

@@ -1,4 +1,4 @@
-"""Loss of service by a fault of a minute, and behind an outage.
+"""Loss of service by a fault of a minute, and after an outage.
 
 A drawn drive of `DURATION_S`, the MEMS unit of `config/vehicle.toml`, one receiver of one fix a
 second, no slip, noise told.
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from drivers.measurements import PositionFix
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.judge import LIE_S
@@ -59,7 +59,7 @@ DURATION_S = BEGINS_S[1] + LASTS_S + AFTER_S
 WITHIN = 1.5
 STAYS_S = 5.0
 OUTAGES_S = {150.0: 10.0, 300.0: 30.0, 450.0: 60.0}
-"""Length of an outage by its begin."""
+"""Length of an outage by its start."""
 QUIET_S = 90.0
 """Time after an outage that is studied, and no longer."""
 OUTAGE_DURATION_S = 600.0
@@ -67,7 +67,7 @@ IMU, VELOCITY, POSITION, NONE = "IMU", "velocity", "position, latency, freeze", 
 
 
 def old(r: Recording, begin_s: float, length_s: float, age_s: float) -> Recording:
-    """Fixes say where the vehicle was `age_s` before, at once and stamped as always."""
+    """Replace fixes by positions of `age_s` before, with present stamps."""
     fixes = [item for item in r.received if isinstance(item.measurement, PositionFix)]
     t_ns = np.array([item.t_ns for item in fixes])
     received = []
@@ -124,7 +124,7 @@ AFTER_OUTAGES = {
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A fault ("" of none) or the outages (None) of a drive, and the receiver that is on board."""
+    """Fault ("" for none) or outages (None) of a drive, and the receiver on board."""
 
     number: int
     receiver: str
@@ -132,7 +132,7 @@ class Job:
 
 
 def jobs(drives: int) -> list[Job]:
-    """All of a drive and a receiver together: they share what is steady."""
+    """Jobs of all faults; those with the same drive and receiver share the steady run."""
     found = []
     for number in range(drives):
         for receiver in RECEIVERS:
@@ -167,14 +167,14 @@ def service_run(job: Job, share: Share) -> dict[str, Any]:
 def _steady(
     receiver: Receiver, number: int, share: Share, duration_s: float
 ) -> tuple[Scene, Published]:
-    """A drive, and what is published with nothing wrong."""
+    """Drive, and its published solution without a fault."""
     vehicle = Vehicle("data sheet", receiver, told="noise")
     on = scene(vehicle, share, number, duration_s)
     return on, published(on.config, on.recording, on.truth)
 
 
 def figures(run: Published, steady: Published, begin_s: float, end_s: float) -> dict[str, Any]:
-    """Of a run with a fault from `begin_s` to `end_s`, beside the same without it."""
+    """Figures of a run with a fault from `begin_s` to `end_s`, against the same without it."""
     since, after = run.t_s >= begin_s - 1e-6, run.t_s >= end_s - 1e-6
     out, beyond = ~run.navigating & since, run.beyond & since
     ratios = run.ratios
@@ -205,7 +205,7 @@ def figures(run: Published, steady: Published, begin_s: float, end_s: float) -> 
 
 
 def settled(run: Published, steady: Published, after: Bools) -> dict[str, float | None]:
-    """Seconds until sigma of each quantity is within `WITHIN` of what is steady, and stays."""
+    """Seconds until sigma of each quantity stays within `WITHIN` of its steady value."""
     samples, first = round(STAYS_S / STEP_S), int(np.argmax(after))
     found = {}
     for name in AXES:
@@ -259,5 +259,5 @@ def _largest(values: Any) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """None for what JSON cannot hold."""
+    """Finite value; None for others, which JSON cannot hold."""
     return value if np.isfinite(value) else None

@@ -55,7 +55,7 @@ GROUPS = {
 
 
 def service(found: Rows) -> str:
-    """Sums by group and receiver, a line a fault, and a line a receiver and outage."""
+    """Table with sums by group and receiver, a line a fault, and a line a receiver and outage."""
     faults = [row for row in found if row["part"] == "fault"]
     outages = [row for row in found if row["part"] == "outages"]
     sums, lines = [], []
@@ -113,7 +113,7 @@ def _after(rows: Rows, length_s: float) -> tuple[str, ...]:
 
 
 def _spread(values: Iterable[float | None]) -> tuple[str, str]:
-    """Median and greatest, None being later than all."""
+    """Median and maximum, with None as the largest."""
     found = [float("inf") if value is None else value for value in values]
     return _time(found, statistics.median_low), _time(found, max)
 

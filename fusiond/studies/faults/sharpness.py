@@ -43,7 +43,7 @@ from fusiond.studies.faults.scenes import (
 
 DURATION_S = 420.0
 OUTAGES_S = {150.0: 10.0, 240.0: 30.0, 340.0: 20.0}
-"""Length of an outage by its begin."""
+"""Length of an outage by its start."""
 FIRST_S, AFTER_S = 60.0, 30.0
 PHASES = ("steady", "first minute", "outage", "after")
 RIGHT = (0.7, 1.4)
@@ -85,7 +85,7 @@ def jobs(drives: int) -> list[tuple[int, int]]:
 
 
 def sharpness_run(job: tuple[int, int], share: Share) -> dict[str, Any]:
-    """By phase and quantity: mean squares of error over sigma, error and sigma, and the time."""
+    """Mean squares of error over sigma, error and sigma by phase and quantity, and the time."""
     cell, drive = job
     vehicle = CELLS[cell]
     on = scene(vehicle, share, MOST_DRIVES * cell + drive, DURATION_S)
@@ -140,8 +140,8 @@ def phases_of(run: Published, recording: Recording) -> dict[str, Bools]:
 
 
 def moments(run: Published, where: Bools) -> dict[str, dict[str, float | None]]:
-    """Of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and those of
-    its axes that are compared at all; None where there is none, or no number."""
+    """Moments of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and
+    compared axes; None without any or with NaN."""
     found = {}
     for name, axes in AXES.items():
         there = [axis for axis in axes if not np.isnan(run.errors[where, axis]).all()]
@@ -155,8 +155,8 @@ def moments(run: Published, where: Bools) -> dict[str, dict[str, float | None]]:
 
 
 def figures(rows: Iterable[Mapping[str, Any]], phase: str, name: str) -> tuple[float, float, float]:
-    """NEES a degree, half its interval, and sigma over RMS of a quantity in a phase of runs, which
-    count alike; not a number where there is none."""
+    """NEES a degree, half its interval, and sigma over RMS of a quantity in a phase, with equal
+    weights of runs; NaN without data."""
     those = [row["phases"][phase][name] for row in rows]
     if not those or any(part is None for each in those for part in each.values()):
         return math.nan, math.nan, math.nan
@@ -170,7 +170,7 @@ def figures(rows: Iterable[Mapping[str, Any]], phase: str, name: str) -> tuple[f
 
 
 def outside(nees: float, half: float) -> str:
-    """`right`; `outside` of `RIGHT` with its whole interval; or `perhaps`."""
+    """Class of a NEES: `right`; `outside` of `RIGHT` with its whole interval; or `perhaps`."""
     low, high = RIGHT
     if low <= nees <= high:
         return "right"

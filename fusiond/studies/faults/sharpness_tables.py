@@ -1,5 +1,4 @@
-"""Tables of `sharpness`, as Markdown: how many cells are right, sums by what they share, and a line
-a cell and phase; and what `real` did, a line a drive."""
+"""Markdown tables of `sharpness` (totals, cells and phases) and of `real` (drives)."""
 
 from __future__ import annotations
 
@@ -89,7 +88,7 @@ def _entries(rows: Rows, phase: str) -> tuple[str, ...]:
 
 
 def _entry(nees: float, half: float, ratio: float) -> str:
-    """NEES, marked where it is not right, and sigma over RMS."""
+    """NEES, marked if not right, and sigma over RMS."""
     if math.isnan(nees):
         return "-"
     text = f"{nees:.2f}"
@@ -98,7 +97,7 @@ def _entry(nees: float, half: float, ratio: float) -> str:
 
 
 def _counts(found: Rows) -> list[tuple[str, ...]]:
-    """Right, perhaps and outside of cells, by what is told, phase and quantity."""
+    """Counts of right, perhaps and outside cells, by setting, phase and quantity."""
     lines = []
     for told, name in TOLD.items():
         cells = [rows for rows in _by_cell(found) if rows[0]["told"] == told]
@@ -114,7 +113,7 @@ def _counts(found: Rows) -> list[tuple[str, ...]]:
 
 
 def real(found: Rows) -> str:
-    """A line a drive as it is, and one of all its sets of outages."""
+    """Table with a line a drive, and one for all its sets of outages."""
     lines = []
     for name in dict.fromkeys(row["drive"] for row in found):
         those = [row for row in found if row["drive"] == name]

@@ -1,4 +1,4 @@
-"""Tables of the fault studies as Markdown, and into which page it goes."""
+"""Markdown tables of the fault studies, and the page of each."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ HAPPENED = (
     "longest, s",
 )
 SLOW_S = 60.0
-"""Nothing takes longer to recover from what is over."""
+"""Longest recovery from a fault that is over."""
 
 
 def recorded(found: Rows) -> str:
-    """A line a fault, phase and instant that lied, was not over a minute behind its end, or ended
-    the navigator; and the count of each verdict."""
+    """Table with a line for each fault, phase and instant that lied, lasted over a minute beyond
+    its end, or ended the navigator; and the count of each verdict."""
     named = [{**row, "fault": f"{row['fault']}, at {row['at_s']:g} s"} for row in found]
     return matrix([row for row in named if _failed(row)]).rpartition("\n\n")[0] + _count(found)
 
@@ -138,7 +138,7 @@ def power(found: Rows) -> str:
 
 
 def alarms(found: Rows) -> str:
-    """A line a vehicle and alarm, and how long an error was beyond five sigma."""
+    """Table with a line a vehicle and alarm, and the time of errors beyond five sigma."""
     hours = sum(row["hours"] for row in found)
     other_s = sum(row["not_navigating_s"] for row in found)
     return (
@@ -148,7 +148,7 @@ def alarms(found: Rows) -> str:
 
 
 def faulty(found: Rows) -> str:
-    """A line a fault, those of `alarms` of the quiet between faults, and the same of that."""
+    """Table with a line a fault, the alarms of the quiet between faults, and the errors in it."""
     lines = [
         (
             row["fault"],
@@ -234,7 +234,7 @@ TABLES: Mapping[str, Callable[[Rows], str]] = {
 
 
 def put_into(page: Path, kind: str, text: str) -> None:
-    """Replace what stands between the marks of `kind` in a page; ValueError without them."""
+    """Replace the text between the marks of `kind` in a page; ValueError without them."""
     begin, end = f"<!-- {kind}: written by --page -->\n", f"<!-- end of {kind} -->"
     before, found, rest = page.read_text().partition(begin)
     _, closed, after = rest.partition(end)

@@ -1,4 +1,4 @@
-r"""Experiments 1 to 3 of paper 004 as linear problems, which is all that the paper says of them.
+r"""Experiments 1 to 3 of paper 004 as linear problems, as far as the paper defines them.
 
 1  x a random walk, measured with noise: does the filter follow it?
 2  x constant, measured with noise: does the filter converge? Its sigma is s / sqrt(k).
@@ -37,7 +37,7 @@ SENSORS_SD = (5.0, 8.0)
 PERIOD_S, ACCELERATION = 1.0, 0.25
 """q in m^2/s^3: velocity wanders by 0.5 m/s in a second."""
 SETTLED = 50
-"""Steps after which figures count."""
+"""Steps before figures count."""
 H = np.array([[1.0, 0.0]])
 F = np.array([[1.0, PERIOD_S], [0.0, 1.0]])
 Q = ACCELERATION * np.array([[PERIOD_S**3 / 3.0, PERIOD_S**2 / 2.0], [PERIOD_S**2 / 2.0, PERIOD_S]])

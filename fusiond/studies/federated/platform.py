@@ -19,7 +19,7 @@ from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, Positi
 from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
 from fusiond.configuration.aiding import AnyAiding, GnssAiding, RdssAiding
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
@@ -56,7 +56,7 @@ AIDING: dict[str, AnyAiding] = {
 
 @lru_cache(maxsize=1)
 def active_root() -> Array:
-    """Cholesky factor (2, 2) of what the intake says of an RDSS fix here."""
+    """Cholesky factor (2, 2) of the intake's covariance of an RDSS fix here."""
     o = RdssAiding()
     lat, lon, height = ORIGIN_DEG_M
     found = RdssGeometry(o.satellites_deg).covariance(
@@ -67,7 +67,7 @@ def active_root() -> Array:
 
 
 def arrivals(rng: np.random.Generator) -> tuple[list[Measurement], dict[str, Array]]:
-    """All fixes in order of arrival, and the horizontal errors (n, 2) of each receiver's."""
+    """Fixes in order of arrival, and the horizontal errors (n, 2) of each receiver."""
     found: list[Measurement] = []
     errors: dict[str, Array] = {}
     for source, every_s in ((ACTIVE, ACTIVE_EVERY_S), (PASSIVE, 1.0)):
@@ -147,7 +147,7 @@ def _run(estimator: Estimator, samples: Array, fixes: list[Measurement]) -> Arra
 
 
 def platform(found: list[dict[str, Array]]) -> dict[str, Any]:
-    """Horizontal RMS (m) over all runs by filter and of the fixes themselves."""
+    """Horizontal RMS (m) over all runs, by filter and of the fixes."""
     return {
         f"{name}_rms_m": float(
             np.sqrt(np.mean([np.mean(np.sum(run[name] ** 2, axis=1)) for run in found]))

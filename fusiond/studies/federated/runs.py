@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
@@ -55,7 +55,7 @@ VERTICAL = 5.0 / 3.0
 GATE = 0.9999
 """The daemon's default."""
 DURATION_S, FAULT_START_S, FAULT_END_S = 240.0, 70.0, 170.0
-"""At the start the car drives at 20 m/s, from 100 to 125 s it stands."""
+"""Times of the drive: the car starts at 20 m/s and stands from 100 to 125 s."""
 STEP_M, DRIFT_M_S = 50.0, 0.5
 NEES_EVERY_S, NEES_DOF = 20, 15
 SD_ATTITUDE_DEG, SD_VELOCITY_M_S, SD_POSITION_M = (0.3, 0.3, 2.0), 0.2, 5.0
@@ -64,9 +64,9 @@ REST_S = 10.0
 STUDY_IMU = Imu(
     rate_hz=50.0, gyro_bias_initial_deg_h=36.0, gyro_scale_ppm=1e-6, accel_scale_ppm=1e-6
 )
-"""The default IMU, without scale factors, as `ins15` has none, and with a tenth of the turn-on bias
-of its gyros: with the whole of it the heading is lost by degrees before the car drives off, and the
-linearisation, not the filter, sets the NEES."""
+"""Default IMU without scale factor errors, as `ins15` has no states for them, and with a tenth of
+the turn-on bias of its gyros: the full bias loses the heading by degrees before the car drives off,
+and then the linearisation, not the filter, determines the NEES."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +81,8 @@ class Filter:
 
 @dataclass(slots=True)
 class Trace:
-    """One filter in one run: error (m, 9) once a second, NEES, when the faulty source was isolated
-    (s, not a number: never), and how often another was or it was without a fault."""
+    """Trace of one filter in one run: error (m, 9) once a second, NEES, the isolation of the faulty
+    source (s, NaN: never), and the number of false isolations."""
 
     error: Array
     nees: list[float] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Trace:
 
 @lru_cache(maxsize=1)
 def truth() -> Truth:
-    """The drive of `fusiond simulate`, its first minutes."""
+    """First minutes of the drive of `fusiond simulate`."""
     lat, lon, height = ORIGIN_DEG_M
     position = (lat * DEG, lon * DEG, height)
     return Truth(drive(DURATION_S, REST_S), position, STUDY_IMU.rate_hz, DURATION_S)
@@ -227,5 +227,5 @@ def monte_carlo(
     seed: int,
     progress: Callable[[], None] | None = None,
 ) -> list[dict[str, Trace]]:
-    """All runs, in order; on two processes when there are enough of them."""
+    """Runs in order; on two processes when there are enough of them."""
     return on_processes(partial(simulate, filters, fault, sd_m, seed), runs, progress)

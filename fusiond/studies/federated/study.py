@@ -292,7 +292,7 @@ def _experiment(key: str) -> str:
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Experiments 1 to 4 as the paper's figures, and the courses of the faults, to `path`."""
+    """Plot experiments 1 to 4 as the paper's figures, and the courses of the faults, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     figure = Figure(figsize=(9.0, 19.0), layout="constrained")

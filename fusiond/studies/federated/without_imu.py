@@ -1,4 +1,4 @@
-r"""Experiments 3 and 4 of paper 004 as the paper has them: two receivers, no inertial unit, live.
+r"""Experiments 3 and 4 of paper 004: two receivers, no inertial unit, live.
 
 The fixes go through the daemon's navigator in order of arrival, which navigates by a constant
 velocity (`fusiond.navigator.without_imu`), once with each filter of `FILTERS`.
@@ -55,12 +55,13 @@ FILTERS: dict[str, dict[str, Any]] = {
 }
 UNCORRELATED = "as if uncorrelated"
 COUNTED = [3, 4, 6, 7]
-"""Of the navigation errors: velocity and position, north and east."""
+"""Counted navigation errors: velocity and position, north and east."""
 
 
 class Course(NamedTuple):
-    """Of one filter in one run, once a second: velocity and position errors and their covariance,
-    horizontal (m, 4) and (m, 4, 4), and the position north and east of the start (m, 2)."""
+    """Course of one filter in one run, once a second: velocity and position errors and their
+    covariance, horizontal (m, 4) and (m, 4, 4), and the position north and east of the start (m,
+    2)."""
 
     x: Array
     p: Array
@@ -87,7 +88,8 @@ class Course(NamedTuple):
 
 
 class Run(NamedTuple):
-    """All filters, and each receiver's fixes: instants and position (m, 3), horizontal errors."""
+    """Run of all filters, with each receiver's fixes: instants and position (m, 3), horizontal
+    errors."""
 
     courses: dict[str, Course]
     fixes: dict[str, Array]
@@ -95,7 +97,7 @@ class Run(NamedTuple):
 
 
 def config_of(name: str, estimator: dict[str, Any], only: tuple[str, ...] = ()) -> Config:
-    """The daemon's configuration for an experiment, of all its receivers or some."""
+    """Daemon's configuration for an experiment, with all its receivers or some."""
     shared = {"bias_sd_m": SHARED_SD_M, "bias_correlation_s": SHARED_TAU_S}
     active = {"kind": "rdss", "fix_height_sd_m": HEIGHT_SD_M}
     active |= shared if name.startswith("3") else {"bias_sd_m": 0.0}
@@ -108,8 +110,8 @@ def config_of(name: str, estimator: dict[str, Any], only: tuple[str, ...] = ()) 
 
 
 def arrivals(name: str, rng: np.random.Generator) -> tuple[list[Measurement], dict[str, Array]]:
-    """All fixes in order of arrival, and of each receiver (n, 5): t (s), north, east of the start
-    (m), and the horizontal errors (m)."""
+    """Fixes in order of arrival, and for each receiver (n, 5): t (s), north, east of the start (m),
+    and the horizontal errors (m)."""
     found: list[Measurement] = []
     rows: dict[str, Array] = {}
     seconds = np.arange(0.0, DURATION_S, 0.5)
@@ -187,8 +189,8 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
 
 
 def as_if_uncorrelated(one: Course, other: Course) -> Course:
-    """Result of the formula for uncorrelated estimates with two filters that share the vehicle's
-    motion, and nothing is shared out."""
+    """Fusion by the formula for uncorrelated estimates of two filters with common vehicle motion,
+    without information sharing."""
     pairs = [
         fuse_uncorrelated(np.array(x), np.array(p))
         for x, p in zip(

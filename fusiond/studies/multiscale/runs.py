@@ -34,7 +34,7 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions
@@ -56,11 +56,11 @@ Array = NDArray[np.float64]
 ORIGIN_DEG_M = (29.0, 118.0, 50.0)
 RATE_HZ, PERIOD_S = 50.0, 1.0
 DURATION_S, COUNTED_FROM_S = 400.0, 60.0
-"""The first minute, in which the start's errors go down, does not count."""
+"""Duration and counted part; errors of the start decrease in the first minute."""
 GPS_M, GPS_M_S, TRACKER_RAD = 8.0, 0.5, 200.0 / 3600.0 * DEG
 BIAS_MG = 1.0
 GATE = 1.0 - 1e-12
-"""So wide that no filter hides its errors by refusing measurements."""
+"""Gate wide enough that no filter hides its errors by refusing measurements."""
 TIMED_S, TIMED_REPEATS = 60, 5
 NONE = 1e-9
 IMU = Imu(
@@ -85,7 +85,7 @@ CIRCUIT = (
     Leg(18, turn_deg=330.0),
     Leg(6, speed_m_s=12.0),
 )
-"""Of 12 m/s at first; one after the other. Turns bank as coordinated ones do."""
+"""Legs of the circuit, from 12 m/s, in order. Turns are coordinated."""
 
 LOCAL_FILTERS = ("gps", "star_tracker")
 NO_RESET = FederatedOptions("no_reset", fault_detection=False)
@@ -105,8 +105,8 @@ class Case:
 
 @dataclass(slots=True)
 class Trace:
-    """One filter in one run, just after each second's measurements (k): errors (k, 7) phi n e d, dv
-    n e, dr n e, the filter's sigma of each (k, 7), NEES (k,)."""
+    """Trace of one filter in one run, just after each second's measurements (k): errors (k, 7) phi
+    n e d, dv n e, dr n e, the filter's sigma of each (k, 7), NEES (k,)."""
 
     error: Array
     sigma: Array
@@ -114,7 +114,7 @@ class Trace:
 
 
 def filters() -> dict[str, Callable[[Model], Estimator]]:
-    """Every filter of the study by its name in the result."""
+    """Filters of the study by name in the result."""
     return {
         "multiscale": lambda m: MultiscaleEstimator(m, IMU.gap_s, 2),
         "federated": lambda m: NoResetFilter(m, IMU.gap_s, LOCAL_FILTERS, NO_RESET),
@@ -145,7 +145,7 @@ def epochs() -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """One run's errors: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch,
+    """Errors of one run: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch,
     start."""
 
     buffer: ImuBuffer
@@ -211,7 +211,7 @@ def begin(drawn: Drawn, make: Callable[[Model], Estimator]) -> Estimator:
 
 
 def fly(drawn: Drawn, make: Callable[[Model], Estimator]) -> Trace:
-    """One filter through one run."""
+    """Run one filter through one run's data."""
     estimator = begin(drawn, make)
     _, true, _ = epochs()
     count = len(true)
@@ -239,7 +239,7 @@ def simulate(case: Case, seed: int, number: int) -> dict[str, Trace]:
 def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
-    """All runs of a case, in order; on two processes when there are enough of them."""
+    """Runs of a case in order; on two processes when there are enough of them."""
     return on_processes(partial(simulate, case, seed), runs, progress)
 
 

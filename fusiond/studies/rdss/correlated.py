@@ -20,7 +20,7 @@ __all__ = ["CASES", "plot", "run_study", "tables"]
 DEFAULT_RUNS = 100
 FILTERS = tuple(Filter(f"bias_{sd:g}_m", "rewind", sd) for sd in (0.0, 8.0, 15.0, 30.0))
 SHARED = ((0.0, 600.0), (8.0, 600.0), (15.0, 60.0), (15.0, 600.0), (15.0, 3600.0), (30.0, 600.0))
-"""One sigma (m) and correlation time (s) of the error that the fixes share in truth."""
+"""One sigma (m) and correlation time (s) of the fixes' true shared error."""
 _DRIVE = Case("drive", level_drive, 900.0, counted_s=((300.0, 1e9),), filters=FILTERS, window=100)
 CASES = tuple(
     replace(

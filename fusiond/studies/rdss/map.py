@@ -59,7 +59,7 @@ CENTRE_DEG = (39.9, 116.4)
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The map, the places, and `runs` nonlinear solutions at each place (default 2000).
+    """Map, places, and `runs` nonlinear solutions at each place (default 2000).
 
     Cells without a fix are None, with the reason under `outcome`. All lengths in m, one sigma.
     """
@@ -177,7 +177,7 @@ def _cell(geometry: RdssGeometry, lat_deg: float, lon_deg: float) -> dict[str, A
 
 
 def _readings(geometry: RdssGeometry, lat_deg: float, lon_deg: float) -> dict[str, Any]:
-    """Sigma of the fix with `SD_RANGE_M` read in three ways, height part included.
+    """Sigma of the fix for three interpretations of `SD_RANGE_M`, height part included.
 
     `slant`: each one-way slant range, independent (what the filter uses). `path`: each measured
     path length L1, L2, independent. `common`: the same error in both slant ranges.
@@ -218,7 +218,7 @@ def path_lengths(
 def locate(
     paths: Array, height: Array, start: tuple[float, float], longitudes_deg: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Latitude and longitude (n,), rad, whose path lengths are `paths` (n, 2) at `height` (n,).
+    """Latitude and longitude (n,), rad, for path lengths `paths` (n, 2) at `height` (n,).
 
     Newton's method from `start` (rad); ArithmeticError where it does not come to 1 um.
     """

@@ -1,4 +1,4 @@
-"""Paper 000's own rows and figures beside ours: what one run gives, as the paper has one.
+"""Paper 000's tables and figures beside ours, from a single run, as in the paper.
 
 Innovations are whitened, so that one is one sigma: the paper prints curves of metres without a
 scale that could be read. K is that of the case; the paper has 50 of 55 steps.
@@ -19,7 +19,7 @@ INS = "ins_alone"
 
 
 def first_run(case: Case, traces: dict[str, Trace]) -> dict[str, Any]:
-    """Of one run: errors of the position, innovations by step, and the ways, for the figures."""
+    """Position errors, innovations by step, and tracks of one run, for the figures."""
     t_s, true = grid(case)
     scale = metres(float(true[0, 0]), YANTAI_DEG_M[2])[:2]
     way = (true[:, :2] - true[0, :2]) * scale
@@ -39,7 +39,7 @@ def _there(way: Array) -> list[list[float]]:
 
 
 def rows(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
-    """The static test as printed, and ours: average NIS with its interval, rho(1) to rho(8)."""
+    """Static test as printed, and ours: average NIS with its interval, rho(1) to rho(8)."""
     paper = result["paper"]["static"]
     table = [
         _row("paper, one test", paper["k"], paper["nis_mean"], paper["nis_interval"], paper["rho"]),
@@ -68,7 +68,7 @@ def _row(
 
 
 def draw(panels: Any, result: dict[str, Any]) -> None:
-    """Figures 1 and 2 of the paper, or 3 and 4 where the vehicle moves, on two panels."""
+    """Draw figures 1 and 2 of the paper, or 3 and 4 for a moving vehicle, on two panels."""
     first, second = panels
     run = result["first_run"]
     moves = any(abs(x) > 1.0 for x in run["way_m"]["truth"][0])

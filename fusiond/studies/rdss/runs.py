@@ -29,7 +29,7 @@ from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -51,11 +51,11 @@ YANTAI_DEG_M = (37.5, 121.4, 40.0)
 and 19 m east: 29 m in all, their "30 m"."""
 CLASS_M = 20
 GRID_S = 1.5
-"""Instants at which the live solution is compared: the paper's step."""
+"""Interval of comparison of the live solution: the paper's step."""
 NEES_EVERY = 8
 """Grid points from one NEES to the next."""
 GATE = 1.0 - 1e-12
-"""So wide that no strategy hides its errors by refusing fixes."""
+"""Gate wide enough that no strategy hides its errors by refusing fixes."""
 
 PAPER_IMU = Imu(
     rate_hz=20.0,
@@ -69,9 +69,9 @@ PAPER_IMU = Imu(
     gyro_scale_ppm=1e-6,
     accel_scale_ppm=1e-6,
 )
-"""Constant and Markov drift of 1 deg/h and 3600 s are the paper's, and an accelerometer without a
-constant part. It prints no accelerometer figure and no white noise: 100 ug, and those of
-`config/tactical.toml`."""
+"""IMU with the paper's constant and Markov drift of 1 deg/h and 3600 s, and an accelerometer
+without a constant part. The paper prints no accelerometer figure and no white noise: 100 ug, and
+those of `config/tactical.toml`."""
 
 Strategy = Literal["rewind", "optimal_prediction", "position_compensation", "none"]
 
@@ -133,8 +133,8 @@ class Fixes:
 
 @dataclass(slots=True)
 class Trace:
-    """One filter in one run: north and east error of position and velocity (m, 2) on the grid, NEES
-    at every `NEES_EVERY`-th point, whitened innovations (n, 2) in order of validity."""
+    """Trace of one filter in one run: north and east error of position and velocity (m, 2) on the
+    grid, NEES at every `NEES_EVERY`-th point, whitened innovations (n, 2) in order of validity."""
 
     error: Array
     velocity: Array
@@ -214,7 +214,7 @@ def _aiding(filter_: Filter) -> RdssAiding:
 
 
 class Navigation:
-    """One filter of a study, live: `advance` it to an instant, give it what arrives there."""
+    """Live filter of a study: `advance` it to an instant, then add the arrivals there."""
 
     def __init__(self, case: Case, filter_: Filter, samples: Array, error: Array) -> None:
         self._intake = Intake({"rdss": _aiding(filter_)})
@@ -238,7 +238,7 @@ class Navigation:
             self.innovations[entry.key[0]] = entry.outcome.whitened
 
     def advance(self, t_s: float) -> None:
-        """IMU samples up to `t_s` arrive, as far as there are any."""
+        """Add the IMU samples up to `t_s`, and run."""
         end = min(round(t_s * 1e9) // self._period_ns, len(self._samples))
         if end > self._given:
             times = np.arange(self._given + 1, end + 1, dtype=np.int64) * self._period_ns
@@ -331,7 +331,8 @@ def simulate(case: Case, seed: int, number: int) -> dict[str, Trace]:
 
 
 def _events(grid_s: Array, arrival_s: Array) -> Iterator[tuple[int | None, int]]:
-    """In order of time: (None, k) fix k arrives, (i, 0) grid point i, which comes after it."""
+    """Events in order of time: (None, k) fix k arrives, (i, 0) grid point i, which comes after
+    it."""
     k = 0
     for i, t_s in enumerate(grid_s):
         while k < len(arrival_s) and arrival_s[k] <= t_s + 1e-9:
@@ -343,5 +344,5 @@ def _events(grid_s: Array, arrival_s: Array) -> Iterator[tuple[int | None, int]]
 def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
-    """All runs of a case, in order; on two processes when there are enough of them."""
+    """Runs of a case in order; on two processes when there are enough of them."""
     return on_processes(partial(simulate, case, seed), runs, progress)

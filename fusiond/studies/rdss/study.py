@@ -82,7 +82,7 @@ def run_cases(
 
 
 def figures(case: Case, results: Runs) -> dict[str, Any]:
-    """The case, the figures of each filter, and the course of the horizontal RMS over time."""
+    """Case, figures of each filter, and the course of the horizontal RMS over time."""
     t_s, _ = grid(case)
     counted = np.zeros(len(t_s), dtype=bool)
     for start, end in case.counted_s:
@@ -121,7 +121,7 @@ def add_times(found: dict[str, Any], case: Case, seed: int) -> None:
 
 
 def _errors(results: Runs, name: str, reference: str, counted: Array) -> dict[str, Any]:
-    """RMS errors, and what the filter loses against the first one, paired run by run."""
+    """RMS errors, and the filter's loss against the first one, paired run by run."""
     e = np.array([traces[name].error[counted] for traces in results])
     v = np.array([traces[name].velocity[counted] for traces in results])
     best = np.array([traces[reference].error[counted] for traces in results])
@@ -139,7 +139,7 @@ def _errors(results: Runs, name: str, reference: str, counted: Array) -> dict[st
 
 
 def _rms(e: Array, axis: int | None = None) -> Array:
-    """Root mean square length of the vectors (..., 2), undefined ones left out."""
+    """RMS length of the vectors (..., 2), without undefined ones."""
     return np.asarray(np.sqrt(np.nanmean(np.square(e).sum(axis=-1), axis=axis)))
 
 
@@ -186,7 +186,7 @@ def _consistency(results: Runs, name: str, k: int) -> dict[str, Any]:
 
 
 def judged_windows(nu: Array, k: int) -> list[Consistency]:
-    """Whitened innovations (n, m) in windows of K and the `LAGS` before them, judged each alone."""
+    """Windows of K whitened innovations (n, m) with the `LAGS` before them, judged separately."""
     found = []
     for start in range(0, len(nu) - k - LAGS + 1, k + LAGS):
         rows = nu[start : start + k + LAGS]

@@ -22,7 +22,7 @@ from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.bearing import BearingMeasurement
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S
@@ -56,12 +56,12 @@ IMU = Imu(
     gyro_scale_ppm=1e-6,
     accel_scale_ppm=1e-6,
 )
-"""The paper's 0.1 deg/h for the constant and for the Markov part, its 1e-4 g for a constant bias.
-Correlation time of paper 000; white noise of a gyro of that grade (0.01 deg/sqrt(h)). Nothing
-changes along a straight flight, so 20 Hz serve."""
+"""IMU with the paper's 0.1 deg/h for the constant and for the Markov part, and its 1e-4 g for a
+constant bias. Correlation time of paper 000; white noise of a gyro of that grade (0.01
+deg/sqrt(h)). Nothing changes along a straight flight, so 20 Hz suffice."""
 
 RANGE_SD_M, RATE_SD_M_S = 5.0, 0.05
-"""Code with its atmosphere modelled, and Doppler."""
+"""One sigma of code with modelled atmosphere, and of Doppler."""
 BEARING_SD_RAD = 1e-3
 """A resolution cell of some tens of metres at 30 km."""
 SAR_SD_RAD = 20.0 * ARC_SECOND
@@ -71,7 +71,7 @@ seconds cannot come out of a radar that is mounted less well than that."""
 EPOCH_NS = 1_000_000_000
 MASK_RAD = 10.0 * DEG
 CHOICE_S = 60.0
-"""The satellites are chosen anew this often."""
+"""Interval at which the satellites are chosen."""
 WEEK = round(EPOCH_S / WEEK_S)
 POINT_SPACING_S = 150.0
 POINT_ASIDE_M = 30_000.0
@@ -171,7 +171,7 @@ DRAWN = len(list(beidou_slots())) + 1
 
 @lru_cache(maxsize=4)
 def scenes(seconds: float, all_in_view: bool = False) -> tuple[Scene, ...]:
-    """One for each second of the flight, from 1 s on: the best four, or all above the mask."""
+    """Scenes for each second of the flight, from 1 s on: the best four, or all above the mask."""
     nav = true_nav(truth(seconds))
     sky_of = Constellation(constellation(WEEK, 0.0, ("C",)))
     names: tuple[str, ...] = ()
@@ -192,7 +192,7 @@ def scenes(seconds: float, all_in_view: bool = False) -> tuple[Scene, ...]:
 
 
 def _point(nav: Array, k: int) -> Vector3:
-    """The radar point abeam of the middle of the stretch that second k lies in."""
+    """Radar point abeam of the middle of second k's stretch."""
     number = int(k // POINT_SPACING_S)
     # Due east at a constant speed: longitude grows evenly.
     rate = (nav[-1, 1] - nav[0, 1]) / (len(nav) - 1)
@@ -235,7 +235,7 @@ def measurements(scene: Scene, values: Array) -> Measurements:
 
 
 def rows(of: Measurements, state: State) -> Innovation:
-    """The rows of both measurements, one below the other."""
+    """Rows of both measurements, stacked."""
     found = [measurement.innovation(state) for measurement in of]
     refused = [f.outcome for f in found if isinstance(f, NotApplicable)]
     if refused:
@@ -245,7 +245,7 @@ def rows(of: Measurements, state: State) -> Innovation:
 
 
 def measured(scene: Scene, true: State, noise: Array) -> Measurements:
-    """Measurement in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
+    """Measurement in the `true` state, with its parameters; `noise` (rows,) in sigmas."""
     z, _, r = rows(
         measurements(scene, np.zeros(scene.rows)), true
     )  # of measured zeros: what is predicted
@@ -261,7 +261,7 @@ def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
 
 
 class Transitions(Estimator):
-    """The filters' own propagation, asked for the transition and noise of a second."""
+    """Transitions of the filters' own propagation, with the noise of a second."""
 
     carries_transition = True
 
@@ -278,7 +278,7 @@ class Transitions(Estimator):
 
 
 def systems(of: Model, seconds: float) -> Iterator[System]:
-    """The linear model of each second along the true flight, as the filter would have it there."""
+    """Linear model of each second along the true flight, as in the filter."""
     flight = truth(seconds)
     nav = true_nav(flight)
     buffer = imu_buffer(np.hstack([flight.gyro, flight.accel]))

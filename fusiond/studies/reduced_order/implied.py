@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 ROOT_HOUR = 60.0
 GYRO_DEG_SQRT_H = 0.112
 GYRO_OF_17_DEG_SQRT_H, ACCELEROMETER_OF_17_M_S_SQRT_H = 0.72, 1.73
-"""Of the filter with 17 states: what constant drifts and biases are to it."""
+"""Noises of the filter with 17 states that represent constant drifts and biases."""
 
 
 class Sensors(NamedTuple):
@@ -90,7 +90,8 @@ def level_axis(tilt_arcsec: float, velocity_m_s: float) -> LevelAxis:
 
 
 def azimuth_ratio(of_17_arcsec: float, of_23_arcsec: float) -> float:
-    """Ratio of a gyro's noise to the 17 to its own, by azimuths of a radar without misalignment."""
+    """Ratio of the gyro noise in the 17 states' filter to the gyro's own, by azimuths of a radar
+    without misalignment."""
     half = (of_17_arcsec / of_23_arcsec) ** 2
     return half + math.sqrt(half**2 - 1.0)
 
@@ -151,8 +152,8 @@ def _initial(of: Model, sensors: Sensors) -> Array:
 def _with(
     systems: list[System], of: Model, white: dict[str, float], sensors: Sensors
 ) -> Iterator[System]:
-    """The flight with densities (unit^2 / s) of some blocks and other sensors; a level flight, so
-    that noise of body axes is that of north, east, down."""
+    """Flight with densities (unit^2 / s) of some blocks and other sensors; level, so that noise of
+    body axes is that of north, east, down."""
     own = {block.name: block.white for block in of.blocks}
     more = np.zeros(of.size)
     for name, density in white.items():

@@ -75,7 +75,7 @@ def paper_rows() -> list[list[str]]:
 
 
 def curves(of: Iterable[Array]) -> dict[str, list[list[float]]]:
-    """Both figures of covariances (n, n) over time, for `picture`."""
+    """Curves of both figures over time, from covariances (n, n), for `picture`."""
     found = [east_north_up(p) for p in of]
     return {key: [figures[k] for figures in found] for k, key in enumerate(KEYS)}
 

@@ -1,4 +1,4 @@
-r"""Observability of paper 002's 23 states at rest, where it argues for leaving six of them out.
+r"""Observability of paper 002's 23 states at rest, the paper's argument for omitting six of them.
 
 F and H are constant: the vehicle stands at the start of the flight under the satellites of that
 instant, the radar sees its first point. Rank is that of the rows over the flight's 4000 s
@@ -27,7 +27,7 @@ def state_names(of: Model) -> list[str]:
 
 
 def found(seconds: float = flight.DURATION_S) -> dict[str, Any]:
-    """Rank and hidden directions, by GNSS alone (`gnss`) and with the radar (`gnss_sar`)."""
+    """Rank and unobservable directions, by GNSS alone (`gnss`) and with the radar (`gnss_sar`)."""
     of = flight.model("ins23")
     still = Profile([0.0], [0.0])
     path = Path(still, Profile([0.0], [0.5 * math.pi]), still)

@@ -48,7 +48,8 @@ def combinations(of: Model) -> Array:
 
 @dataclass(slots=True)
 class Flown:
-    """One filter in one run: error (k, 20) and what it believes of it (k, 20, 20)."""
+    """Result of one filter in one run: error (k, 20) and its covariance in the filter (k, 20,
+    20)."""
 
     error: Array
     believed: Array
@@ -170,7 +171,7 @@ def monte_carlo(
     progress: Callable[[], None],
     all_in_view: bool = False,
 ) -> dict[str, Flown]:
-    """All runs of `fly`, stacked: error (runs, k, 20) and belief (runs, k, 20, 20) by filter."""
+    """Runs of `fly`, stacked: error (runs, k, 20) and covariance (runs, k, 20, 20) by filter."""
     one_run = partial(fly, models, seconds, every_s, all_in_view, seed)
     found = on_processes(one_run, runs, progress)
     return {
@@ -183,7 +184,7 @@ def monte_carlo(
 
 
 def nees(error: Array, p: Array) -> Array:
-    """e^T P^-1 e (runs, k) for errors (runs, k, m) and covariances (1 or runs, k, m, m).
+    """NEES e^T P^-1 e (runs, k) for errors (runs, k, m) and covariances (1 or runs, k, m, m).
 
     States differ by ten orders of magnitude: scaled to unit variance first.
     """

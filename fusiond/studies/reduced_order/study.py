@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.studies.covariance_analysis import Result, System, analyse
@@ -161,7 +161,7 @@ def _analysis(models: dict[str, Model], systems: dict[str, list[System]]) -> dic
 
 
 def _sigmas(of: Analysed) -> dict[str, Any]:
-    """True error and belief at the end, and the NEES that the analysis expects."""
+    """True error and the filter's sigma at the end, and the expected NEES."""
     last = of.results[-1]
     later = of.results[len(of.results) // 2 :: SERIES_EVERY_S]
     expected = [_expected_nees(r) for r in later]

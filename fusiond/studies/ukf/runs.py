@@ -31,7 +31,7 @@ from fusiond.aiding.height import HeightMeasurement
 from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeMeasurement, epoch_values
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
@@ -76,11 +76,11 @@ SLANT_SD_M, HEIGHT_SD_M = 15.3, 10.0
 RANGE_SD_M, RATE_SD_M_S = 3.0, 0.1
 SATELLITES = (4, 10)
 MASK_RAD, MOST_PDOP = 10.0 * DEG, 6.0
-"""Satellites of a run are any of those above the mask that do not exceed the customary PDOP."""
+"""Mask and PDOP: satellites of a run are above the mask and within the customary PDOP."""
 START = (2300, 345_600.0)
-"""GPS week and second of it."""
+"""Start as GPS week and second."""
 GATE = 1.0 - 1e-9
-"""So wide that a matched filter refuses nothing: what is refused was badly predicted."""
+"""Gate wide enough that a matched filter refuses nothing; a refusal shows a bad prediction."""
 COUNTED_S = 30.0
 """Errors count from here: the first corrections of a poor start have been made."""
 NEES_EVERY_S = 15.0
@@ -93,8 +93,9 @@ FILTERS: dict[str, Callable[[Model], KalmanEstimator]] = {
     "ekf": lambda model: KalmanEstimator(model, IMU.gap_s),
     "invariant": lambda model: InvariantFilter(model, IMU.gap_s),
 }
-"""Sigma points for all, for the measurements alone (the daemon's default), and none:
-in plain errors, and with what turns with the heading, as the daemon's `kalman` starts."""
+"""Filters with sigma points for all, for the measurements alone (the daemon's default), and
+without: in plain errors, and with errors that turn with the heading, as in the start of the
+daemon's `kalman`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +121,8 @@ PROBLEMS = (
 
 @dataclass(slots=True)
 class Trace:
-    """One filter in one run: horizontal error (m) at each epoch, NEES after the first epoch and
-    every `NEES_EVERY_S` seconds, whether it has converged, and rows or measurements that were
-    refused.
+    """Trace of one filter in one run: horizontal error (m) at each epoch, NEES after the first
+    epoch and every `NEES_EVERY_S` seconds, convergence, and refused rows or measurements.
 
     Converged: over the last `LAST_S` the horizontal RMS is at most one sigma of what a single
     epoch's measurements give without an INS."""
@@ -144,7 +144,7 @@ def epochs(problem: Problem) -> Array:
 
 @lru_cache(maxsize=2)
 def _true_states(every_s: float) -> tuple[Array, Array, Array]:
-    """At 0 and each epoch: navigation states (n + 1, 10), the antenna's ECEF position and velocity
+    """Navigation states (n + 1, 10) at 0 and each epoch, the antenna's ECEF position and velocity
     (n + 1, 3)."""
     t_s: Array = np.arange(int(DURATION_S / every_s) + 1, dtype=np.float64) * every_s
     antenna = drive_truth().at(t_s, LEVER)
@@ -158,8 +158,8 @@ def _true_states(every_s: float) -> tuple[Array, Array, Array]:
 
 @lru_cache(maxsize=1)
 def _satellites() -> tuple[tuple[str, ...], Array, Array]:
-    """Names, positions and velocities (epochs, n, 3) of the BeiDou satellites that are above the
-    mask all the time."""
+    """Names, positions and velocities (epochs, n, 3) of the BeiDou satellites above the mask
+    throughout."""
     week, tow_s = START
     sky = Constellation(constellation(week, tow_s, ("C",)))
     lat, lon, height = ORIGIN_DEG_M
@@ -204,7 +204,7 @@ def draw_satellites(rng: np.random.Generator, number: int) -> tuple[Indices, flo
 
 
 def draw_clock(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Offset (m) and drift (m/s) at each IMU sample, from the model that the filter has."""
+    """Offset (m) and drift (m/s) at each IMU sample, from the filter's model."""
     n, h = round(DURATION_S * IMU.rate_hz), 1.0 / IMU.rate_hz
     decay = math.exp(-h / CLOCK.drift_tau_s)
     noise = rng.standard_normal(n) * CLOCK.drift_steady * math.sqrt(1.0 - decay * decay)
@@ -353,5 +353,5 @@ def _refused(entry: Entry) -> int:
 def monte_carlo(
     problem: Problem, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
-    """All runs of a problem, in order, on two processes."""
+    """Runs of a problem in order, on two processes."""
     return on_processes(partial(simulate, problem, seed), runs, progress)

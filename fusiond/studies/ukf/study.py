@@ -124,7 +124,7 @@ def _finding(problems: dict[str, Any]) -> str:
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """One table: problems and filters down, figures across."""
+    """Table: problems and filters down, figures across."""
     low, high = result["nees_interval"]
     rows = [
         [
@@ -158,7 +158,7 @@ TITLES = {
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Horizontal RMS and mean NEES over time, one row a problem, to `path`."""
+    """Plot horizontal RMS and mean NEES over time, one row a problem, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     problems = result["problems"]

@@ -1,4 +1,4 @@
-r"""A car of which nobody has measured anything: its truth is drawn from the filter's own priors.
+r"""Car with unmeasured parameters, whose truth is drawn from the filter's own priors.
 
 Every block of fusiond.models.vehicle has a true value of its own in each run:
 
@@ -30,7 +30,7 @@ from drivers.standard_atmosphere import pressure_height_m
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG
+from fusiond.configuration.si_units import DEG
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
@@ -73,7 +73,7 @@ STEP_M_S = 1.0 / 3.6
 FIX_SD_M, FIX_VELOCITY_SD_M_S = (0.02, 0.02, 0.04), (0.03, 0.03, 0.05)
 """A receiver with fixed ambiguities: what shows a lever arm of decimetres."""
 STANDS_M_S = 0.5
-"""Below it wheels give no pulses: the speed reads 0, without noise."""
+"""Speed below which wheels give no pulses: they read 0, without noise."""
 WHEEL_HZ, SLIP_HZ, AIR_HZ, AIR_SD_M = 2.0, 5.0, 1.0, 2.0
 VEHICLE: dict[str, Any] = {
     # What a rest before the drive leaves of a `mems` unit's biases.
@@ -111,14 +111,14 @@ class SlippingConstraint(NonHolonomicConstraint):
         return found._replace(z=found.z + np.array(self.slip))
 
     def packed(self, model: Model) -> None:
-        """A kernel knows nothing of the slip."""
+        """No packed row, since a kernel ignores the slip."""
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class Car:
-    """One run: IMU samples (n, 6), body axes; measurements in order; the true value of each block
-    at the end; and the mounting as a matrix (3, 3), from the IMU's axes to the car's."""
+    """Run: IMU samples (n, 6), body axes; measurements in order; the true value of each block at
+    the end; and the mounting as a matrix (3, 3), from the IMU's axes to the car's."""
 
     truth: Truth
     samples: Array
@@ -135,7 +135,7 @@ class Car:
 
 
 def draw_car(config: Config, path: Path, seconds: float, rng: np.random.Generator) -> Car:
-    """A car on `path` (of its rear axle)."""
+    """Car on `path` (of its rear axle), drawn at random."""
     slip, wheel = config.constraints.non_holonomic, config.aiding["wheel"]
     mounting = rng.standard_normal(2) * (slip.mounting_sd_deg * DEG)
     turn = dcm_from_quaternion(np.array(rotation_vector_to_quaternion(0.0, *mounting)))
@@ -209,7 +209,7 @@ def _fixes(
 def _speeds(
     o: Any, truth: Truth, true: dict[str, Array], rng: np.random.Generator
 ) -> list[Measured]:
-    """At the wheel's point, which is the IMU's: `[aiding.wheel] lever_arm_m` is zero."""
+    """Speeds at the wheel's point, which is the IMU's: `[aiding.wheel] lever_arm_m` is zero."""
     t_s = np.arange(0.21, truth.duration_s - 0.5, 1.0 / WHEEL_HZ)
     n = len(t_s)
     scale, share = rng.standard_normal() * o.scale_sd, rng.standard_normal() * SHARED_SD

@@ -1,4 +1,4 @@
-"""One run of the filter on a drawn car, and the NEES of what it estimates."""
+"""Run of the filter on a drawn car, and the NEES of its estimates."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -46,7 +46,7 @@ PATHS = {"shown": (shown, SHOWN_S), "hidden": (hidden, HIDDEN_S)}
 
 
 def model_of(config: Config) -> Model:
-    """The error state, with the blocks of the vehicle and of its measurements."""
+    """Error state with the blocks of the vehicle and of its measurements."""
     blocks = vehicle_blocks(config.constraints.non_holonomic)
     blocks += Intake(config.aiding).extra_blocks()
     return make_model(config.estimator.model, imu_noise(config.imu), *blocks)
@@ -54,8 +54,8 @@ def model_of(config: Config) -> Model:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """At the end: by block its error (k,), one sigma and prior (k,), and the joint NEES; outcomes
-    of the measurements."""
+    """Result at the end: by block its error (k,), one sigma and prior (k,), and the joint NEES;
+    outcomes of the measurements."""
 
     errors: dict[str, Array]
     sigmas: dict[str, Array]
@@ -65,8 +65,8 @@ class Run:
 
 
 def run_once(config: Config, path: str, seed: int, number: int, known: bool = True) -> Run:
-    """Draw car `number` of a seed and drive it, from an error of `START_SD` on; `known`: whether
-    the filter has the noise of axes that are out of square."""
+    """Draw car `number` of a seed and drive it, from an error of `START_SD` on; `known`: the filter
+    has the noise of non-orthogonal axes."""
     # A seed's thousand cars, then others: no two seeds share any.
     thousand, left = divmod(number, 1000)
     rng = np.random.default_rng([1000 * seed + left, sorted(PATHS).index(path), thousand])

@@ -36,7 +36,7 @@ CASES: dict[str, tuple[str, dict[str, float], bool]] = {
     "askew": ("shown", MISALIGNED, True),
     "askew, no noise for it": ("shown", MISALIGNED, False),
 }
-"""Path, IMU, and whether the filter has the noise of axes out of square."""
+"""Path and IMU, and True if the filter has the noise of non-orthogonal axes."""
 
 
 def _one(case: str, seed: int, number: int) -> Run:
@@ -89,7 +89,7 @@ def run_study(
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """NEES by block and case with the interval of a matched filter, to `path`."""
+    """Plot NEES by block and case with the interval of a matched filter, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[studies]`)
 
     names = list(dict.fromkeys(row["block"] for row in result["blocks"]))

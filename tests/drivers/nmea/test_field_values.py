@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pynmeagps.exceptions import NMEATypeError
+from pynmeagps.nmeahelpers import dmm2ddd
 from pynmeagps.nmeareader import NMEAReader
 
 from drivers.measurements import (
@@ -108,9 +109,13 @@ def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length:
     try:
         wanted = NMEAReader.parse(made(",".join([address, *printed])), validate=0)
     except NMEATypeError:
-        # An angle that is none is empty there, and may stand before the field that raises.
-        with pytest.raises(ValueError, match=r"could not convert|invalid literal|not an angle"):
-            typed(address[2:], printed)
+        # Here an angle that is none raises as well: the field that raises there is found without it.
+        plain = [
+            "" if text and (address[2:], k) in _ANGLES and dmm2ddd(text) == "" else text
+            for k, text in enumerate(printed)
+        ]
+        with pytest.raises(ValueError, match=r"could not convert|invalid literal"):
+            typed(address[2:], plain)
         return
     angles = (_ANGLES.get((address[2:], k), "") for k, text in enumerate(printed) if text)
     if any(name and getattr(wanted, name) == "" for name in angles):  # passed there as empty

@@ -1,5 +1,5 @@
-"""Counters since the daemon's start, as what they were in the last minute: an alarm ends when what
-it tells of has ended."""
+"""Counters of the last minute, from counters since the daemon's start, so that an alarm ends with
+its cause."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from collections.abc import Mapping
 from typing import Any
 
 WINDOW_S = 60.0
-"""Long enough for six ticks in a thousand at 100 Hz to be more than an accident."""
+"""Length of the window; six ticks in a thousand at 100 Hz are more than an accident in it."""
 
 
 class Recent:
-    """Of one topic: its counters `names`. One that goes back tells of a daemon that began anew."""
+    """Counters `names` of one topic over the last minute. A counter that falls shows a restart of
+    the daemon."""
 
     def __init__(self, *names: str) -> None:
         self._names = names
         self._window: deque[tuple[float, dict[str, int]]] = deque()
 
     def of(self, said: Mapping[str, Any], at_s: float) -> dict[str, Any]:
-        """The message with each counter less what it was a minute ago, or at the first message
-        since then."""
+        """Message with each counter less its value a minute ago, or at the first message since
+        then."""
         now = {name: said[name] for name in self._names if isinstance(said.get(name), int)}
         if self._window and any(now.get(n, 0) < k for n, k in self._window[-1][1].items()):
             self._window.clear()

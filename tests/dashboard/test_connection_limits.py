@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.dashboard import connections
-from fusiond.dashboard.connections import MOST_CONNECTIONS
+from fusiond.dashboard import connection_limits
+from fusiond.dashboard.connection_limits import MOST_CONNECTIONS
 from fusiond.dashboard.serve import PMTILES
 from tests.dashboard.serving import at_work, browsing
 from tests.dashboard.test_page import make_hub
@@ -81,8 +81,8 @@ async def test_a_thousand_slow_ones_keep_nobody_from_the_page(said: bytes) -> No
 async def test_a_request_that_does_not_come_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(connections, "REQUEST_S", 0.2)
-    monkeypatch.setattr(connections, "LOOK_S", 0.05)
+    monkeypatch.setattr(connection_limits, "REQUEST_S", 0.2)
+    monkeypatch.setattr(connection_limits, "LOOK_S", 0.05)
     async with at_work(make_hub()) as address, browsing(address) as browser:
         await ended(await opened(address))
         await ended(await opened(address, b"GET / HT"))
@@ -96,8 +96,8 @@ async def test_a_request_that_does_not_come_is_not_waited_for(
 async def test_who_takes_nothing_of_an_answer_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "STUCK_S", 0.3)
-    monkeypatch.setattr(connections, "LOOK_S", 0.05)
+    monkeypatch.setattr(connection_limits, "STUCK_S", 0.3)
+    monkeypatch.setattr(connection_limits, "LOOK_S", 0.05)
     land = tmp_path / "land.pmtiles"
     land.write_bytes(PMTILES + bytes(8_000_000))
     async with at_work(make_hub(), base_map=land) as address:

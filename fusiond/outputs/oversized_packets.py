@@ -1,4 +1,4 @@
-"""Packets of a broker that are longer than anything of ours: read to their end, and not kept.
+"""Limit on a broker's packets: longer ones are read to their end and discarded.
 
 MQTT lets a message have 256 MB. A client of MQTT 5 tells its broker what it takes at most
 (`outputs.mqtt_version`); a broker of 3.1.1 is told nothing. So the length is looked at here, before
@@ -18,8 +18,8 @@ LONGEST_TOPIC = 65_535 + 8
 PIECE = 4096
 """Bytes of a read; paho makes a hundred in one turn of the loop."""
 HELD_BYTES = 131_072
-"""Asked of the kernel, which takes twice as much: some thousand small messages, which take 0.1 s to
-drop, and enough that large ones are read as fast as they come."""
+"""Receive buffer (bytes) requested from the kernel, which doubles it: some thousand small messages,
+dropped within 0.1 s, and large enough to read large ones at full speed."""
 SOCKET_OPTIONS = (
     # Else a message waits for the broker's word on the one before (Nagle): 20 ms of gap.
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
@@ -28,7 +28,7 @@ SOCKET_OPTIONS = (
 
 
 def limit(client: aiomqtt.Client, most_payload: int) -> None:
-    """Let no more of a payload be held than shows that it has more than `most_payload` bytes.
+    """Limit the stored payload to `most_payload` bytes and one more.
 
     paho has no such limit, so its reads are cut where it makes them; aiomqtt keeps it as `_client`.
     """

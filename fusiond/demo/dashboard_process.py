@@ -12,13 +12,13 @@ from types import TracebackType
 from fusiond.demo.broker import DemoError
 
 PORT = 8088
-"""Of the page, unless it is taken: the address can be kept open from one demo to the next."""
+"""Preferred port of the page, so that its address stays the same from demo to demo."""
 _END_S = 5.0
 _PR_SET_PDEATHSIG = 1
 
 
 def _end_with_the_demo() -> None:
-    """Ask the kernel for SIGTERM when the parent dies, however it does (prctl(2))."""
+    """Ask the kernel for SIGTERM when the parent dies (prctl(2))."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

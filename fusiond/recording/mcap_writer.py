@@ -1,4 +1,4 @@
-"""One MCAP file in writing: its description first, then messages in chunks.
+"""Writer of one MCAP file: its description first, then messages in chunks.
 
 Every file carries configuration, DBC files, version and host: each split can be read alone. What is
 flushed and synced outlives a power cut; a chunk that was under way then is lost, no more.
@@ -20,7 +20,7 @@ CHUNK_BYTES = 128 * 1024
 """Lost at most when a chunk is cut off; compressed at once in 15 ms, where 1 MiB takes 70."""
 METADATA = "fusiond"
 FORMAT = "1"
-"""Of the records and of what is in the metadata; a reader refuses a higher one."""
+"""Version of the format of records and metadata; a reader refuses a higher one."""
 SUFFIX = ".mcap"
 
 
@@ -63,7 +63,7 @@ class LogFile:
 
     @property
     def size(self) -> int:
-        """Bytes so far, those since the last sync before compression."""
+        """Bytes written, those since the last sync before compression."""
         return self._synced + self._unflushed
 
     def write(self, channel: Channel, t_log_ns: int, data: bytes, sequence: int = 0) -> None:
@@ -89,7 +89,7 @@ class LogFile:
         return number
 
     def sync(self) -> None:
-        """Everything so far is on the disk when this returns."""
+        """Write everything to disk before returning."""
         self._writer.flush()
         self._synced, self._unflushed = self._file.tell(), 0
         os.fsync(self._file.fileno())
@@ -102,7 +102,7 @@ class LogFile:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close what can no longer be written; it is readable up to its last whole chunk."""
+        """Close a file that can no longer be written; it is readable up to its last whole chunk."""
         try:
             self._file.close()
         except OSError:  # the buffer could not be written; raw closes all the same

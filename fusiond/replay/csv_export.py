@@ -1,4 +1,4 @@
-"""A log's measurements as this project's CSV tables (docs/files.md): what `fusiond process` reads.
+"""Conversion of a log's measurements to CSV tables for `fusiond process` (docs/files.md).
 
 The recorded bytes go through the drivers and the clock as they did live; each measurement is
 written at the instant that the clock gave it. t_s is the log's time: POSIX seconds where the daemon
@@ -51,7 +51,7 @@ def arrivals(
     config: Config,
     on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None],
 ) -> None:
-    """Report every measurement of the log with its instant; no filter runs."""
+    """Report every measurement of the log with its instant, without a filter."""
     replay = Replay(recording, config, navigate=False, on_arrival=on_arrival)
     for _ in replay.ticks():
         pass

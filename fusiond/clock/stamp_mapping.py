@@ -1,4 +1,4 @@
-"""One clock: every stamp a device can give becomes an instant of the host's monotonic clock.
+"""Conversion of every device's stamps to the host's monotonic clock.
 
 Three relations are kept, each on its own evidence:
 
@@ -34,7 +34,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from fusiond.clock import dates
+from fusiond.clock import plausible_dates
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
     KERNEL_FUTURE_NS,
@@ -47,7 +47,7 @@ from fusiond.clock.host import (
 )
 from fusiond.clock.results import ClockStatus, Instant, TimeSample
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
-from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown
+from fusiond.clock.utc_from_arrivals import UtcEnvelope, UtcKnown
 from fusiond.configuration.schema import ClockOptions
 
 _KERNEL_MAX_AGE_NS = SECOND_NS
@@ -58,18 +58,19 @@ _UTC_MAX_DELAY_NS = 60 * SECOND_NS
 """Longer than a tty's queue holds: a stamp older by its own source's UTC belongs to another UTC."""
 _UTC_FUTURE_NS = 100 * MILLISECOND_NS
 _SYSTEM_LATENCY_NS = SECOND_NS
-"""Every fix of a receiver older than this by the system clock: the system clock is wrong."""
+"""Delay from which a receiver's fixes prove the system clock wrong."""
 _SOURCE_SILENT_NS = 60 * SECOND_NS
 _SAME_UTC_NS = 3 * SECOND_NS
-"""Sources this close state the same UTC: whole seconds, and delays up to 2 s."""
+"""Difference up to which two sources state the same UTC: whole seconds, and delays up to 2 s."""
 _RESUMED_NS = 60 * SECOND_NS
-"""Older knowledge is learnt anew: drift of 100 ppm has made 6 ms of it, twice what it is worth."""
+"""Age from which saved UTC is learnt again: 100 ppm of drift are then 6 ms, twice its sigma."""
 _BETTER_NS = 5 * MILLISECOND_NS
 _REPORTED_STEP_NS = 500 * MILLISECOND_NS
-"""A change of UTC this large is an event when another source becomes the reference."""
+"""Change of UTC from which another reference is reported as an event."""
 
 _SETS_CLOCKS_SD_S = 2e-2
-"""After eight reports of a receiver; one of whole seconds, late by up to a second, takes fifty."""
+"""Sigma up to which UTC may set clocks. A receiver reaches it after eight reports, or fifty of
+whole seconds delayed by up to a second."""
 
 _KERNEL_SD_S = 1e-4
 _DEVICE_SD_S = 5e-4
@@ -77,9 +78,9 @@ _SYSTEM_SD_S = 1e-2
 _ARRIVAL_SD_S = 5e-3
 """A USB serial read arrives 1 to 16 ms late: uniform, 16 ms / sqrt(12)."""
 _GUESSED_SD_S = 0.5
-"""Sentences come 20 to 200 ms after their epoch, and with one receiver always alike. A filter takes
-the error of a fix for independent of the next one's and averages it: hence three times the most
-that it can be (a drive at 15 m/s with 0.15 s: 8 sigma)."""
+"""Sigma of an assumed delay. Sentences come 20 to 200 ms after their epoch, with one receiver
+always alike. A filter averages the errors of fixes as independent; sigma is therefore three times
+the largest error (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 
 
 class Clock:
@@ -119,7 +120,7 @@ class Clock:
         return self._system.state()
 
     def restore_system(self, state: Mapping[str, int | None]) -> None:
-        """Know of the system clock what another `Clock` did at its start."""
+        """Restore another `Clock`'s state of the system clock, from its start."""
         self._system.restore(state)
 
     def look(self) -> int:
@@ -131,7 +132,7 @@ class Clock:
         return offset_ns
 
     def _changed(self) -> None:
-        """The host has slept, or its clock was set, or both."""
+        """Handle a suspend of the host, a step of its clock, or both."""
         stepped_ns = self._system.last_step_ns
         slept_ns = self._system.slept_ns - self._slept_ns
         if slept_ns:
@@ -152,7 +153,7 @@ class Clock:
             self.on_event(code, text)
 
     def _envelope(self, of: dict[str, UtcEnvelope], source: str) -> UtcEnvelope:
-        """The one of `source`; the first time, one that has heard nothing."""
+        """UTC envelope of `source`, created on first use."""
         if source not in of:
             of[source] = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
         return of[source]
@@ -160,7 +161,7 @@ class Clock:
     # ------------------------------------------------------------------ stamps
 
     def resolve(self, stamp: Stamp, source: str, t_seen_ns: int) -> Instant:
-        """The instant at which a measurement of `source`, seen at `t_seen_ns`, was true.
+        """Instant of validity of a measurement of `source` that was seen at `t_seen_ns`.
 
         Not after `t_seen_ns`, but for a `MonotonicStamp`, which is taken as it is, and for the
         nanosecond that keeps a device's samples apart.
@@ -176,7 +177,7 @@ class Clock:
                 t_ns = device.to_monotonic(stamp.ticks_ns, t_seen_ns)
                 return Instant(t_ns, _DEVICE_SD_S, "device")
             case UtcStamp():
-                return self._from_utc(dates.rolled_over(stamp.utc_ns), source, t_seen_ns)
+                return self._from_utc(plausible_dates.rolled_over(stamp.utc_ns), source, t_seen_ns)
             case TimeOfDayStamp():
                 return self._from_time_of_day(stamp, source, t_seen_ns)
             case MonotonicStamp():
@@ -219,7 +220,8 @@ class Clock:
         return Instant(min(t_ns, t_seen_ns), stamped.sd_s, "utc")
 
     def _from_others_utc(self, utc_ns: int, source: str, t_seen_ns: int) -> Instant:
-        """By the reference's UTC or the system's; by the source's own stamps if that cannot be."""
+        """Instant by the reference's UTC or the system's; by the source's own stamps if neither
+        applies."""
         own = self._envelope(self._stamped, source)
         own.update(utc_ns, t_seen_ns)
         offset_ns, sd_s, how = self._mapping(source)
@@ -268,16 +270,16 @@ class Clock:
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
             if report.source in self._utc:
-                utc_ns = dates.rolled_over(report.utc_ns)
+                utc_ns = plausible_dates.rolled_over(report.utc_ns)
                 self._utc[report.source].untrusted(utc_ns, report.t_seen_ns)
             return
-        utc_ns = dates.rolled_over(report.utc_ns)
-        plausible = dates.plausible(utc_ns)
+        utc_ns = plausible_dates.rolled_over(report.utc_ns)
+        plausible = plausible_dates.plausible(utc_ns)
         self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
         envelope = self._envelope(self._utc, report.source)
         if envelope.plausible and not plausible:
-            refusal = f"{report.source} tells the year {dates.year(utc_ns)}: not believed"
+            refusal = f"{report.source} tells the year {plausible_dates.year(utc_ns)}: not believed"
             self._event("utc_implausible", refusal)
         jumped_ns = -envelope.update(utc_ns, report.t_seen_ns, plausible=plausible)
         if jumped_ns and report.source == self._reference:
@@ -287,8 +289,9 @@ class Clock:
             self._pass_on(report.source, utc_ns, report.t_seen_ns)
 
     def _pass_on(self, source: str, utc_ns: int, t_seen_ns: int) -> None:
-        """Hand a report of the reference on as it came: who sets a clock has a filter of its own,
-        and the envelope, on a clock that he slews, would answer with what he did."""
+        """Hand the reference's report on unchanged. A client that sets a clock has its own filter,
+        and the envelope follows the clock that the client slews: it would return the client's own
+        correction."""
         if self.on_time is None or source != self._reference or self._options.utc == "system":
             return
         reference = self._utc[source]
@@ -297,13 +300,13 @@ class Clock:
             self.on_time(TimeSample(system_ns, utc_ns + self._serial_latency_ns))
 
     def known(self) -> tuple[UtcKnown, ...]:
-        """UTC as its sources have told it, for `resume`; none of which there is a doubt."""
+        """UTC of every source without doubts, for `resume`."""
         found = (envelope.known(source) for source, envelope in self._utc.items())
         return tuple(known for known in found if known is not None)
 
     def resume(self, known: tuple[UtcKnown, ...]) -> None:
-        """Go on with what a process before this one has learnt of UTC: monotonic time must have
-        gone on without a pause since. Before the first report; what is old is left.
+        """Resume with UTC from an earlier process, before the first report; monotonic time must
+        have continued without a pause. Old values are ignored.
 
         Its first reports tell a new process UTC to 50 ms and more, alike for all fixes of the next
         seconds: on a road a metre or two along the way, which no filter takes for what it is.
@@ -312,7 +315,7 @@ class Clock:
         for each in known:
             if not 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS:
                 continue
-            if not dates.plausible(each.utc_ns):
+            if not plausible_dates.plausible(each.utc_ns):
                 continue
             envelope = self._envelope(self._utc, each.source)
             envelope.resume(each)
@@ -324,7 +327,8 @@ class Clock:
         self._event("utc_jumped", f"UTC jumped by {jumped_ns / SECOND_NS:+.3f} s: {why}")
 
     def _choose_reference(self, source: str, envelope: UtcEnvelope) -> None:
-        """Prefer the source that is heard, and of those that agree the least delayed."""
+        """Select the reference: a source that reports, and among those that agree the least
+        delayed."""
         if source == self._reference:
             return
         if self._reference is None:
@@ -340,7 +344,7 @@ class Clock:
             self._reference = source
 
     def _mapping(self, source: str | None) -> tuple[int, float, str]:
-        """Monotonic minus UTC (ns), its sigma (s) and its name, for what `source` says.
+        """Monotonic minus UTC (ns), its sigma (s) and its name, for a stamp of `source`.
 
         With `utc = "system"` a step of the system clock says that its reference changed, and not
         whether for the better: stamps are mapped as before it for two minutes, and sigma is the
@@ -368,7 +372,7 @@ class Clock:
         plausible (a computer without a battery starts in 1970).
         """
         utc_ns = t_ns - self._mapping(None)[0]
-        return utc_ns if dates.plausible(utc_ns) else None
+        return utc_ns if plausible_dates.plausible(utc_ns) else None
 
     @property
     def sets_others(self) -> bool:

@@ -1,4 +1,4 @@
-"""From a vehicle's configuration, in data-sheet units, to what the numerics take, in SI units.
+"""Conversion of a vehicle's configuration from data-sheet units to SI units.
 
 The only place where units are converted.
 """

@@ -14,8 +14,8 @@ WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
 EARLIEST_UTC_NS = 1554595200 * SECOND_NS
 """2019-04-07, the last rollover of the ten-bit GPS week: earlier dates are mistakes."""
 LATEST_UTC_NS = 1793491200 * SECOND_NS + WEEKS_1024_NS
-"""1024 weeks (19.6 years) after this release, 2026-11-01: no date is believed that has come out of
-a rollover moved once too often, nor one beyond the service life of this code."""
+"""Latest believable date: 1024 weeks (19.6 years) after this release, 2026-11-01. A later date is a
+rollover corrected once too often, or beyond the service life of this code."""
 
 
 def plausible(utc_ns: int) -> bool:
@@ -29,7 +29,7 @@ def year(utc_ns: int) -> int:
 
 
 def rolled_over(utc_ns: int) -> int:
-    """The date moved by 1024 weeks once if it lies before the last rollover and then is not."""
+    """Date moved by 1024 weeks if it lies before the last rollover and the result does not."""
     if utc_ns < EARLIEST_UTC_NS <= utc_ns + WEEKS_1024_NS:
         return utc_ns + WEEKS_1024_NS
     return utc_ns

@@ -19,7 +19,7 @@ from rich.text import Text
 REFRESH_S = 0.25
 LINE_EVERY_S = 5.0
 WIDE = 112
-"""Least width of a terminal, in columns, for two tables side by side."""
+"""Terminal width, in columns, from which two tables stand side by side."""
 RATE_WINDOW_S = 5.0
 _EVENTS = 40
 _LEAST_EVENTS = 3
@@ -53,14 +53,14 @@ _MADE_INSIDE = "made by the filter or part of another source"
 
 
 class Live:
-    """Latest messages of the broker, and what the simulation knows besides."""
+    """Latest messages of the broker, and the state of the simulation."""
 
     def __init__(self, duration_s: float, port: int, vehicle: str, page: str | None = None) -> None:
         self.duration_s = duration_s
         self.port = port
         self.vehicle = vehicle
         self.page = page
-        """Address of the dashboard, if there is one."""
+        """Address of the dashboard; None without one."""
         self.started = time.monotonic()
         self.nav: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
@@ -69,9 +69,9 @@ class Live:
         self.errors: list[float] = []
         """True errors: m north, east, down; m/s; degrees roll, pitch, yaw."""
         self.outage: tuple[str, float] | None = None
-        """Unplugged device and the instant (monotonic, s) of its return."""
+        """Unplugged device and the instant (monotonic, s) at which it returns."""
         self.aligning = ""
-        """Display while there is no solution yet."""
+        """Display while no solution exists yet."""
         self.received = 0
         self._arrivals: deque[float] = deque(maxlen=4096)
 
@@ -94,7 +94,7 @@ class Live:
 
     @property
     def rate_hz(self) -> float:
-        """Messages a second that came out of the broker, over the last seconds."""
+        """Rate of messages from the broker over the last seconds."""
         since = time.monotonic() - RATE_WINDOW_S
         count = sum(t >= since for t in tuple(self._arrivals))
         return count / max(1.0, min(RATE_WINDOW_S, self.elapsed_s))
@@ -173,7 +173,7 @@ def line(live: Live) -> str:
 
 
 class Screen:
-    """One picture, fitted to the terminal's size when it is drawn."""
+    """Screen layout, fitted to the terminal's size when it is drawn."""
 
     def __init__(self, live: Live) -> None:
         self._live = live

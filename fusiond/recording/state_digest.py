@@ -1,4 +1,4 @@
-"""Eight bytes that change with any bit of what the navigator knows after a tick."""
+"""Digest of the navigator's state after a tick, eight bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _T_NS = struct.Struct("<q")
 
 
 def state_digest(navigator: Navigator, solution: Solution) -> bytes:
-    """Of the solution with its mode, and of the filter's state (nav, xi, P) once it has started.
+    """Digest of the solution and its mode, and of the filter's state (nav, xi, P) once started.
 
     BLAKE2b to 8 bytes: two states that differ agree by chance once in 2^64 ticks. NaN counts by its
     bits. 10 us a tick.

@@ -1,4 +1,4 @@
-"""One log, one row: the figures of a drive through the navigator.
+"""Figures of one drive through the navigator, as a row.
 
 A log is a recording of the daemon (`.mcap`, or a folder with the parts of one), a recorded CAN bus,
 or a folder with the tables of `fusiond process`: `imu.csv` and, as far as they are there,

@@ -21,12 +21,12 @@ from fusiond.report.page_items import Grid, Item, Plot, Section, Sentence, Serie
 
 GROUPED = ("study", "part", "config_digest", "version", "seed")
 MOST_GROUPS = 6
-"""As many colours as the page tells apart."""
+"""Most groups: the number of colours that a page can distinguish."""
 MOST_BINS, FEWEST_BINS = 60, 8
-"""As many as the root of the number of drives, between these."""
+"""Limits of the number of bins, which is the root of the number of drives."""
 SHOWN_SHARE = 0.995
-"""Bars reach to this share of the drives; the last bar holds the rest, so that one drive far off
-does not press the others into a single bar."""
+"""Share of drives on the axis; the last bar holds the rest, so that an outlier does not compress
+the others into one bar."""
 PERCENTILES = (5.0, 50.0, 95.0, 99.0, 100.0)
 MOST_PLOTS = 12
 
@@ -143,8 +143,8 @@ def document(title: str, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def groups_of(rows: Sequence[Row]) -> list[Group]:
-    """Groups in the order of their first rows, named by what differs; beyond `MOST_GROUPS` the
-    rest is one."""
+    """Groups in order of their first rows, named by their difference; groups beyond `MOST_GROUPS`
+    are merged."""
     keys = [tuple(str(row.get(name, "")) for name in GROUPED) for row in rows]
     distinct = list(dict.fromkeys(keys))
     changed_settings = [k for k in range(len(GROUPED)) if len({key[k] for key in distinct}) > 1]
@@ -160,7 +160,7 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
 
 
 def _values(rows: Iterable[Row], column: str) -> Floats:
-    """Those of the rows that have it."""
+    """Values of a column, without rows that lack it."""
     return np.array([row[column] for row in rows if column in row], dtype=np.float64)
 
 
@@ -244,7 +244,7 @@ def _histogram(shown: Shown, groups: Sequence[Group]) -> Plot:
 
 
 def _full(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], good: str = "") -> Table:
-    """A table without the columns in which nothing stands."""
+    """Table without empty columns."""
     kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
     return Table(title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], good)
 
@@ -309,7 +309,7 @@ def _outcomes(groups: Sequence[Group]) -> Section | None:
 
 
 def _others(groups: Sequence[Group]) -> Section | None:
-    """Of a study whose runs are no drives: every number that its rows have."""
+    """Tables of a study whose rows are not drives: every numeric column."""
     if any(s.column in row for s in ERRORS for g in groups for row in g.rows):
         return None
     known = {*GROUPED, "run", "ended", "reason"}

@@ -15,7 +15,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from fusiond.clock.clock import Clock
+from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from tests.clock.host_time import MS, Host, S, utc
 

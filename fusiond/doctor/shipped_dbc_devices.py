@@ -1,4 +1,4 @@
-"""The devices whose DBC file is shipped, each as the options of its source.
+"""Devices with a shipped DBC file, each with its source options.
 
 The same as the blocks of `docs/can-imu.md` and `docs/can-gnss.md`, which say what is to be set in
 the device and what is uncertain.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.commands.compiling import Progress, compiling
+from fusiond.commands.compile_progress import Progress, compiling
 from fusiond.commands.shared import COLLECT_AFTER
 from tests.patience import PATIENCE_S
 
@@ -36,7 +36,7 @@ def doubled(x):
 """
 CODE = """
 import sys
-from fusiond.commands.compiling import compiling
+from fusiond.commands.compile_progress import compiling
 with compiling():
     import kernels
     print("imported", file=sys.stderr)
@@ -111,7 +111,7 @@ def test_a_terminal_has_one_line_and_a_dumb_one_lines(
     monkeypatch: pytest.MonkeyPatch, term: str, written: str
 ) -> None:
     monkeypatch.setenv("TERM", term)
-    monkeypatch.setattr("fusiond.commands.compiling.time.monotonic", lambda: 100.0)
+    monkeypatch.setattr("fusiond.commands.compile_progress.time.monotonic", lambda: 100.0)
     out = _Terminal()
     told = Progress(out)
     for done in range(3):

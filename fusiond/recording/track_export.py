@@ -84,7 +84,7 @@ def _gpx(file: TextIO, vehicle: str, points: list[Point]) -> None:
 
 
 def _kml(file: TextIO, vehicle: str, points: list[Point]) -> None:
-    """A track with its times (the extension gx:Track of KML 2.2)."""
+    """Write a track with its times (the extension gx:Track of KML 2.2)."""
     file.write(
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
@@ -100,7 +100,8 @@ def _kml(file: TextIO, vehicle: str, points: list[Point]) -> None:
 
 
 def _geojson(file: TextIO, vehicle: str, points: list[Point]) -> None:
-    """A LineString a stretch of one mode, so that a map can colour them; times beside it."""
+    """Write one LineString for each stretch of one mode, so that a map can colour them, with
+    times."""
     features: list[dict[str, object]] = []
     stretch: list[Point] = []
     for p in points:

@@ -1,4 +1,4 @@
-"""Schedule of `tracker`: every 10 s, and sooner after 20 m, but for one a second."""
+"""Schedule of `tracker`: every 10 s or after 20 m, at most once a second."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SHORTEST_NS = SECOND_NS
 """Recorders of such positions (Home Assistant's) keep every one."""
 MOVED_M = 20.0
 _METRES_A_DEGREE = 111_195.0
-"""On a sphere of 6371 km."""
+"""Metres a degree on a sphere of 6371 km."""
 
 
 class Tracking:
-    """Remembers what was told last. Time is the tick's."""
+    """Last published position, for a decision on the next. Time is the tick's."""
 
     def __init__(self) -> None:
         self._sent: TrackerMessage | None = None

@@ -18,19 +18,19 @@ from drivers.measurements import ImuSample, Measurement
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import sensor_to_body
+from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError
 from fusiond.files.extras import install
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
-from fusiond.replay.tables import arrivals
+from fusiond.replay.csv_export import arrivals
 
 _TO_ROS = np.array([1.0, -1.0, -1.0])
 
 
 def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]:
-    """A bag in `folder`, which must not exist; messages by topic. Raises `MissingPackageError`,
-    OSError."""
+    """Write a bag into `folder`, which must not exist; the messages by topic. Raises
+    `MissingPackageError`, OSError."""
     if importlib.util.find_spec("rosbags") is None:
         raise MissingPackageError(f"rosbag2 needs the package rosbags: {install('ros')}")
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an extra
@@ -75,7 +75,7 @@ class _Messages:
         return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
     def fix(self, location: dict[str, Any]) -> Any:
-        """NavSatFix of a `foxglove.LocationFix`, which has the same fields."""
+        """Convert a `foxglove.LocationFix` into a NavSatFix, which has the same fields."""
         stamp = location["timestamp"]
         status = self._types["sensor_msgs/msg/NavSatStatus"]
         return self._types[self.fix_type](

@@ -36,7 +36,7 @@ def _numbers(value: object) -> list[float]:
 
 
 def _ragged(rows: list[list[float]]) -> Floats:
-    """Rows of different lengths as one table, NaN where there is nothing."""
+    """Table of rows with different lengths, padded with NaN."""
     table: Floats = np.full((len(rows), max(map(len, rows))), nan)
     for k, row in enumerate(rows):
         table[k, : len(row)] = row
@@ -55,8 +55,8 @@ class _Ended(NamedTuple):
 
 
 class InnovationLists:
-    """`/innovation`: a late measurement rewinds the filter and brings later measurements again; the
-    last word on each counts, and the first says when it came."""
+    """Rows of `/innovation`. A delayed measurement rewinds the filter, and later measurements come
+    again: the last outcome counts, with the first time of arrival."""
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns
@@ -98,7 +98,7 @@ class InnovationLists:
 
 
 class VerdictLists:
-    """`/consistency`."""
+    """Rows of `/consistency`."""
 
     def __init__(self) -> None:
         self._rows: dict[str, list[tuple[float, ...]]] = {}
@@ -123,7 +123,7 @@ class VerdictLists:
 
 
 class Calibrations:
-    """`/calibration`; the unit ends a parameter's name, none is a ratio."""
+    """Rows of `/calibration`; a parameter's name ends with its unit, or has none for a ratio."""
 
     def __init__(self) -> None:
         self._rows: dict[str, list[tuple[float, ...]]] = {}
@@ -146,8 +146,8 @@ class Calibrations:
 
 
 class Healths:
-    """`/health`: outcomes and counters as the last message has them; satellites, delays, CPU and
-    memory over time."""
+    """Rows of `/health`: last outcomes and counters; satellites, delays, CPU and memory over
+    time."""
 
     def __init__(self) -> None:
         self.outcomes: dict[str, dict[str, int]] = {}
@@ -157,7 +157,7 @@ class Healths:
         self._sky: dict[str, list[tuple[float, ...]]] = {}
         self._reasons: dict[str, Counter[str]] = {}
         self.service: dict[str, Counter[str]] = {}
-        """By source: messages in each state of service."""
+        """Messages in each state of service, by source."""
 
     def read(self, t_s: float, said: dict[str, Any]) -> None:
         self._usage.append((t_s, number(said.get("cpu_percent")), number(said.get("memory_mb"))))

@@ -20,9 +20,9 @@ from fusiond.outputs.sockets import LINGER_NOT
 MOST_CONNECTIONS = 128
 """Most connections: sixteen browsers with six each, and two for their WebSockets."""
 REQUEST_S = 10.0
-"""As the daemon's own servers wait (`fusiond.outputs.tcp`)."""
+"""Deadline of a request, as in the daemon's own servers (`fusiond.outputs.tcp`)."""
 STUCK_S = 20.0
-"""For bytes of an answer to be taken, as a viewer has."""
+"""Time in which a client must take bytes of an answer, as for a viewer."""
 LOOK_S = 0.5
 
 

@@ -17,7 +17,7 @@ from fusiond.simulation.vehicle import Device, SimulatedVehicle
 
 
 class Unplugged(NamedTuple):
-    """A device without its plug, s since the start; every so many s again (0: once)."""
+    """Unplugged device, s since the start; repeated each `every_s` (0: once)."""
 
     device: Device
     start_s: float
@@ -44,7 +44,7 @@ class DemoSetup:
     paper: dict[str, Any] = field(default_factory=dict)
 
     def sources(self, folder: Path) -> dict[str, Source]:
-        """The drivers of the simulated devices, whose links are in `folder`."""
+        """Configure the drivers of the simulated devices, whose links are in `folder`."""
         receiver = {"driver": "nmea"} if self.raw is None else RAW
         every = {
             "imu": Source(driver="can_imu", **SIM_IMU.model_dump()),
@@ -56,7 +56,7 @@ class DemoSetup:
         return {name: every[name] for name in self.devices}
 
     def served(self, port: int, folder: Path) -> Config:
-        """The configuration with these devices and the demo's broker."""
+        """Complete the configuration with these devices and the demo's broker."""
         mqtt = self.config.mqtt.model_copy(
             update={"enabled": True, "host": "127.0.0.1", "port": port}
         )

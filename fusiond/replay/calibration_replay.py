@@ -1,4 +1,4 @@
-"""A recording through a navigator that somebody watches: `fusiond calibrate LOG.mcap`."""
+"""Replay of a recording under observation, for `fusiond calibrate LOG.mcap`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fusiond.replay.replay import Replay
 
 
 def watched(recording: Log, config: Config, look: Callable[[Navigator], None]) -> dict[str, Any]:
-    """Run; what was navigated, in the words of `process`.
+    """Run a replay; the summary of its solution in the terms of `process`.
 
-    The navigator starts anew: what an earlier drive had found of mounting and offsets would count
-    twice. `look` has it once a second, which is less than it keeps. Raises `LogError`.
+    The navigator starts without saved calibration, which this drive would count twice. `look`
+    receives the navigator once a second. Raises `LogError`.
     """
     replay = Replay(recording, config, same=False, afresh=True)
     rows, why = 0, "the log has no tick of a daemon"

@@ -1,4 +1,4 @@
-"""One source's UTC on the host's monotonic clock, learnt from when its reports arrive.
+"""UTC of one source on the host's monotonic clock, learnt from the arrival of its reports.
 
     d_i = t_seen_i - utc_i = offset + delay_i,    delay_i >= its least value
 
@@ -37,21 +37,22 @@ from pydantic.dataclasses import dataclass
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
 _EARLY_NS = 50 * MILLISECOND_NS
-"""Beyond the jitter of a serial line (1 to 16 ms for USB) an early report is held back."""
+"""Lead from which an early report is held back: above a serial line's jitter (1 to 16 ms for USB).
+"""
 _DELAY_NS = 500 * MILLISECOND_NS
-"""UTC reports are at most 200 ms late on a healthy serial line."""
+"""Largest delay of UTC reports on a healthy serial line."""
 _YOUNG_REPORTS = 10
 _YOUNG_EARLY_NS = 60 * SECOND_NS
-"""Of the first reports any may be the first that was not late; a tty's queue holds less."""
+"""Lead allowed for the first reports, which may all be delayed; a tty's queue holds less."""
 _AGREE_NS = 100 * MILLISECOND_NS
 _CONFIRM_REPORTS = 3
 _CONFIRM_SPAN_NS = SECOND_NS
 _BELIEVE_NS = 120 * SECOND_NS
 _WHOLE_LOW_NS = 50 * MILLISECOND_NS
 _WHOLE_HIGH_NS = 200 * MILLISECOND_NS
-"""A jump by whole seconds shows as that, less the envelope's own error, plus a report's delay."""
+"""Excess over whole seconds that a jump may show: the envelope's own error and a report's delay."""
 _SLEEP_ERROR_NS = 2 * SECOND_NS
-"""A battery-backed clock without a fraction of a second, read before and after the sleep."""
+"""Error of a sleep's length by a battery-backed clock of whole seconds, read before and after."""
 _MAX_SPREAD_S = 1.0
 """Reports of whole seconds come up to a second late."""
 _SCATTER_NS = 500 * MILLISECOND_NS
@@ -66,7 +67,7 @@ _UNKNOWN_S = 0.15
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
 class UtcKnown:
-    """State of a source's UTC, for a process that runs later on the same monotonic clock.
+    """State of a source's UTC, for a later process on the same monotonic clock.
 
     `offset_ns` and `t_seen_ns` as of `UtcEnvelope`, `utc_ns` the UTC of its last report, `reports`
     how many have told it. Raises pydantic's `ValidationError` for what no source can have told.
@@ -80,20 +81,20 @@ class UtcKnown:
 
 
 class Stamped(NamedTuple):
-    """Monotonic ns of a stamp and one sigma of it (s)."""
+    """Monotonic instant of a stamp (ns) and its sigma (s)."""
 
     t_ns: int
     sd_s: float
 
 
 def whole_seconds_ns(excess_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:
-    """The jump by whole seconds that explains `excess_ns` with a delay up to `delay_ns`, else 0."""
+    """Jump by whole seconds that explains `excess_ns` with a delay up to `delay_ns`, else 0."""
     jump = (excess_ns + _WHOLE_LOW_NS) // SECOND_NS * SECOND_NS
     return jump if excess_ns - jump <= delay_ns else 0
 
 
 def _after_leap(utc_ns: int) -> bool:
-    """True if a month has just begun: leap seconds come before it (ITU-R TF.460-6, annex 1)."""
+    """True at the start of a month, before which leap seconds come (ITU-R TF.460-6, annex 1)."""
     if utc_ns % _DAY_NS > _AFTER_LEAP_NS:
         return False
     return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).day == 1
@@ -133,7 +134,7 @@ class UtcEnvelope:
         return UtcKnown(source, self._offset_ns, self._utc_ns, self.t_seen_ns, self._reports)
 
     def resume(self, known: UtcKnown) -> None:
-        """Go on with what another process has learnt."""
+        """Resume with the state of another process."""
         self._offset_ns = known.offset_ns
         self._supported_ns = known.t_seen_ns
         self._accept(known.utc_ns, known.t_seen_ns - known.utc_ns, known.t_seen_ns)
@@ -141,40 +142,40 @@ class UtcEnvelope:
 
     @property
     def offset_ns(self) -> int:
-        """Host monotonic minus the UTC that the source states now, with its least delay."""
+        """Host monotonic time minus the source's present UTC, at its least delay."""
         assert self._offset_ns is not None, "made from its first report"
         return self._offset_ns
 
     @property
     def believed_offset_ns(self) -> int:
-        """The same, for UTC as it is believed: without changes of the last two minutes."""
+        """Host monotonic time minus believed UTC, which ignores changes of the last two minutes."""
         return self.offset_ns - self._unbelieved_ns
 
     @property
     def open(self) -> bool:
-        """True while the reports held back show a change that is not identified yet."""
+        """True while the held reports show an unidentified change."""
         return bool(self._odd)
 
     @property
     def settled(self) -> bool:
-        """False while it is not known which is right: what reports say, or what is believed."""
+        """True unless reports and believed UTC disagree without a decision."""
         return not (self._odd or self._unbelieved_ns or self._doubt_ns)
 
     @property
     def _doubt_ns(self) -> int:
-        """By how much UTC may have jumped while reports were missing, ns."""
+        """Possible jump of UTC during missing reports (ns)."""
         run = self._unsupported
         return whole_seconds_ns(run.least_ns) if run is not None and run.after_gap else 0
 
     @property
     def sd_s(self) -> float:
-        """One sigma of the offset (s): the least of n delays lies spread / n above the least."""
+        """Sigma of the offset (s): the least of n delays lies spread / n above the true least."""
         unsupported_ns = max(0, self.t_seen_ns - self._supported_ns)
         drift_s = unsupported_ns * self._ppb / SECOND_NS / SECOND_NS
         return hypot(max(SD_S, self._spread_s / (self._reports + 1)), drift_s)
 
     def stamp(self, utc_ns: int, t_seen_ns: int) -> Stamped:
-        """The instant of the source's own stamp `utc_ns`, less its least delay.
+        """Instant of the source's own stamp `utc_ns`, less its least delay.
 
         A late one keeps its age; if a jump of UTC would explain that, sigma is the jump.
         """
@@ -193,7 +194,7 @@ class UtcEnvelope:
         return 2 * (utc_ns - self._utc_ns) > 3 * self._interval_ns
 
     def _turns_back(self, utc_ns: int, t_seen_ns: int) -> bool:
-        """True if UTC stands still or goes back with `utc_ns`, and not because it is read twice."""
+        """True if UTC stands still or goes back at `utc_ns`, other than by a second reading."""
         return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _DELAY_NS
 
     def untrusted(self, utc_ns: int, t_seen_ns: int) -> None:

@@ -21,8 +21,8 @@ LINE_EVERY_S = 5.0
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Say how far it is while what is imported inside compiles; nothing where nothing does. The
-    collector of garbage leaves alone what has been loaded by its end."""
+    """Show progress while an import compiles kernels. The garbage collector then ignores all that
+    was loaded."""
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - numba
 
     with gathered() as missing:
@@ -33,8 +33,8 @@ def compiling() -> Iterator[None]:
 
 
 def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> None:
-    """Compile kernels in processes that end, and link them in this one. What cannot be kept on disk
-    is compiled here."""
+    """Compile kernels in child processes and link them here. Kernels that cannot be stored on disk
+    are compiled in this process."""
     from fusiond.navigation.compiled import (  # noqa: PLC0415 - numba
         kernels_can_be_kept,
         load_compiler,
@@ -57,8 +57,8 @@ def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> 
 
 
 class Progress:
-    """Hears how many kernels of how many are compiled: on a terminal one line, in a pipe or a
-    journal one now and then, for systemd its STATUS=."""
+    """Progress of the compilation: one line on a terminal, some lines in a pipe or journal, STATUS=
+    for systemd."""
 
     def __init__(self, out: TextIO) -> None:
         from fusiond.live.service_manager import ServiceManager  # noqa: PLC0415

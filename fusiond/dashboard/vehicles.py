@@ -1,4 +1,4 @@
-"""All vehicles of a broker or a log, and how the link to it is: what the viewers look at."""
+"""Vehicles of a broker or a log, and the state of the link: the model behind all viewers."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ LARGEST_BYTES = 65536
 MOST_VEHICLES = 32
 GIVES_WAY_S = 60.0
 """Age from which a silent vehicle gives way to a new one: a daemon sends its status every second.
-Names of no vehicles that a broker has kept shut nobody out."""
+Retained messages of vehicles that no longer exist thus keep nobody out."""
 MOST_NAME = 64
-"""Letters of a vehicle's name, as the configuration has it."""
+"""Longest name of a vehicle, as in the configuration."""
 
 LARGEST_INTEGER = 2**63 - 1
 """Nanoseconds of a recording's clock; what a browser is sent has closer bounds in its schema."""
@@ -33,7 +33,7 @@ LinkState = Literal["connecting", "up", "lost", "ended"]
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """The way to what is shown. `ended`: a log has been played to its end."""
+    """Link to the source of messages. `ended`: a log has been played to its end."""
 
     state: LinkState
     text: str
@@ -106,14 +106,14 @@ class Hub:
         one.receive(topic, said, now_s, kept)
 
     def _make_room(self, now_s: float, kept: bool) -> None:
-        """For a vehicle that speaks, in place of the one that was silent longest."""
+        """Remove the vehicle that was silent longest, for a new one."""
         silent = min(self.vehicles.values(), key=lambda one: one.received_s)
         if kept or now_s - silent.received_s < GIVES_WAY_S:
             raise _NotTakenError("too_many_vehicles", f"there are {MOST_VEHICLES} already")
         del self.vehicles[silent.name]
 
     def _read(self, topic: str, payload: bytes) -> Any:
-        """Message by the schema of its topic."""
+        """Parse a message by the schema of its topic."""
         if topic == "online":
             if payload not in (b"online", b"offline"):
                 raise _NotTakenError("not_as_published", "neither online nor offline")
