@@ -83,6 +83,8 @@ class Epoch:
     """Formatters in the order they came."""
     addresses: set[str] = field(default_factory=set)
     """The same with their talkers."""
+    whole: bool = False
+    """True if the receiver's epochs have been of these sentences and no more."""
     raws: set[bytes] = field(default_factory=set)
     """Sentences of the epoch, which may come twice."""
     day: date | None = None
@@ -134,6 +136,11 @@ class Epoch:
         self.cycle.append(formatter)
         self.addresses.add(sentence.address)
         self.raws.add(sentence.raw)
+
+    @property
+    def phase_ns(self) -> int | None:
+        """Where in the second it is."""
+        return None if self.time_of_day_ns is None else self.time_of_day_ns % 1_000_000_000
 
     def position(self) -> tuple[float, float, int] | None:
         """Latitude, longitude (deg) and quality, where the epoch has them."""
