@@ -62,6 +62,8 @@ class Host:
     def monotonic_ns(self) -> int:
         return self.now_ns
 
+    slewed_ns = monotonic_ns
+
     def realtime_ns(self) -> int:
         return UTC_NS + self.now_ns - BEGIN_NS
 

@@ -1,7 +1,7 @@
 """The vocabulary that drivers speak: what a device said, in SI units, with the stamp it gave.
 
 A driver never settles *when* a measurement was true. It reports the device's own stamp (one of the
-`Stamp` classes) and `t_seen_ns`, the host's monotonic clock (`time.monotonic_ns`) when the last
+`Stamp` classes) and `t_seen_ns`, the host's monotonic clock (`drivers.base`) when the last
 byte or frame came in. Whoever consumes the measurement turns the stamp into a validity instant.
 
 Frames: *sensor* axes are the device's own; *body* is forward-right-down; *NED* is

@@ -216,9 +216,9 @@ class NmeaDecoder:
                 self._delayed()
         elif time_ns is not None and time_step_ns(sentence) < epoch.time_step_ns:
             epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
-        if formatter == self._decoding.last_sentence or (
-            self._decoding.last_sentence is None and self._cycle.whole(epoch.cycle)
-        ):
+        epoch.whole = self._cycle.whole(epoch.cycle, epoch.phase_ns)
+        last = self._decoding.last_sentence
+        if formatter == last or (last is None and epoch.whole):
             self._close(found, learn=False, by="last")
 
     def _doubled(self, sentence: Sentence, time_ns: int | None) -> bool:
@@ -273,7 +273,7 @@ class NmeaDecoder:
         epoch, self._epoch = self._epoch, None
         if epoch is None:
             return
-        self._cycle.ended(epoch.cycle, learn=learn)
+        self._cycle.ended(epoch.cycle, epoch.phase_ns, learn=learn)
         self._closed, self._closed_by = epoch, by
         self._judge.epoch(epoch, found)
 

@@ -84,6 +84,8 @@ class Epoch:
     """Formatters in order of arrival."""
     addresses: set[str] = field(default_factory=set)
     """Formatters with talkers, in order of arrival."""
+    whole: bool = False
+    """True if the receiver's epochs have been of these sentences and no more."""
     raws: set[bytes] = field(default_factory=set)
     """Raw sentences of the epoch, to detect repetitions."""
     day: date | None = None
@@ -135,6 +137,11 @@ class Epoch:
         self.cycle.append(formatter)
         self.addresses.add(sentence.address)
         self.raws.add(sentence.raw)
+
+    @property
+    def phase_ns(self) -> int | None:
+        """Where in the second it is."""
+        return None if self.time_of_day_ns is None else self.time_of_day_ns % 1_000_000_000
 
     def position(self) -> tuple[float, float, int] | None:
         """Latitude, longitude (deg) and quality, if complete."""

@@ -24,6 +24,7 @@ import aiomqtt
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import monotonic_ns
 from drivers.shipped import shipped
 from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
@@ -120,7 +121,7 @@ class _Run:
             config = config.model_copy(update={"recording": recording})
         self._vehicle = play.vehicle(duration_s + 10.0, folder)
         self._score = Score()
-        self._without_gnss: list[tuple[float, float]] = []
+        self._without_gnss: list[tuple[int, int]] = []
         self._daemon = Daemon(config, on_solution=self._on_solution)
         publisher = self._daemon.outputs["mqtt"]
         assert isinstance(publisher, MqttPublisher), "the demo's configuration has a broker"
@@ -207,13 +208,13 @@ class _Run:
             assert pulled is not None
             await asyncio.sleep(started + start_s - loop.time())
             self._vehicle.unplug(pulled.device)
-            pulled_s = time.monotonic()
-            self._live.outage = pulled.device, pulled_s + end_s - start_s
+            pulled_ns = monotonic_ns()
+            self._live.outage = pulled.device, time.monotonic() + end_s - start_s
             await asyncio.sleep(started + end_s - loop.time())
             self._vehicle.plug(pulled.device)
             self._live.outage = None
             if pulled.device == "gnss":
-                self._without_gnss.append((pulled_s, time.monotonic()))
+                self._without_gnss.append((pulled_ns, monotonic_ns()))
         await asyncio.Event().wait()
 
     def _summary(self, duration_s: float) -> dict[str, Any]:
@@ -239,8 +240,8 @@ class _Run:
     def _print_outages(self) -> None:
         """Report an event on standard error: the last line of the output is the summary."""
         t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
-        start_s = self._vehicle.start_ns * 1e-9
-        outages = [(begin - start_s, end - start_s) for begin, end in self._without_gnss]
+        start_ns = self._vehicle.start_ns
+        outages = [((a - start_ns) * 1e-9, (b - start_ns) * 1e-9) for a, b in self._without_gnss]
         for sentence in outage_report(t_s, error_m, sigma_m, outages):
             print(sentence, file=sys.stderr)
 

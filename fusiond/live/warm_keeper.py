@@ -159,9 +159,10 @@ class WarmKeeper:
 
 
 def _boot_id() -> str:
-    """Identifier of this boot; empty where the kernel hides it."""
+    """Identifier of this boot and of the clock whose instants are kept; empty where the kernel
+    hides it."""
     try:
-        return BOOT_ID.read_text().strip()
+        return f"{BOOT_ID.read_text().strip()} raw"
     except OSError:
         return ""
 

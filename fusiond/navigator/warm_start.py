@@ -89,7 +89,7 @@ Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 class WarmState:
     """A navigation state: instant, nav (10,), parameters (n,), P (n, n) as its lower triangle.
 
-    `t_ns` is CLOCK_MONOTONIC of the boot `boot_id`, `asleep_ns` CLOCK_BOOTTIME minus that clock;
+    `t_ns` is CLOCK_MONOTONIC_RAW of the boot `boot_id`, `asleep_ns` what that has been suspended;
     `config` the digest of the configuration whose states these are, `how` the heading's origin,
     `confirmed` whether anything has shown that heading. `turn_rad_s` is the rate of the heading,
     `push_m_s2` the acceleration along the way.

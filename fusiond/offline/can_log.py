@@ -97,7 +97,7 @@ class _LogTime:
     def monotonic_ns(self) -> int:
         return self.t_ns
 
-    boottime_ns = monotonic_ns
+    boottime_ns = slewed_ns = monotonic_ns
 
     def realtime_ns(self) -> int:
         return self.stamp_ns

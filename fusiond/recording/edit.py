@@ -16,7 +16,7 @@ from fusiond.recording.channels import CHANNELS, INPUT, STATE
 from fusiond.recording.mcap_writer import About, Attachment, LogFile
 from fusiond.recording.reader import About as Described
 from fusiond.recording.reader import Log, LogError, LogMessage
-from fusiond.recording.records import NO_SOURCE, Kind, Record, pack, unpack
+from fusiond.recording.records import NO_SOURCE, SLEWED, Kind, Record, pack, unpack
 
 _TYPES = {".json": "application/json"}
 
@@ -78,7 +78,8 @@ def _first_tick_ns(recording: Log) -> int:
 def _head(recording: Log, t_log_ns: int) -> LogMessage:
     """A start on the way: what was known of the host's clocks there."""
     t_ns = t_log_ns - recording.about.epoch_ns
-    ahead = [recording.about.epoch_ns, 0]
+    ahead = [recording.about.epoch_ns, 0, 0]
+    apart_ns = ahead[0]
     read_ns, sequence = t_ns, 0
     for message in recording.messages(INPUT):
         if message.t_log_ns >= t_log_ns:
@@ -87,15 +88,21 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
         for record in unpack(message.data):
             if record.kind is Kind.START:
                 start = json.loads(record.payload)["system_clock"]
-                ahead = [start["offset_ns"], start["_boot_ns"]]
+                slewed_ns = start.get("_slewed_ns", 0)
+                ahead = [start["offset_ns"], start["_boot_ns"] + slewed_ns, slewed_ns]
+                apart_ns = start.get("_apart_ns", start["offset_ns"])
             for clock, at_ns, ahead_ns in record.readings:
                 ahead[clock] = ahead_ns
                 read_ns = at_ns
+                if clock == SLEWED:
+                    apart_ns = ahead[0] - ahead_ns
     clock_state = {
         **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), read_ns),
         **dict.fromkeys(("offset_ns", "held_ns"), ahead[0]),
         **dict.fromkeys(("slept_ns", "changes", "last_step_ns"), 0),
-        "_boot_ns": ahead[1],
+        "_boot_ns": ahead[1] - ahead[2],
+        "_slewed_ns": ahead[2],
+        "_apart_ns": apart_ns,
         "before_step_ns": None,
     }
     payload = json.dumps({"from_start": False, "system_clock": clock_state}).encode()

@@ -10,12 +10,11 @@ from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 from fusiond.outputs.messages.base import stamp
 from fusiond.recording.channels import INPUT
 from fusiond.recording.reader import Log
-from fusiond.recording.records import NO_SOURCE, Kind, Record, tick_of
+from fusiond.recording.records import NO_SOURCE, REALTIME, SLEWED, Kind, Record, tick_of
 
 _STEP_NS = MILLISECOND_NS
-"""Least jump of the system clock against the monotonic one.
-
-A slew (500 ppm at most) stays below it between two readings of a running daemon."""
+"""Least jump of the system clock against the monotonic one. What stays below it between two
+readings of a running daemon is a quartz that is disciplined (500 ppm at most)."""
 
 
 def info(recording: Log) -> dict[str, Any]:
@@ -56,6 +55,8 @@ class _Inputs:
         self._counts = [[0] * len(Kind) for _ in self._about.sources]
         self._bytes = [0] * len(self._counts)
         self._ahead_ns: int | None = None
+        self._apart_ns: int | None = None
+        """The system clock less CLOCK_MONOTONIC, which is slewed with it, at the last look."""
         self._tick_ns: int | None = None
         self.from_start = False
         self.first_ns: int | None = None
@@ -69,8 +70,10 @@ class _Inputs:
         self.first_ns = record.t_ns if self.first_ns is None else self.first_ns
         self.last_ns = record.t_ns
         for clock, t_ns, ahead_ns in record.readings:
-            if clock == 0:
+            if clock == REALTIME:
                 self._look(t_ns, ahead_ns)
+            elif clock == SLEWED and self._ahead_ns is not None:
+                self._look_at_slews(self._ahead_ns - ahead_ns)
         kind, source = record.kind, record.source
         if source != NO_SOURCE:
             self._counts[source][kind] += 1
@@ -78,7 +81,9 @@ class _Inputs:
             return
         match kind:
             case Kind.START:
-                self.from_start = bool(json.loads(record.payload).get("from_start"))
+                start = json.loads(record.payload)
+                self.from_start = bool(start.get("from_start"))
+                self._apart_ns = start.get("system_clock", {}).get("_apart_ns")
             case Kind.TICK:
                 self._tick(record)
             case Kind.COMMAND:
@@ -89,6 +94,16 @@ class _Inputs:
         if before is not None and abs(ahead_ns - before) > _STEP_NS:
             step_s = (ahead_ns - before) / SECOND_NS
             self.steps.append({"t_utc": self.utc(t_ns), "step_s": round(step_s, 6)})
+
+    def _look_at_slews(self, apart_ns: int) -> None:
+        """A reading of CLOCK_MONOTONIC follows one that leapt: to tell a step from a slew."""
+        before, self._apart_ns = self._apart_ns, apart_ns
+        if before is None or not self.steps:
+            return
+        if abs(apart_ns - before) <= _STEP_NS:
+            self.steps.pop()
+        else:
+            self.steps[-1]["step_s"] = round((apart_ns - before) / SECOND_NS, 6)
 
     def _tick(self, record: Record) -> None:
         tick = tick_of(record)

@@ -3,10 +3,10 @@
     record  = kind u8 | source u8 | readings u16 | length u32 | t_ns i64 | payload | reading ...
     reading = clock u8 | t_ns i64 | ahead_ns i64
 
-Little-endian; `t_ns` is CLOCK_MONOTONIC of the recording host. `source` is the place of the
+Little-endian; `t_ns` is CLOCK_MONOTONIC_RAW of the recording host. `source` is the place of the
 driver's name in `sources` of the metadata, 255 for none. `length` is that of the payload. The
-readings are those that the daemon made of the host's clocks (0 realtime, 1 boottime: how far that
-is ahead of the monotonic clock) from this record on until the next, in order.
+readings are those that the daemon made of the host's clocks (0 realtime, 1 boottime, 2
+CLOCK_MONOTONIC: how far that is ahead of `t_ns`) from this record on until the next, in order.
 
 Records stand in the order in which the daemon handled them: a log is played by handling them again.
 
@@ -43,10 +43,11 @@ _FRAME = struct.Struct("<IBq")
 _TICK = struct.Struct("<QQq8s")
 _EXTENDED, _REMOTE, _ERROR, _STAMPED = 1, 2, 4, 8
 _MOST_READINGS = 0xFFFF
-_CLOCKS: tuple[ReadClock, ...] = ("realtime", "boottime")
+REALTIME, BOOTTIME, SLEWED = range(3)
+_CLOCKS: tuple[ReadClock, ...] = ("realtime", "boottime", "slewed")
 
 Reading = tuple[int, int, int]
-"""Index of the clock in `realtime, boottime`; monotonic ns; how far it is ahead, ns."""
+"""Index of the clock in `realtime, boottime, slewed`; monotonic ns; how far it is ahead, ns."""
 
 
 class Kind(IntEnum):

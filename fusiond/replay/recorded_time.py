@@ -6,9 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 
 from fusiond.clock.host import Readings
-from fusiond.recording.records import Reading
-
-REALTIME, BOOTTIME = 0, 1
+from fusiond.recording.records import BOOTTIME, REALTIME, SLEWED, Reading
 
 
 class RecordedTime:
@@ -23,7 +21,7 @@ class RecordedTime:
     def realtime_ns(self) -> int:
         raise AssertionError("read by RecordedReadings")
 
-    boottime_ns = realtime_ns
+    boottime_ns = slewed_ns = realtime_ns
 
 
 class RecordedReadings(Readings):
@@ -36,9 +34,11 @@ class RecordedReadings(Readings):
     def __init__(self, time: RecordedTime, system_clock: Mapping[str, int | None]) -> None:
         super().__init__(time)
         self._time = time
+        slewed_ns = int(system_clock.get("_slewed_ns") or 0)
         self._last = {
             REALTIME: int(system_clock["offset_ns"] or 0),
-            BOOTTIME: int(system_clock["_boot_ns"] or 0),
+            BOOTTIME: int(system_clock["_boot_ns"] or 0) + slewed_ns,
+            SLEWED: slewed_ns,
         }
         self._readings: deque[Reading] = deque()
 
@@ -55,6 +55,12 @@ class RecordedReadings(Readings):
 
     def boottime(self) -> tuple[int, int]:
         return self._next(BOOTTIME)
+
+    def slewed(self) -> tuple[int, int]:
+        """It stands where it is asked for, but in logs of CLOCK_MONOTONIC, which hold none."""
+        if self._readings and self._readings[0][0] == SLEWED:
+            return self._next(SLEWED)
+        return self._time.t_ns, self._last[SLEWED]
 
     def _next(self, clock: int) -> tuple[int, int]:
         while self._readings:

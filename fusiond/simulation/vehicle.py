@@ -27,6 +27,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from drivers.base import monotonic_ns
 from drivers.can.imu import CanImuOptions
 from drivers.can.python_can import can
 from fusiond.configuration.load import load_config
@@ -103,9 +104,9 @@ class SimulatedVehicle:
         """Start at the next full tenth of a UTC second, where receivers have their epochs.
 
         The sky is that of `fusiond simulate`: a seed meets the same satellites at every hour."""
-        utc_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        utc_ns, now_ns = time.time_ns(), monotonic_ns()
         wait_ns = -utc_ns % 100_000_000
-        self.start_ns = monotonic_ns + wait_ns
+        self.start_ns = now_ns + wait_ns
         self.utc_start_ns = self.terminal.utc_start_ns = utc_ns + wait_ns
         if self.raw is not None:
             self.raw.receiver.begin(*utc_ns_to_gps(self.utc_start_ns), sky=START)
@@ -154,7 +155,7 @@ class SimulatedVehicle:
             for device in get_args(Device):
                 self.plug(device)
             self._start_clock()
-            while (t_s := (time.monotonic_ns() - self.start_ns) * 1e-9) < self.truth.duration_s:
+            while (t_s := self._now_s()) < self.truth.duration_s:
                 self._serve(t_s)
                 await asyncio.sleep(max(0.0, self._next_s(t_s) - self._now_s()))
         finally:
@@ -162,7 +163,7 @@ class SimulatedVehicle:
                 self.unplug(device)
 
     def _now_s(self) -> float:
-        return (time.monotonic_ns() - self.start_ns) * 1e-9
+        return (monotonic_ns() - self.start_ns) * 1e-9
 
     def _next_s(self, t_s: float) -> float:
         """Next instant of work."""

@@ -17,21 +17,37 @@ def utc(text: str) -> int:
 
 @dataclass
 class Host:
-    """True UTC and the monotonic clock run together; the system clock may be wrong and step."""
+    """True UTC and the monotonic clock run together; the system clock may be wrong, step and be
+    slewed, which moves CLOCK_MONOTONIC too."""
 
     mono: int = 5_000 * S
     true_utc_at_zero: int = utc("2026-11-20T23:00:00") - 5_000 * S
     system_error: int = 0
     slept: int = 0
+    slew_ppm: int = 0
+    _slewed: int = 0
+    _slewed_since: int = 0
 
     def monotonic_ns(self) -> int:
         return self.mono
 
+    @property
+    def slewed(self) -> int:
+        """What slews have come to."""
+        return self._slewed + (self.mono - self._slewed_since) * self.slew_ppm // 1_000_000
+
+    def slew(self, ppm: int) -> None:
+        """Slew the system clock from now on."""
+        self._slewed, self._slewed_since, self.slew_ppm = self.slewed, self.mono, ppm
+
+    def slewed_ns(self) -> int:
+        return self.mono + self.slewed
+
     def realtime_ns(self) -> int:
-        return self.mono + self.true_utc_at_zero + self.system_error
+        return self.mono + self.true_utc_at_zero + self.system_error + self.slewed
 
     def boottime_ns(self) -> int:
-        return self.mono + self.slept
+        return self.mono + self.slept + self.slewed
 
     def suspend(self, ns: int) -> None:
         """Monotonic time stands still, all others go on."""

@@ -157,3 +157,104 @@ def test_a_frame_stamped_before_the_suspend_and_read_after_it() -> None:
     host.mono += MS
     assert clock.resolve(stamp, "imu", host.mono).t_valid_ns == true
     assert clock.resolve(KernelStamp(host.realtime_ns()), "imu", host.mono)[0] == host.mono
+
+
+# ------------------------------------------------------------------ slews
+
+
+def drive(
+    clock: Clock, host: Host, ppm: int, seconds: float, every: int = 2 * MS
+) -> tuple[float, float]:
+    """The system clock is slewed by `ppm`: the largest error (ms) of fixes of a receiver, ten a
+    second, and of frames that the kernel stamped and that waited 30 ms."""
+    fix_ns = frame_ns = 0
+    host.slew(ppm)
+    waiting: list[tuple[int, KernelStamp]] = []
+    for step in range(round(seconds * S) // every):
+        host.mono += every
+        waiting.append((host.mono, KernelStamp(host.realtime_ns())))
+        while waiting and waiting[0][0] <= host.mono - 30 * MS:
+            true, stamp = waiting.pop(0)
+            frame_ns = max(frame_ns, abs(clock.resolve(stamp, "imu", host.mono)[0] - true))
+        if step % max(1, 100 * MS // every) == 0:
+            epoch = host.mono - 60 * MS
+            clock.report(TimeReport("gnss", host.mono, host.utc(epoch), True))
+            instant = clock.resolve(UtcStamp(host.utc(epoch)), "gnss", host.mono)
+            fix_ns = max(fix_ns, abs(instant.t_valid_ns - epoch))
+    return fix_ns / MS, frame_ns / MS
+
+
+@pytest.mark.parametrize("ppm", [-100_000, -83_333, -1_500, 500, 83_333, 100_000])
+@pytest.mark.parametrize("every", [2 * MS, 50 * MS])
+def test_a_slewed_system_clock_moves_no_instant(ppm: int, every: int) -> None:
+    """chrony slews by 8.3 % (`maxslewrate`), adjtimex(2) by 10 %."""
+    host = Host(system_error=-S)
+    clock, events = with_events(ClockOptions(), host)
+    before = drive(clock, host, 0, 20, every)
+    assert before[0] <= 10.0
+    assert before[1] == 0.0
+    fix_ms, frame_ms = drive(clock, host, ppm, 12, every)
+    assert fix_ms <= 10.0
+    # The rate is known a tenth of a second later: until then by the wait.
+    assert frame_ms <= abs(ppm) * 1e-6 * max(30.0, every / MS) + 0.001
+    assert drive(clock, host, ppm, 5, every)[1] < 0.03
+    assert drive(clock, host, 0, 5, every)[0] <= 10.0
+    assert not events
+    assert clock.status().system_error_s == pytest.approx(
+        (host.system_error + host.slewed) / S, abs=0.012
+    )
+
+
+@pytest.mark.parametrize("step", [-2 * S, 5 * MS, 400 * MS, 3600 * S])
+def test_a_step_in_a_slew_is_told_by_its_size(step: int) -> None:
+    host = Host()
+    clock, events = with_events(ClockOptions(), host)
+    texts: list[str] = []
+    clock.on_event = lambda code, text: texts.append(f"{code} {text}")
+    drive(clock, host, 0, 20)
+    drive(clock, host, 83_333, 3)
+    host.system_error += step
+    fix_ms, frame_ms = drive(clock, host, 83_333, 3)
+    assert fix_ms <= 10.0
+    # Which side of a step shorter than its wait a frame was stamped on cannot be told.
+    assert frame_ms < (0.03 if abs(step) > 30 * MS else 5.03)
+    assert texts == [f"system_clock_stepped the system clock was set by {step / S:+.3f} s"]
+    assert not events
+
+
+def test_a_suspended_host_in_a_slew() -> None:
+    host = Host()
+    clock, events = with_events(ClockOptions(), host)
+    drive(clock, host, 0, 20)
+    drive(clock, host, 83_333, 3)
+    host.suspend(20 * S)
+    assert drive(clock, host, 83_333, 3)[0] <= 11.0
+    assert events == ["host_resumed"]
+    assert clock.counters["system_clock_stepped"] == 0
+
+
+@pytest.mark.parametrize("every", [2 * MS, 50 * MS, S])
+def test_utc_of_the_system_follows_a_slew(every: int) -> None:
+    """Whoever keeps UTC by it has it slewed to what is right."""
+    host = Host(system_error=-S)
+    clock, events = with_events(ClockOptions(utc="system"), host)
+    drive(clock, host, 83_333, 12, every)
+    stamp = host.realtime_ns() - 60 * MS
+    assert abs(clock.resolve(UtcStamp(stamp), "gnss", host.mono)[0] - host.mono + 60 * MS) < MS
+    now = clock.utc_ns(host.mono)
+    assert now is not None
+    assert abs(now - host.realtime_ns()) < 2 * MS
+    assert not events
+
+
+def test_a_state_of_a_log_whose_instants_are_of_the_slewed_clock() -> None:
+    """Before 2026-11-28: nothing was slewed against them."""
+    host = Host()
+    clock = Clock(ClockOptions(), host)
+    new = {"_slewed_ns", "_apart_ns", "_rate_ppb", "_rated_ns", "_rated_offset_ns"}
+    known = {name: of for name, of in clock.system_state().items() if name not in new}
+    host.mono += S
+    clock.restore_system(known)
+    host.system_error += 2 * S
+    clock.look()
+    assert clock.counters["system_clock_stepped"] == 1

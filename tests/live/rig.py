@@ -24,6 +24,7 @@ from pathlib import Path
 import can
 import numpy as np
 
+from drivers.base import monotonic_ns
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.can.imu import CanImu
@@ -179,7 +180,7 @@ class Rig:
     @property
     def now_s(self) -> float:
         """Time of the drive."""
-        return (time.monotonic_ns() - self.vehicle.start_ns) * 1e-9
+        return (monotonic_ns() - self.vehicle.start_ns) * 1e-9
 
     async def until(self, t_s: float) -> None:
         """Wait for an instant of the drive."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import can
 import pytest
 
+from drivers.base import monotonic_ns
 from drivers.can.imu import CanImuOptions
 from drivers.nmea.driver import NmeaDriver
 from fusiond.configuration.load import load_config
@@ -204,7 +205,7 @@ async def test_samples_that_cannot_be_true_are_named_and_survived(
                 bus.send(frame)
 
         def now_ns() -> int:
-            return time.monotonic_ns() - vehicle.start_ns
+            return monotonic_ns() - vehicle.start_ns
 
         async with running(daemon, vehicle):
             await bench.mode(PARKED)

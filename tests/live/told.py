@@ -13,10 +13,10 @@ import os
 import re
 import signal
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
+from drivers.base import monotonic_ns
 from fusiond.navigation.solution import Mode, Solution
 from tests.patience import PATIENCE_S
 
@@ -140,7 +140,7 @@ class ToldDaemon:
                 log.flush()
                 found = EVENT.match(line.decode(errors="replace"))
                 if found is not None:
-                    self.events.append(Heard(time.monotonic_ns(), *found.groups()))
+                    self.events.append(Heard(monotonic_ns(), *found.groups()))
 
     async def terminate(self) -> int:
         """SIGTERM, as systemd stops it; the exit status. What it still says is not kept."""

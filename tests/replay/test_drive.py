@@ -38,7 +38,8 @@ from tests.replay.track_judges import gpsbabel_points, gpx_points
 LENGTH_S = 18.0
 ZSTD = bytes.fromhex("28b52ffd")
 """How a compressed chunk begins (RFC 8878, 3.1.1)."""
-STEP_S, REQUEST_S, INJECT_S, UNPLUG_S, PLUG_S, STALL_S = 9.0, 10.0, 12.0, 13.5, 15.0, 16.0
+SLEW_S, STEP_S, REQUEST_S, INJECT_S, UNPLUG_S = 6.0, 9.0, 10.0, 12.0, 13.5
+PLUG_S, STALL_S = 15.0, 16.0
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,12 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """18 s with a step of the system clock, an operator's request, injected noise, a receiver that
-    is unplugged, and ticks that are skipped because the host stood still."""
+    """18 s with a step of the system clock, which chrony slews, an operator's request, injected
+    noise, a receiver that is unplugged, and ticks that are skipped because the host stood still."""
     folder = tmp_path_factory.mktemp("logs")
     drive = Drive(folder, LENGTH_S + 6.0, split_min=13.0 / 60.0)
+    drive.run(SLEW_S)
+    drive.host.slew(83_333)
     drive.run(STEP_S)
     drive.host.system_error = 2 * S
     drive.run(REQUEST_S)
@@ -64,6 +67,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     drive.run(INJECT_S)
     drive.command(Inject(id="2", source="gnss", fault="noise", size=0.5, duration_s=1.0))
     drive.run(UNPLUG_S)
+    drive.host.slew(0)
     drive.until_file(2)
     drive.take("gnss", "close", "unplugged")
     drive.unplugged.add("gnss")

@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import sys
-import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 import serial
 
+from drivers.base import monotonic_ns
 from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder
 from drivers.measurements import DeviceStamp, ImuSample, UtcStamp
@@ -105,7 +105,7 @@ async def test_all_devices_speak_in_real_time(vehicle: SimulatedVehicle, tmp_pat
     def take(bus: can.BusABC, gnss: serial.Serial, terminal: serial.Serial) -> bool:
         while (frame := bus.recv(timeout=0.0)) is not None:
             data = bytes(frame.data)
-            found = decoder.feed(CanFrame(frame.arbitration_id, False, data, time.monotonic_ns()))
+            found = decoder.feed(CanFrame(frame.arbitration_id, False, data, monotonic_ns()))
             samples.extend(s for s in found if isinstance(s, ImuSample))
         said.extend(gnss.read(4096))
         replies.extend(rdss.feed(terminal.read(4096)))
@@ -163,7 +163,7 @@ async def test_raw_gnss_beside_nmea_gives_the_true_position(
         with serial.Serial(str(tmp_path / "gnss"), 115200, timeout=0) as port:
 
             def take() -> bool:
-                for event in decoder.feed(port.read(65536), time.monotonic_ns()):
+                for event in decoder.feed(port.read(65536), monotonic_ns()):
                     if isinstance(event, RawGnssEpoch):
                         epochs.append(event)
                     else:
@@ -181,7 +181,7 @@ async def test_raw_gnss_beside_nmea_gives_the_true_position(
     stamp = epochs[-1].stamp
     assert isinstance(stamp, UtcStamp)
     t_ns = made.start_ns + stamp.utc_ns - made.utc_start_ns
-    assert made.start_ns <= t_ns <= time.monotonic_ns()
+    assert made.start_ns <= t_ns <= monotonic_ns()
     lat, lon, height = (float(x) for x in made.truth_at(t_ns).position[0])
     # Ionosphere of whatever time of day it is: 20 m of zenith delay are half modelled.
     assert np.linalg.norm(solved.position - np.array(to_ecef(lat, lon, height))) < 25.0
@@ -199,27 +199,27 @@ async def test_truth_on_the_monotonic_clock(vehicle: SimulatedVehicle) -> None:
 async def test_both_clocks_are_read_at_one_instant(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    utc_ns, monotonic_ns = 1_795_478_400_012_345_678, 7_000_000_000_001
-    clocks = SimpleNamespace(time_ns=lambda: utc_ns, monotonic_ns=lambda: monotonic_ns)
+    utc_ns, now_ns = 1_795_478_400_012_345_678, 7_000_000_000_001
     made = SimulatedVehicle(
         SCENARIOS["static"],
         seed=2,
         duration_s=10.0,
         can_imu=SIM_IMU.model_copy(update={"channel": f"test-{tmp_path.name}"}),
     )
-    monkeypatch.setattr(vehicle_module, "time", clocks)
+    monkeypatch.setattr(vehicle_module, "time", SimpleNamespace(time_ns=lambda: utc_ns))
+    monkeypatch.setattr(vehicle_module, "monotonic_ns", lambda: now_ns)
     task = asyncio.create_task(made.run())
     await asyncio.sleep(0)
     task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await task
     assert made.utc_start_ns == 1_795_478_400_100_000_000
-    assert made.start_ns - monotonic_ns == made.utc_start_ns - utc_ns
+    assert made.start_ns - now_ns == made.utc_start_ns - utc_ns
 
 
 async def test_the_vehicle_as_a_process(tmp_path: Path) -> None:
     """The way hardware-in-the-loop tests use it; UDP multicast stands in for a CAN interface."""
-    before_ns = time.monotonic_ns()
+    before_ns = monotonic_ns()
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",
@@ -238,7 +238,7 @@ async def test_the_vehicle_as_a_process(tmp_path: Path) -> None:
             assert await process.stdout.readline() == b"ready\n"
             start = json.loads((tmp_path / "start.json").read_text())
             # At the next tenth of a second, once it was told to start.
-            assert before_ns < start["start_monotonic_ns"] < time.monotonic_ns() + 100_000_000
+            assert before_ns < start["start_monotonic_ns"] < monotonic_ns() + 100_000_000
             assert len(read_truth(tmp_path / "truth.csv").t_s) == 2401
             assert (tmp_path / "gnss").is_symlink()
             with serial.Serial(str(tmp_path / "rdss"), 115200, timeout=PATIENCE_S) as port:

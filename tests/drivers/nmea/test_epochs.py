@@ -323,3 +323,38 @@ def test_pauses_at_ever_new_places_are_bounded() -> None:
         line.burst(rmc, after_ms=100)
         line.burst(gst, after_ms=200)
     assert line.decoder.counters["fixes"] == 59
+
+
+@pytest.mark.parametrize("first", ["GGA", "RMC"])
+@pytest.mark.parametrize(("fast_hz", "slow_hz"), [(50, 1), (20, 5), (10, 1)])
+def test_mixed_rates_are_learned_by_the_phase_of_the_second(
+    first: str, fast_hz: int, slow_hz: int
+) -> None:
+    """RMC at 50 Hz and GGA at 1 Hz: no epoch waits for the next one to know that it is over."""
+    one = decoder()
+    for k in range(6 * fast_hz):
+        seconds, hundredths = divmod(100 * k // fast_hz, 100)
+        time = f"0214{seconds:02d}.{hundredths:02d}"
+        burst = [at(RMC, time)]
+        if k % (fast_hz // slow_hz) == 0:
+            burst.insert(0 if first == "GGA" else 1, at(GGA, time))
+        found = fixes(one.feed(wire(*burst), k * 1_000_000_000 // fast_hz))
+        if seconds >= 4:
+            assert [fix.v_ned_m_s is not None for fix in found] == [True], time
+            assert (found[0].height_m is None) == (len(burst) == 1)
+    assert one.counters["late_sentence"] <= 1
+    assert one.counters["gga_awaited"] <= 2 * slow_hz, "until it is learned"
+
+
+def test_a_sentence_once_in_five_seconds_costs_one_fix_and_is_waited_for_from_then_on() -> None:
+    one = decoder()
+    found = []
+    for k in range(200):
+        time = f"02{14 + k // 600:02d}{k // 10 % 60:02d}.{k % 10}0"
+        burst = [at(GGA, time)] + [at(RMC, time)] * (k % 50 == 49)
+        found += fixes(one.feed(wire(*burst), k * 100_000_000))
+    found += fixes(one.flush())
+    assert len(found) == 200
+    with_velocity = [k for k, fix in enumerate(found) if fix.v_ned_m_s is not None]
+    assert with_velocity == [99, 149, 199]
+    assert one.counters["late_sentence"] == 1
