@@ -30,8 +30,8 @@ from drivers.plausible import SIGMA_M
 
 PLAIN_AFTER = 2
 """Consecutive epochs with RMC or GLL but neither GGA nor GNS, after which their position is a fix:
-a single GGA may be damaged, where not all epochs before were so. A GGA at an instant of its own does
-not count (plotters take turns)."""
+a single GGA may be damaged, where not all epochs before were so. A GGA at an instant of its own
+does not count (plotters take turns)."""
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
 DATUMS = frozenset({"", "W84", "P90"})
 """Datums of DTM: WGS 84, and PZ-90, which agrees with it to some centimetres since 2007 (PZ-90.02);
