@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,13 +16,9 @@ from fusiond.commands.shared import (
     ConfigPath,
     config_errors,
     draws,
-    freeze_imports,
     load,
     plain,
 )
-
-if TYPE_CHECKING:
-    from fusiond.configuration.schema import Config
 
 RecordPath = Annotated[
     Path | None,
@@ -32,26 +28,10 @@ RecordPath = Annotated[
 
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
-    settings = recorded(load(config), record)
-    from fusiond.configuration.load import ConfigError, load_config  # noqa: PLC0415
-    from fusiond.navigation.compiled import gathered  # noqa: PLC0415
-
-    with gathered() as missing:
-        from fusiond.live.daemon import run_daemon  # noqa: PLC0415
-        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
-
-        with suppress(ConfigError):  # the daemon's own will say so
-            Navigator(settings)
-    freeze_imports()
-    run_daemon(settings, config, lambda: recorded(load_config(config), record), missing)
-
-
-def recorded(config: Config, folder: Path | None) -> Config:
-    """The configuration, with all recorded into `folder` if there is one."""
-    if folder is None:
-        return config
-    update = {"directory": folder.absolute(), "when": "always"}
-    return config.model_copy(update={"recording": config.recording.model_copy(update=update)})
+    # Of the interpreter's paths the working folder is none (-P): no file there is taken for a module.
+    arguments = [config] if record is None else [config, record]
+    program = [sys.executable, "-P", "-m", "fusiond.live", *map(str, arguments)]
+    os.execv(sys.executable, program)  # the same process, another program
 
 
 def demo(
