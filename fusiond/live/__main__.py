@@ -33,20 +33,22 @@ def main(path: Path, record: Path | None = None) -> None:
     except ConfigError as error:
         print(error, file=sys.stderr)
         sys.exit(EXIT_CONFIG)
-    from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - after the mistakes: seconds
+    from fusiond.navigation.compiled import gathered, needed  # noqa: PLC0415 - takes seconds
 
     with gathered() as missing:
         from fusiond.live.daemon import run_daemon  # noqa: PLC0415
+        from fusiond.navigator.kernel_widths import kernel_widths  # noqa: PLC0415
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
+        widths = None
         with suppress(ConfigError):  # the daemon's own will say so
-            Navigator(config)
+            widths = kernel_widths(Navigator(config))
     # What imports left in cycles, 2 MB, is used again by what follows; what lives is looked through
     # no more.
     gc.collect()
     gc.freeze()
     gc.set_threshold(COLLECT_AFTER)
-    run_daemon(config, path, read, missing)
+    run_daemon(config, path, read, needed(missing, widths))
 
 
 def recorded(config: Config, folder: Path | None) -> Config:
