@@ -1,4 +1,4 @@
-"""Widths of the covariances of a vehicle's filters, by which its kernels are compiled and linked."""
+"""Widths of covariances of a vehicle's filters, by which its kernels are compiled and linked."""
 
 from __future__ import annotations
 
