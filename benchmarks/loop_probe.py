@@ -194,11 +194,10 @@ def _kernels_linked() -> int:
 
 def main() -> None:
     out = Path(sys.argv[1])
-    sys.argv = ["fusiond", *sys.argv[2:]]
     Probe(out).install()
-    from fusiond.commands.app import main as fusiond  # noqa: PLC0415 - timed too
+    from fusiond.live.__main__ import main as daemon  # noqa: PLC0415 - timed too
 
-    fusiond()
+    daemon(Path(sys.argv[3]))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from fusiond.navigation.compiled import gathered
 MODULES = (
     "fusiond.__main__",
     "fusiond.configuration.doubts",
+    "fusiond.live.__main__",
     "fusiond.live.daemon",
     "fusiond.offline.process",
     "fusiond.outputs.broker_access",

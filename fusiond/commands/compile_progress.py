@@ -20,16 +20,20 @@ LINE_EVERY_S = 5.0
 
 
 @contextmanager
-def compiling() -> Iterator[None]:
+def compiling() -> Iterator[set[int]]:
     """Show progress while an import compiles kernels. The garbage collector then ignores all that
-    was loaded."""
-    from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - numba
+    was loaded.
 
+    Where the widths of covariances are known (`kernel_widths`) and put into the set that it gives,
+    kernels of no other are compiled."""
+    from fusiond.navigation.compiled import gathered, needed  # noqa: PLC0415 - numba
+
+    widths: set[int] = set()
     with gathered() as missing:
-        yield
+        yield widths
         freeze_imports()
     if missing:
-        compile_aside(missing, Progress(sys.stderr))
+        compile_aside(needed(missing, widths or None), Progress(sys.stderr))
 
 
 def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,13 +16,9 @@ from fusiond.commands.shared import (
     ConfigPath,
     config_errors,
     draws,
-    freeze_imports,
     load,
     plain,
 )
-
-if TYPE_CHECKING:
-    from fusiond.configuration.schema import Config
 
 RecordPath = Annotated[
     Path | None,
@@ -32,26 +28,10 @@ RecordPath = Annotated[
 
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
-    settings = recorded(load(config), record)
-    from fusiond.configuration.load import ConfigError, load_config  # noqa: PLC0415
-    from fusiond.navigation.compiled import gathered  # noqa: PLC0415
-
-    with gathered() as missing:
-        from fusiond.live.daemon import run_daemon  # noqa: PLC0415
-        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
-
-        with suppress(ConfigError):  # the daemon's own will say so
-            Navigator(settings)
-    freeze_imports()
-    run_daemon(settings, config, lambda: recorded(load_config(config), record), missing)
-
-
-def recorded(config: Config, folder: Path | None) -> Config:
-    """Configuration that records everything into `folder`, if there is one."""
-    if folder is None:
-        return config
-    update = {"directory": folder.absolute(), "when": "always"}
-    return config.model_copy(update={"recording": config.recording.model_copy(update=update)})
+    # -P: no file of the working folder is taken for a module.
+    arguments = [config] if record is None else [config, record]
+    program = [sys.executable, "-P", "-m", "fusiond.live", *map(str, arguments)]
+    os.execv(sys.executable, program)  # the same process, another program
 
 
 def demo(
@@ -68,12 +48,16 @@ def demo(
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
 
-    with compiling():
+    with compiling() as widths:
         from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
+        from fusiond.demo.demo import demo_setup  # noqa: PLC0415
+        from fusiond.navigator.kernel_widths import kernel_widths  # noqa: PLC0415
+        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
         from fusiond.simulation.papers import PAPERS  # noqa: PLC0415
 
-    if paper is not None and paper not in PAPERS:
-        raise typer.BadParameter(f"--paper {paper}: there are {', '.join(PAPERS)}")
+        if paper is not None and paper not in PAPERS:
+            raise typer.BadParameter(f"--paper {paper}: there are {', '.join(PAPERS)}")
+        widths.update(kernel_widths(Navigator(demo_setup(paper).config)))
     try:
         summary = run_demo(duration, headless or not draws(sys.stdout), record, dashboard, paper)
     except DemoError as error:
@@ -97,11 +81,12 @@ def check(
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415
 
     if compile_kernels:
-        with compiling(), config_errors():
+        with compiling() as widths, config_errors():
             import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
+            from fusiond.navigator.kernel_widths import kernel_widths  # noqa: PLC0415
             from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
-            Navigator(settings)  # and so does its filter
+            widths.update(kernel_widths(Navigator(settings)))  # and so does its filter
     typer.echo(f"{config}: ok, vehicle {settings.vehicle}")
     for name, source in settings.sources.items():
         section = settings.aiding.get(name)

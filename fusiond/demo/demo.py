@@ -82,15 +82,18 @@ def demo(
         DemoPage(broker.port) if dashboard else contextlib.nullcontext() as page,
         _log_kept_out(headless),
     ):
-        play = demo_setup() if paper is None else paper_setup(paper)
+        play = demo_setup(paper)
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
         live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
         return asyncio.run(_Run(play, live, view, Path(folder), record).drive())
 
 
-def demo_setup() -> DemoSetup:
-    """Demo of the shipped car in town streets; its receiver is unplugged once a minute."""
+def demo_setup(paper: str | None = None) -> DemoSetup:
+    """Demo of the shipped car in town streets, whose receiver is unplugged once a minute, or of a
+    paper's vehicle by its number in `fusiond.simulation.papers`."""
+    if paper is not None:
+        return paper_setup(paper)
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
     config = load_config(CONFIG).model_copy(
         update={"vehicle": VEHICLE, "position_reports": reports}

@@ -40,6 +40,7 @@ from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.compiled import kernels_can_be_kept, load_compiler, load_kernels
 from fusiond.navigation.solution import Solution
+from fusiond.navigator.kernel_widths import kernel_widths
 from fusiond.navigator.timeline import Entry
 from fusiond.outputs.base import Output
 from fusiond.outputs.commands import (
@@ -91,7 +92,7 @@ class Daemon:
         self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
         self.navigator = navigator = self._chain.navigator
         # None is linked inside a tick. Of those by the width of a covariance 10 MB are for others.
-        load_kernels({navigator.model.width, navigator.without_imu.model.width})
+        load_kernels(kernel_widths(navigator))
         self.navigator.timeline.keeps_raw = config.recording.directory is not None
         self.sources = self._chain.sources
         self._calibration.restore_into(self.navigator)

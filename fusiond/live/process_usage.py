@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+import gc
 import os
 import resource
 import time
@@ -66,7 +67,8 @@ def widen_descriptor_table() -> None:
 
 def release_start_memory() -> None:
     """Release memory that only the start needed: pages of libraries, among them LLVM's, 45 MB,
-    unused once the kernels are loaded, and 13 MB of others; bitcode, 7 MB; freed memory, 1 MB.
+    unused once the kernels are loaded, and 13 MB of others; bitcode, 7 MB; objects in cycles; freed
+    memory, 1 MB.
 
     madvise(2), MADV_DONTNEED: pages of a mapping that nobody wrote to are clean copies of the
     file, and those that are used are read again. malloc_trim(3) is glibc's.
@@ -75,6 +77,7 @@ def release_start_memory() -> None:
     for start, end in _clean_mappings():
         libc.madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
     release_bitcode()
+    gc.collect()  # what linking left: what was imported is frozen
     trim = getattr(libc, "malloc_trim", None)  # musl has none
     if trim is not None:
         trim(0)

@@ -30,11 +30,11 @@ import itertools
 import os
 import secrets
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numba
 import numpy as np
@@ -77,12 +77,22 @@ def _cache_folder() -> Path:
 
 
 FOLDER = _cache_folder()
+
+
+class Missing(NamedTuple):
+    """A kernel that lies in no cache: `load` compiles it, with those that it calls, and leaves it
+    there. `variant` is that of one of several which one piece of source makes."""
+
+    load: Callable[[], None]
+    variant: int | None
+
+
 _names: set[str] = set()
 _variants: dict[str, int] = {}
 _in_cache = kept_in(FOLDER)
 _shipped = shipped_in(Path(__file__).with_name("prebuilt") / FOLDER.name)
 _waiting: dict[str, Callable[[], None]] = {}
-_gathered: list[Callable[[], None]] | None = None
+_gathered: list[Missing] | None = None
 
 
 def _count_from_anywhere() -> None:
@@ -123,7 +133,7 @@ def compiled(
         if cache.shipped is not None or cache.file_name in _in_cache:
             _load_when_called(kernel, name, signature)
         elif _gathered is not None:
-            _gathered.append(_load_when_called(kernel, name, signature))
+            _gathered.append(Missing(_load_when_called(kernel, name, signature), variant))
         else:
             kernel.compile(signature)
             kernel.disable_compile()
@@ -134,17 +144,28 @@ def compiled(
 
 
 @contextmanager
-def gathered() -> Iterator[list[Callable[[], None]]]:
-    """List what is imported inside and lies in no cache, instead of compiling it: each item
-    compiles one kernel, with those that it calls, and leaves it in the cache. A kernel that is
+def gathered() -> Iterator[list[Missing]]:
+    """List what is imported inside and lies in no cache, instead of compiling it. A kernel that is
     called is compiled all the same."""
     global _gathered  # noqa: PLW0603 - imports have no other way to be told
-    missing: list[Callable[[], None]] = []
+    missing: list[Missing] = []
     outer, _gathered = _gathered, missing
     try:
         yield missing
     finally:
         _gathered = outer
+
+
+def needed(
+    missing: Iterable[Missing], variants: Collection[int] | None = None
+) -> list[Callable[[], None]]:
+    """What compiles them; of those that one piece of source makes, these `variants` alone. Half of
+    the compiler's time is theirs, and a vehicle has one or two of four."""
+    return [
+        load
+        for load, variant in missing
+        if variant is None or variants is None or variant in variants
+    ]
 
 
 def kernels_can_be_kept() -> bool:

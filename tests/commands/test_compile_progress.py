@@ -33,19 +33,29 @@ USED = quartered(1.0)
 @compiled("f8(f8)")
 def doubled(x):
     return 2.0 * x
+
+def times(width):
+    @compiled("f8(f8)", variant=width)
+    def by_width(x):
+        return width * x
+    return by_width
+
+TIMES = {width: times(width) for width in (20, 40)}
 """
 CODE = """
 import sys
 from fusiond.commands.compile_progress import compiling
-with compiling():
+with compiling() as widths:
     import kernels
+    widths.add(20)
     print("imported", file=sys.stderr)
-print(kernels.USED, kernels.quartered(8.0), kernels.doubled(8.0))
+print(kernels.USED, kernels.quartered(8.0), kernels.doubled(8.0), kernels.TIMES[20](2.0))
 """
 
 
 def test_a_pipe_and_systemd_hear_how_far_it_is(tmp_path: Path) -> None:
-    """All kernels are known before the first one compiles, but for one that an import calls."""
+    """All kernels are known before the first one compiles, but for one that an import calls; of
+    those that one piece of source makes, that which is needed alone is compiled."""
     (tmp_path / "kernels.py").write_text(KERNELS)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
@@ -63,13 +73,13 @@ def test_a_pipe_and_systemd_hear_how_far_it_is(tmp_path: Path) -> None:
             check=True,
         )
         manager.setblocking(False)
-        told = [manager.recv(256).decode() for _ in range(4)]
-    assert done.stdout == "0.25 2.0 16.0\n"
+        told = [manager.recv(256).decode() for _ in range(5)]
+    assert done.stdout == "0.25 2.0 16.0 40.0\n"
     first, second, *_, last = done.stderr.splitlines()
-    assert (first, second) == ("imported", "compiling 0/3 kernels, once")
-    assert re.fullmatch(r"compiled 3 kernels in \d+ s", last)
-    assert told == [f"STATUS=compiling {n}/3 kernels, once" for n in range(4)]
-    assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 3
+    assert (first, second) == ("imported", "compiling 0/4 kernels, once")
+    assert re.fullmatch(r"compiled 4 kernels in \d+ s", last)
+    assert told == [f"STATUS=compiling {n}/4 kernels, once" for n in range(5)]
+    assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 4
 
 
 def test_what_cannot_be_kept_is_compiled_here_and_told(tmp_path: Path) -> None:
@@ -87,8 +97,8 @@ def test_what_cannot_be_kept_is_compiled_here_and_told(tmp_path: Path) -> None:
         timeout=PATIENCE_S,
         check=True,
     )
-    assert done.stdout == "0.25 2.0 16.0\n"
-    assert "compiled 3 kernels in" in done.stderr.splitlines()[-1]
+    assert done.stdout == "0.25 2.0 16.0 40.0\n"
+    assert "compiled 4 kernels in" in done.stderr.splitlines()[-1]
 
 
 class _Terminal(io.StringIO):

@@ -187,8 +187,9 @@ def _check_process(pid: int) -> None:
     assert status["Uid"].split() == [str(entry.pw_uid)] * 4
     assert status["Gid"].split() == [str(entry.pw_gid)] * 4
     assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
-    program = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-    assert program[1].decode() == str(PREFIX / "bin" / "fusiond")
+    program = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+    assert program[0] == str(PREFIX / "bin" / "python")
+    assert program[3] == "fusiond.live"
 
 
 def _check_state(stands: dict[str, Any]) -> None:

@@ -1,0 +1,70 @@
+"""The daemon's own process: `python -m fusiond.live CONFIG [DIR]`, recording all into DIR.
+
+`fusiond run` reads the command line and becomes this program under the same process id: what reads
+command lines takes 2 MB that a daemon would hold for as long as it lives.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fusiond.configuration.schema import Config
+
+COLLECT_AFTER_IMPORTS, COLLECT_AFTER = 1_000_000, 50_000
+"""Objects made since the last collection: imports make half a million, and are looked through once
+they are done; a filter at work makes the other in minutes, `fusiond.live.collector` in none."""
+
+
+def main(path: Path, record: Path | None = None) -> None:
+    """Serve until SIGTERM. A mistake in the configuration is told on standard error; exits 78."""
+    gc.set_threshold(COLLECT_AFTER_IMPORTS)
+    from fusiond.configuration.load import EXIT_CONFIG, ConfigError, load_config  # noqa: PLC0415
+
+    def read() -> Config:
+        return recorded(load_config(path), record)
+
+    try:
+        config = read()
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        sys.exit(EXIT_CONFIG)
+    from fusiond.navigation.compiled import gathered, needed  # noqa: PLC0415 - takes seconds
+
+    with gathered() as missing:
+        from fusiond.live.daemon import run_daemon  # noqa: PLC0415
+        from fusiond.navigator.kernel_widths import kernel_widths  # noqa: PLC0415
+        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
+
+        widths = None
+        with suppress(ConfigError):  # the daemon's own will say so
+            widths = kernel_widths(Navigator(config))
+    # What imports left in cycles, 2 MB, is used again by what follows; what lives is looked through
+    # no more.
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(COLLECT_AFTER)
+    run_daemon(config, path, read, needed(missing, widths))
+
+
+def recorded(config: Config, folder: Path | None) -> Config:
+    """The configuration, with all recorded into `folder` if there is one."""
+    if folder is None:
+        return config
+    update = {"directory": folder.absolute(), "when": "always"}
+    return config.model_copy(update={"recording": config.recording.model_copy(update=update)})
+
+
+if __name__ == "__main__":
+    try:
+        main(*map(Path, sys.argv[1:]))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    finally:
+        # The interpreter's last two collections would look through all that was imported, a quarter
+        # of a second for nothing: the process and its memory end.
+        gc.freeze()
