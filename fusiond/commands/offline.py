@@ -51,7 +51,9 @@ CanLog = Annotated[
 ]
 MeasurementFiles = Annotated[
     list[str] | None,
-    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(MEASUREMENT_KINDS)}."),
+    typer.Option(
+        "--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(MEASUREMENT_KINDS)}."
+    ),
 ]
 
 
@@ -266,7 +268,9 @@ def _measurement_argument(text: str) -> tuple[str, Path]:
     """Parse KIND=FILE."""
     kind, equals, path = text.partition("=")
     if not equals or not path or kind not in MEASUREMENT_KINDS:
-        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(MEASUREMENT_KINDS)}")
+        raise typer.BadParameter(
+            f"--aid {text}: KIND=FILE with KIND of {', '.join(MEASUREMENT_KINDS)}"
+        )
     return kind, Path(path)
 
 

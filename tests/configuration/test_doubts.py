@@ -40,7 +40,7 @@ def test_examples_leave_no_doubt(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"[sources.gnss]\n{GNSS}", "sources: none is an IMU"),
+        (f"[sources.gnss]\n{GNSS}", "sources: no IMU"),
         (f"{SOUND}[sources.imu2]\n{IMU}", "sources: imu and imu2 are IMUs"),
         (f"{SOUND}[imu]\nrate_hz = 0.01\n", "imu.rate_hz = 0.01: samples 100 s apart"),
         (
