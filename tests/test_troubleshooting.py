@@ -29,7 +29,7 @@ def test_every_sentence_of_the_page_is_one_of_the_navigator() -> None:
     assert [row for row in rows if row not in said] == []
 
 
-def test_what_doctor_says_of_a_receiver_is_what_the_code_says() -> None:
+def test_receiver_findings_on_the_page_are_those_of_the_code() -> None:
     """The sentences of the table are parts of those of the code."""
     places = (REPOSITORY / "drivers" / "nmea", REPOSITORY / "fusiond" / "doctor")
     text = "\n".join(path.read_text() for place in places for path in place.rglob("*.py"))

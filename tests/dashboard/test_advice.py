@@ -65,7 +65,7 @@ def test_why_becomes_a_step(mode: str, why: str, step: str) -> None:
         ({"verdict": "optimistic"}, "gnss: sigma is too small"),
     ],
 )
-def test_what_a_source_needs(changed: dict[str, Any], step: str) -> None:
+def test_advice_for_a_source(changed: dict[str, Any], step: str) -> None:
     (only,) = texts(status(), health(**changed))
     assert only.startswith(step)
 
@@ -78,7 +78,7 @@ def test_a_fault_is_told_once_with_its_size() -> None:
     ]
 
 
-def test_what_is_left_out_and_diagnosed_is_not_said_to_disagree() -> None:
+def test_a_diagnosed_exclusion_has_one_advice() -> None:
     fault = said("status")["faults"][0]
     found = texts(status(faults=[fault]), health(isolated=fault["text"], diagnosis=fault))
     assert len(found) == 1
