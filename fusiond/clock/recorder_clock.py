@@ -71,9 +71,9 @@ class Slew(NamedTuple):
 
 
 class RecorderClock:
-    """Takes the stamps in their order. `t_ns` is monotonic time, which begins at the first of them;
-    `stamp_ns` the latest stamp taken; `steps` what the clock was set by, `slewed_ns` what it has
-    gained by its slews, which come in their order."""
+    """Monotonic clock from a recorder's stamps, in order. `t_ns` is monotonic time, which starts at
+    the first stamp; `stamp_ns` the latest stamp; `steps` the changes of the recorder's clock,
+    `slewed_ns` the sum of its slews."""
 
     def __init__(self, slews: Sequence[Slew] = ()) -> None:
         self.t_ns = 0

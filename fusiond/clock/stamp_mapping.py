@@ -84,7 +84,7 @@ the largest error (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 
 
 class Clock:
-    """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
+    """Converter of stamps to instants. `counters` names every refusal, guess and learnt value.
 
     `on_event(code, text)` hears what happens to UTC, to the system clock and to the host;
     `on_time` has every report by which the system clock may be set.

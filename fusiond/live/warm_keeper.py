@@ -59,7 +59,7 @@ KEPT_STATE = TypeAdapter(KeptState)
 
 
 class WarmKeeper:
-    """Keeps one vehicle's navigation state in systemd's runtime directory, else not.
+    """Store of one vehicle's navigation state in systemd's runtime directory, else none.
 
     `on_event(code, text)` hears `warm_state_damaged` and `warm_state_refused`.
     """

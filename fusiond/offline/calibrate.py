@@ -193,7 +193,7 @@ def _why(p: Parameter, drive: _Drive) -> str:
 
 
 class _Drive:
-    """Watches a navigator: its calibration, and what the vehicle did to show it.
+    """Watch of a navigator: its calibration, and the vehicle's motion that shows it.
 
     `rolled`: an earlier pass has taken a roll out.
     """

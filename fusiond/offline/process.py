@@ -55,7 +55,7 @@ CHUNK = 50
 YOUNG = 50_000
 _SHOWN = 20
 _REPORT_EVERY = 2000
-"""Samples between two words on the progress: some tenths of a second of work."""
+"""Samples between two reports of progress: some tenths of a second of work."""
 
 
 def process(

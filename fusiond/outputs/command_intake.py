@@ -40,7 +40,7 @@ Answer = ReplyMessage | Coroutine[None, None, ReplyMessage]
 
 
 class CommandIntake:
-    """Answers commands; `allowed` are those that the configuration lists.
+    """Executor of commands; `allowed` are those that the configuration lists.
 
     `counters`: `mqtt_commands`, `mqtt_commands_limited`, `mqtt_commands_refused`, and of these
     `mqtt_commands_repeated` and `mqtt_commands_retained`. `on_event` hears

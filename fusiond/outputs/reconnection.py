@@ -21,7 +21,7 @@ PEACE_S = 2.0 * LONGEST_CONTESTED_S
 
 
 class Reconnecting:
-    """Waits between connections; `taken` while another client seems to have our name."""
+    """Wait between connections; `taken` while another client seems to have our name."""
 
     def __init__(self) -> None:
         self.taken = False

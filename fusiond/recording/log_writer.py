@@ -50,7 +50,7 @@ class Item:
 
 
 class LogWriter:
-    """Writes one recording into files `STEM_0000.mcap`, ... of `folder` until it is closed.
+    """Writer of one recording into files `STEM_0000.mcap`, ... of `folder`, until closed.
 
     `about()` describes it; it is called in the thread, since it reads files.
     The attributes may be read at any time: `path` of the file under way, whether any was `synced`,

@@ -26,7 +26,7 @@ class Outcome(Generic[R]):
 
 
 class Runner(Protocol):
-    """Runs a function of each item on other processes. `workers` run at a time."""
+    """Runner of a function of each item on other processes; `workers` at a time."""
 
     @property
     def workers(self) -> int: ...

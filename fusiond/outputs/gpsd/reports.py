@@ -1,4 +1,4 @@
-"""Reports of gpsd's protocol, made of the daemon's messages; no I/O.
+"""Reports of gpsd's protocol, built from the daemon's messages; no I/O.
 
 Units m, m/s, degrees; `climb` up, `velD` down; the errors of TPV at 95 %, those of GST one sigma.
 What is not known is left out: null and NaN are no part of the protocol. Nothing stands in TPV that

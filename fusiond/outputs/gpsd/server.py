@@ -1,4 +1,4 @@
-"""Serves gpsd's clients in the place of gpsd: VERSION on connecting, reports to those who watch."""
+"""Server for gpsd's clients in place of gpsd: VERSION on connection, reports to watchers."""
 
 from __future__ import annotations
 
