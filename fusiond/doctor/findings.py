@@ -69,11 +69,13 @@ FINDINGS: Mapping[str, str] = {
     "no_card": "{detail}: insert the user card, or have it activated",
     "no_beam": "{detail}: give the antenna a free sky to the south (geostationary satellites)",
     "low_battery": "{detail}: charge the terminal or feed it from the vehicle",
-    "suppressed": "{detail}: the RDSS centre suppresses the transmitter: ask the operator of
-    the service", "silence": "{detail}: radio silence is set at the terminal: lift it
-    there", # Inertial unit
-    "imu_rate": "{seen:.1f} samples a second, but [imu] rate_hz = {set:g}: correct one of
-    them", "imu_force": (
+    "suppressed": (
+        "{detail}: the RDSS centre suppresses the transmitter: ask the operator of the service"
+    ),
+    "silence": "{detail}: radio silence is set at the terminal: lift it there",
+    # Inertial unit
+    "imu_rate": "{seen:.1f} samples a second, but [imu] rate_hz = {set:g}: correct one of them",
+    "imu_force": (
         "Specific force at rest is {force:.3f} m/s2 instead of {gravity:.2f}: correct the unit "
         "(accel_unit of [sources.{name}], or the DBC)"
     ),
