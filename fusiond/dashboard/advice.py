@@ -1,7 +1,7 @@
 """Steps for the operator, the most urgent first, from `status` and `health`.
 
-The step for a `why` is that of the catalogue `fusiond.navigator.reasons`; sources, host and faults
-add theirs. Where all is well there is none.
+The step for a `why` comes from the catalogue `fusiond.navigator.reasons`; sources, host and faults
+add theirs.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class _Asking:
 class GpsdServer:
     """gpsd's protocol at `host:port`. Counters: those of `TcpServer`, and `requests`, `malformed`.
 
-    `raw`, `pps` and `timing` are taken and answered, and nothing is sent for them: there is none.
+    `raw`, `pps` and `timing` are accepted, but nothing is sent for them.
     """
 
     name = "gpsd"
