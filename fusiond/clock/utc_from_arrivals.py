@@ -18,8 +18,8 @@ What the envelope cannot explain is a change of the source's UTC. It is seen in 
   that, the sequence shows that UTC went on). They are stamped as late, with a sigma as large as the
   doubt, until it has lasted for two minutes.
 
-Whoever asks for UTC itself hears of a change only when it has lasted for two minutes
-(`believed_offset_ns`): a receiver's mistake is no leap second.
+UTC itself changes only after two minutes (`believed_offset_ns`): a receiver's mistake is no leap
+second.
 
 Everything is integer nanoseconds: UTC in ns does not fit a double. A pure function of its inputs.
 """
