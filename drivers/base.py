@@ -77,7 +77,7 @@ class Driver(Protocol):
 
 @dataclass(slots=True)
 class Backoff:
-    """Waits between attempts to reopen a device: doubling from `first_s` up to `longest_s`."""
+    """Wait between attempts to reopen a device: doubling from `first_s` up to `longest_s`."""
 
     first_s: float = 0.25
     longest_s: float = 5.0

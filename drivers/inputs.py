@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from drivers.can.bus import CanFrame
 
 Handler = Callable[[Any, int], None]
-"""Takes the payload and the instant (monotonic ns)."""
+"""Callback with the payload and the instant (monotonic ns)."""
 
 
 class Inputs:

@@ -66,7 +66,8 @@ class ReceiverOptions(DriverOptions):
 
 
 class ReceiverDriver:
-    """Reads the line. Who derives from it gives the decoder and the words of `status.detail`."""
+    """Base of drivers of one device on one line. Subclasses provide the decoder and the words of
+    `status.detail`."""
 
     alive_by: tuple[str, ...] = ("sentences",)
     """Counters of which one must grow for the device to be `running`."""

@@ -24,7 +24,8 @@ class SolutionOptions(ReceiverOptions, SolutionDecoding):
 
 
 class SolutionDriver(ReceiverDriver):
-    """Reads the line, hands over fixes, headings and times; says in `status` what is wrong."""
+    """Driver that reads a line and hands over fixes, headings and times; `status` says what is
+    wrong."""
 
     Options: ClassVar[type[SolutionOptions]] = SolutionOptions
     Decoder: ClassVar[Callable[..., Any]]

@@ -28,7 +28,7 @@ def _steps() -> list[tuple[str, str]]:
     return [(word, rest.strip()) for word, _, rest in lines]
 
 
-def test_what_is_copied_is_there_and_is_let_through() -> None:
+def test_copied_files_exist_and_pass_the_ignore_list() -> None:
     copied = [
         source
         for word, rest in _steps()

@@ -18,7 +18,7 @@ LOADING = """<script src="https://cdn.example.org/a.js"></script><img src="gone.
 <p style="background: url(https://example.org/p.png)">p</p>"""
 
 
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+def test_broken_links_are_named(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text(GOOD)
     (tmp_path / "other.html").write_text('<h2 id="deep">Deep</h2>')
     (tmp_path / "style.css").write_text("p { background: url('style.css') }")

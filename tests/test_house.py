@@ -110,7 +110,7 @@ def sources_of(module: str) -> list[Path]:
     return [file] if file.exists() else sorted(path.glob("**/*.py"))
 
 
-def test_what_contributing_names_exists() -> None:
+def test_names_in_contributing_exist() -> None:
     modules = set(re.findall(r"`((?:fusiond|drivers)\.[\w.]+)`", CONTRIBUTING))
     modules.remove("fusiond.drivers")  # the group of entry points
     assert len(modules) > 25
@@ -122,7 +122,7 @@ def test_what_contributing_names_exists() -> None:
     assert [path for path in paths if not (REPOSITORY / path).exists()] == []
 
 
-def test_what_stands_by_a_module_is_in_it() -> None:
+def test_names_after_a_module_are_defined_in_it() -> None:
     """On the two ways through the house: "`drivers.can.bus` (`CanBus`)"."""
     pairs = re.findall(r"`((?:fusiond|drivers)\.[\w.]+)`\s\(`([\w.]+)`\)", CONTRIBUTING)
     assert len(pairs) > 20
@@ -180,7 +180,7 @@ NOT_IN_THE_PROGRAM = {
 """Module-level names that tests alone use, and why they are there."""
 
 
-def test_what_stands_at_module_level_is_used() -> None:
+def test_module_level_names_are_used() -> None:
     """By the program, an entry point or a decorator: what tests alone use is named above."""
     sources = {
         ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__init__"): (

@@ -24,16 +24,16 @@ def source() -> str:
 
 def test_every_sentence_of_the_page_is_one_of_the_navigator() -> None:
     said = source()
-    rows = quoted("Alignment does not come") + quoted("It aligned, and is not `navigating`")
+    rows = quoted("It does not align") + quoted("It has aligned, but is not `navigating`")
     assert len(rows) > 30
     assert [row for row in rows if row not in said] == []
 
 
-def test_what_doctor_says_of_a_receiver_is_what_the_code_says() -> None:
+def test_receiver_findings_on_the_page_are_those_of_the_code() -> None:
     """The sentences of the table are parts of those of the code."""
     places = (REPOSITORY / "drivers" / "nmea", REPOSITORY / "fusiond" / "doctor")
     text = "\n".join(path.read_text() for place in places for path in place.rglob("*.py"))
     said = re.sub(r'"\s*\n\s*f?"', "", text)
-    rows = quoted("The receiver sends, and there is no fix")
+    rows = quoted("The receiver sends, but there is no fix")
     assert len(rows) >= 8
     assert [row for row in rows if row not in said] == []

@@ -168,7 +168,7 @@ def _readable(shared: Sequence[str], left_out: dict[str, str]) -> list[str]:
 
 
 class _Reader:
-    """Reads units; what none of is left notes why in `left_out`."""
+    """Reader of a DBC file's units; unreadable ones are noted in `left_out`."""
 
     def __init__(self, shared: Sequence[str], left_out: dict[str, str]) -> None:
         self._shared = shared

@@ -75,7 +75,7 @@ def request(identifiers: int) -> CanFrame:
 
 
 class ObdSpeedDecoder:
-    """Answers in, speeds out; no I/O.
+    """Decoder of OBD replies into speeds; no I/O.
 
     `counters`: `samples`, `other_frames` (no answer to a tester), `other_unit`, `other_answers` (of
     another service or parameter), `refused` (a unit that does not know the speed), `several_frames`

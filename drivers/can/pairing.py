@@ -71,7 +71,7 @@ class _Losses:
 
 
 class Pairing:
-    """Puts the parts of samples together.
+    """Assembly of samples from their parts.
 
     `counters`: `lost_samples`, `unpaired` (frames whose partners never came), `duplicates`,
     `time_backward` (device time that stood still or went back), `device_restarts`.

@@ -127,7 +127,7 @@ def _number(text: str, most: float) -> float:
 
 
 class CompassDriver(ReceiverDriver):
-    """Reads the line and hands over headings."""
+    """Driver that reads a line and hands over headings."""
 
     Options: ClassVar[type[CompassOptions]] = CompassOptions
 

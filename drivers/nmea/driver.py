@@ -17,7 +17,8 @@ class NmeaOptions(ReceiverOptions, NmeaDecoding):
 
 
 class NmeaDriver(ReceiverDriver):
-    """Reads the line, hands over fixes, headings and times; says in `status` what is wrong."""
+    """Driver that reads a line and hands over fixes, headings and times; `status` says what is
+    wrong."""
 
     Options: ClassVar[type[NmeaOptions]] = NmeaOptions
 

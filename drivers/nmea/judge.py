@@ -39,7 +39,7 @@ others differ by up to hundreds of metres."""
 
 
 class EpochJudge:
-    """Judges epochs in their order. Its counters are those of `NmeaDecoder`."""
+    """Judge of epochs in order. Its counters are those of `NmeaDecoder`."""
 
     def __init__(
         self, source: str, decoding: SolutionDecoding, counters: Counter[str], received: Received

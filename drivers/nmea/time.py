@@ -111,7 +111,7 @@ class Calendar:
 
 
 class EpochOrder:
-    """Refuses repeated and backward epochs: counts `duplicate_epoch`, `backward_epoch`.
+    """Filter of repeated and backward epochs: counts `duplicate_epoch`, `backward_epoch`.
 
     A receiver that goes on from an earlier instant (`time_set_back`) is followed after
     `BACKWARD_EPOCHS`.

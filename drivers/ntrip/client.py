@@ -111,9 +111,9 @@ def _without_tls(error: ssl.SSLError) -> str:
 
 
 class NtripClient:
-    """Runs until cancelled. `write(frame)` takes a frame to the receiver, False where it cannot;
-    `gga()` gives the receiver's last position as a sentence, empty without one; `on_state(state,
-    text)` hears when the state has changed.
+    """Client that runs until cancelled. `write(frame)` passes a frame to the receiver, False if
+    that fails; `gga()` gives the receiver's last position as a sentence, empty without one;
+    `on_state(state, text)` receives changes of state.
 
     `counters`: `ntrip_connected`, `ntrip_failed` (attempts that brought no corrections, and
     connections that ended), `ntrip_bytes`, `ntrip_frames`, `ntrip_damaged` (frames whose checksum

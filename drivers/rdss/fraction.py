@@ -8,7 +8,7 @@ FractionUnit = Literal["auto", "0.1", "0.01"]
 
 
 class FractionReader:
-    """Reads the byte by a configured unit, or finds the unit out.
+    """Reader of the byte in a configured unit, or with detection of the unit.
 
     A value above 9 can only be hundredths, and settles it. Until one has been seen, `auto` gives
     the middle of what both units allow, and half the way between them as the uncertainty

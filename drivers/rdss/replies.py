@@ -47,7 +47,7 @@ from drivers.rdss.session import Session
 
 
 class Replies:
-    """Applies messages to a `Session`; the counters are listed at `Terminal`."""
+    """Effect of messages on a `Session`; the counters are listed at `Terminal`."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -31,8 +31,8 @@ def run_batch(
 ) -> dict[str, int]:
     """Write a row for each log; the counts of rows by outcome.
 
-    Raises `ConfigError`, `MissingPackageError`, `TableError` for an `out` that is no file of rows,
-    OSError; of what happens to a log nothing.
+    Raises `ConfigError`, `MissingPackageError`, OSError, and `TableError` for an `out` without
+    rows; failures of logs are rows.
     """
     digest, release = config_digest(load_config(config_path)), version("fusiond")
     wanted = {str(log.resolve()): log for log in logs}

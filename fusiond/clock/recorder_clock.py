@@ -5,15 +5,14 @@ computer is up. Between two frames the stamps then advance by what passed and by
 
     s(k) - s(k-1) = passed + set,    d = s - utc advances by `set` alone
 
-What a device says of UTC tells the two apart. Without it, stamps that go back were set, since time
-does not, and stamps that leap ahead are a pause: whoever takes a pause for a step navigates on
-through it, who takes a step for a pause aligns anew.
+Reported UTC distinguishes the two. Without it, stamps that go back mean a set clock, since time
+does not, and stamps that jump ahead mean a pause: a pause mistaken for a step is navigated through,
+a step mistaken for a pause only restarts the alignment.
 
-Where the clock is slewed, which only those who have read the whole log know (`recorder_rate`), time
-passes by its stamps less what it gains. A stamp alone among others, which come from where it left,
-is damage: `time_backwards`, `time_ahead`. Stamps of another channel that lie a little behind are
-its controller's own clock, or were written late: those frames have come by now, and their stamps
-stand.
+While the clock is slewed, which only a reading of the whole log shows (`recorder_rate`), time
+passes by its stamps less the gain. A single deviating stamp is damage: `time_backwards`,
+`time_ahead`. Stamps of another channel that lie a little behind come from its controller's own
+clock or from delayed writing: those frames have arrived by now, and their stamps are valid.
 
 All times are integer nanoseconds; a pure function of its inputs.
 """
@@ -71,9 +70,9 @@ class Slew(NamedTuple):
 
 
 class RecorderClock:
-    """Takes the stamps in their order. `t_ns` is monotonic time, which begins at the first of them;
-    `stamp_ns` the latest stamp taken; `steps` what the clock was set by, `slewed_ns` what it has
-    gained by its slews, which come in their order."""
+    """Monotonic clock from a recorder's stamps, in order. `t_ns` is monotonic time, which starts at
+    the first stamp; `stamp_ns` the latest stamp; `steps` the changes of the recorder's clock,
+    `slewed_ns` the sum of its slews."""
 
     def __init__(self, slews: Sequence[Slew] = ()) -> None:
         self.t_ns = 0

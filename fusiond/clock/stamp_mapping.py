@@ -84,9 +84,9 @@ the largest error (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 
 
 class Clock:
-    """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
+    """Converter of stamps to instants. `counters` names every refusal, guess and learnt value.
 
-    `on_event(code, text)` hears what happens to UTC, to the system clock and to the host;
+    `on_event(code, text)` receives what happens to UTC, to the system clock and to the host;
     `on_time` has every report by which the system clock may be set.
     """
 
@@ -346,9 +346,9 @@ class Clock:
     def _mapping(self, source: str | None) -> tuple[int, float, str]:
         """Monotonic minus UTC (ns), its sigma (s) and its name, for a stamp of `source`.
 
-        With `utc = "system"` a step of the system clock says that its reference changed, and not
-        whether for the better: stamps are mapped as before it for two minutes, and sigma is the
-        step, or what it is without any UTC. UTC itself (None) is what the system clock says.
+        With `utc = "system"` a step of the system clock shows a change of its reference, for better
+        or worse: for two minutes stamps are mapped as before, and sigma is the step, or its value
+        without any UTC. UTC itself (None) follows the system clock.
         """
         system_ns = self.look()
         if self._options.utc == "gnss":

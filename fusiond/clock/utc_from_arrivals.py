@@ -18,8 +18,8 @@ What the envelope cannot explain is a change of the source's UTC. It is seen in 
   that, the sequence shows that UTC went on). They are stamped as late, with a sigma as large as the
   doubt, until it has lasted for two minutes.
 
-Whoever asks for UTC itself hears of a change only when it has lasted for two minutes
-(`believed_offset_ns`): a receiver's mistake is no leap second.
+UTC itself changes only after two minutes (`believed_offset_ns`): a receiver's mistake is no leap
+second.
 
 Everything is integer nanoseconds: UTC in ns does not fit a double. A pure function of its inputs.
 """
@@ -54,7 +54,7 @@ _WHOLE_HIGH_NS = 200 * MILLISECOND_NS
 _SLEEP_ERROR_NS = 2 * SECOND_NS
 """Error of a sleep's length by a battery-backed clock of whole seconds, read before and after."""
 _MAX_SPREAD_S = 1.0
-"""Reports of whole seconds come up to a second late."""
+"""Largest delay of reports in whole seconds."""
 _SCATTER_NS = 500 * MILLISECOND_NS
 """Reports of a receiver that has jumped scatter like any; those of a busy host scatter more."""
 _AFTER_LEAP_NS = 5 * SECOND_NS

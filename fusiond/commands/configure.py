@@ -26,47 +26,51 @@ _NAMES = {
     "rdss": "rdss",
 }
 ARM = typer.Option(metavar="F,R,D", help="m forward, right, down of the IMU.")
+Out = Annotated[Path, typer.Argument(metavar="CONFIG", help="File to write.")]
+VehicleClassName = Annotated[
+    str | None, typer.Option("--class", help="road, rail, marine or aircraft.")
+]
+SensorClassName = Annotated[
+    str | None, typer.Option(help="Of the IMU: consumer, mems or tactical.")
+]
+AxesText = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z", help="Sensor axes forward, right, down: +x,-y,-z."),
+]
+Ports = Annotated[list[str] | None, typer.Option(help="Serial port to listen to; all by default.")]
+Buses = Annotated[
+    list[str] | None,
+    typer.Option(metavar="[INTERFACE:]CHANNEL", help="CAN bus; all that are up by default."),
+]
+AskTerminal = Annotated[
+    bool | None,
+    typer.Option(
+        "--ask-terminal/--listen-only",
+        help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
+    ),
+]
+Drive = Annotated[
+    bool | None,
+    typer.Option(
+        "--drive/--no-drive", help="Find the IMU's forward axis by driving off straight ahead."
+    ),
+]
 
 
 @config.command()
 def init(
-    out: Annotated[Path, typer.Argument(metavar="CONFIG", help="File to write.")] = Path(
-        "vehicle.toml"
-    ),
+    out: Out = Path("vehicle.toml"),
     vehicle: Annotated[str | None, typer.Option(help="Its name, as in the MQTT topics.")] = None,
-    vehicle_class: Annotated[
-        str | None, typer.Option("--class", help="road, rail, marine or aircraft.")
-    ] = None,
-    sensor_class: Annotated[
-        str | None, typer.Option(help="Of the IMU: consumer, mems or tactical.")
-    ] = None,
-    axes: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="Sensor axes forward, right, down: +x,-y,-z."),
-    ] = None,
+    vehicle_class: VehicleClassName = None,
+    sensor_class: SensorClassName = None,
+    axes: AxesText = None,
     antenna: Annotated[str | None, ARM] = None,
     axle: Annotated[str | None, ARM] = None,
     broker: Annotated[str | None, typer.Option(metavar="HOST[:PORT]", help="MQTT.")] = None,
-    port: Annotated[
-        list[str] | None, typer.Option(help="Serial port to listen to; all by default.")
-    ] = None,
-    can: Annotated[
-        list[str] | None,
-        typer.Option(metavar="[INTERFACE:]CHANNEL", help="CAN bus; all that are up by default."),
-    ] = None,
-    ask_terminal: Annotated[
-        bool | None,
-        typer.Option(
-            "--ask-terminal/--listen-only",
-            help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
-        ),
-    ] = None,
-    drive: Annotated[
-        bool | None,
-        typer.Option(
-            "--drive/--no-drive", help="Find the IMU's forward axis by driving off straight ahead."
-        ),
-    ] = None,
+    port: Ports = None,
+    can: Buses = None,
+    ask_terminal: AskTerminal = None,
+    drive: Drive = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Use defaults and options, without questions.")
     ] = False,
@@ -93,14 +97,7 @@ def init(
     if ask_terminal is None:
         question = "Ask silent serial ports whether an RDSS terminal is there (sends bytes)?"
         ask_terminal = asks and typer.confirm(question, default=False)
-    devices, silent_ports = _look(port, can, ask_terminal)
-    for device in devices:
-        typer.echo(f"found: {device.text}")
-    for silent in silent_ports if port is not None else ():
-        typer.echo(f"found nothing: {silent.text}")
-    if not devices:
-        looked_at = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
-        typer.echo(f"No supported device found on: {looked_at}")
+    devices = _found(port, can, ask_terminal)
     imu = next((d for d in devices if d.driver == "can_imu"), None)
     has_antenna = any(d.driver != "can_imu" for d in devices)
     where = ""
@@ -131,6 +128,19 @@ def init(
         sources=_sources(devices),
     )
     _write(draft, out)
+
+
+def _found(port: list[str] | None, can: list[str] | None, ask_terminal: bool) -> list[Device]:
+    """Look for devices, and print what was found."""
+    devices, silent_ports = _look(port, can, ask_terminal)
+    for device in devices:
+        typer.echo(f"found: {device.text}")
+    for silent in silent_ports if port is not None else ():
+        typer.echo(f"found nothing: {silent.text}")
+    if not devices:
+        looked_at = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
+        typer.echo(f"No supported device found on: {looked_at}")
+    return devices
 
 
 def _measured_axes(

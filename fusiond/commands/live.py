@@ -74,8 +74,8 @@ def check(
 ) -> None:
     """Validate a configuration: 0, or 78 with every mistake.
 
-    What is valid and cannot work is told too, marked with !, and leaves the exit code at 0. With
-    --compile also that the model, with all that its measurements add, fits the kernels.
+    Valid settings that cannot work are marked with ! and leave the exit code at 0. --compile also
+    checks that the model, with all its measurements, fits the kernels.
     """
     settings = load(config)
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415

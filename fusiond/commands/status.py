@@ -1,7 +1,7 @@
 """`fusiond status`: ask the running daemon, over MQTT, how it stands.
 
-What is retained comes at once; the solution is not, and comes within a second of a daemon that
-works. So one that is `online` and says nothing has stopped, or hangs.
+Retained topics arrive at once; the solution arrives within a second from a working daemon. One that
+is `online` and silent has stopped, or hangs.
 """
 
 from __future__ import annotations

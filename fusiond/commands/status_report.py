@@ -161,7 +161,10 @@ def _fault(source: dict[str, Any]) -> str:
     if source["state"] != "running":
         return str(source["detail"])
     fault = source["diagnosis"]
-    return str(source["isolated"] or "") if fault is None else str(fault["text"])
+    if fault is not None:
+        return str(fault["text"])
+    returned = "is back; checking it against the motion" * (source["service"] == "probation")
+    return str(source["isolated"] or returned)
 
 
 def _refused(reasons: dict[str, int]) -> str:

@@ -164,8 +164,7 @@ class AttitudeAiding(Aiding):
 class Misaligned(Aiding):
     """Measurement by a misaligned sensor: three small angles that the filter estimates.
 
-    The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
-    device.
+    The angles rotate body axes to sensor axes; the device has removed the known mounting.
     """
 
     misalignment_sd_arcsec: NonNegativeFloat = 200.0

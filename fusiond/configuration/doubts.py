@@ -78,14 +78,14 @@ def _imu(config: Config) -> Iterator[str]:
     foreign = [s.driver for s in config.sources.values() if s.driver not in GIVES]
     if not imus and not foreign:
         yield (
-            "sources: none is an IMU: position and velocity by fixes and a constant velocity, "
-            "sigma that grows by metres in seconds without a fix, no attitude: add one (can_imu)"
+            "sources: no IMU: constant velocity between fixes, no attitude, and sigma grows by "
+            "metres in seconds without a fix: add one (can_imu)"
         )
     spare = config.imu.spare
     if spare is not None and (spare.source not in imus or len(imus) < 2) and not foreign:
         yield (
-            f"imu.spare.source = {spare.source!r}: two IMUs are needed in sources, one of them "
-            f"with this name; there {'is' if len(imus) == 1 else 'are'} "
+            f"imu.spare.source = {spare.source!r}: sources need two IMUs, one of them with this "
+            f"name; there {'is' if len(imus) == 1 else 'are'} "
             f"{' and '.join(imus) or 'none'}"
         )
     if len(imus) > (1 if spare is None else 2):
@@ -139,8 +139,8 @@ def _filter(config: Config) -> Iterator[str]:
     name = config.estimator.filter
     if name != "kalman":
         yield (
-            f"estimator.filter = {name!r} has no bank of fault hypotheses: what is wrong of a "
-            "sensor is not named, and faults of the inertial unit are not corrected "
+            f"estimator.filter = {name!r} has no bank of fault hypotheses: it names no faults of "
+            "sensors and corrects none of the inertial unit "
             "(docs/diagnosis.md)"
         )
 
@@ -202,8 +202,8 @@ def _start(config: Config) -> Iterator[str]:
     foreign = any(source.driver not in GIVES for source in config.sources.values())
     if not foreign and not any(name in config.sources for name in config.positioning):
         yield (
-            "sources: none gives a position: nothing is navigated before cmd/set_position or "
-            "alignment.position_deg_m says where it starts"
+            "sources: none gives a position: navigation starts only after cmd/set_position or by "
+            "alignment.position_deg_m"
         )
 
 

@@ -10,8 +10,8 @@ speeds up (`fusiond.navigation.scale_noise`). The measure is a minute without me
     a gyro's scale factor s       s pi / 2
     what a minute makes of it     n sqrt(t)
 
-N and n the densities of velocity and attitude in the model, which is where such a bias is. Every
-shipped model has gyro states. Said is what is more than `MATTERS` times the other.
+N and n are the densities of velocity and attitude in the model, which represent such a bias. Every
+shipped model has gyro states. Only a ratio above `MATTERS` is reported.
 
 Source: Groves, 2nd ed., sections 4.4.2 and 5.7 (short-term straight-line error propagation).
 """

@@ -1,4 +1,4 @@
-"""Limits of a class of vehicle: ranges that every measurement of it is held against.
+"""Plausible ranges of measurements for a class of vehicle.
 
 They are wide enough that no vehicle of the class leaves them and narrow enough that the usual
 nonsense of devices does: another unit, a field that slipped, a number out of range.

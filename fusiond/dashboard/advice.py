@@ -1,7 +1,7 @@
 """Steps for the operator, the most urgent first, from `status` and `health`.
 
-The step for a `why` is that of the catalogue `fusiond.navigator.reasons`; sources, host and faults
-add theirs. Where all is well there is none.
+The step for a `why` comes from the catalogue `fusiond.navigator.reasons`; sources, host and faults
+add theirs.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ class Advice(NamedTuple):
 _ORDER: dict[str, int] = {"error": 0, "warning": 1, "info": 2}
 
 _STATES: dict[str, tuple[Weight, str]] = {
-    "absent": ("error", "cannot be opened: check plug, power and port"),
-    "silent": ("warning", "is open and says nothing: check power, wiring and baud rate"),
+    "absent": ("error", "cannot be opened: check cable, power and port"),
+    "silent": ("warning", "is open but silent: check power, wiring and baud rate"),
     "failed": ("error", "cannot work as configured: correct its section, then restart"),
 }
 _TERMINAL: tuple[tuple[str, str], ...] = (
-    ("no card", "put a card into the terminal"),
+    ("no card", "insert a card into the terminal"),
     ("no beam", "give its antenna a free view towards the equator"),
-    ("suppressed", "the system has silenced it: wait, it tries again by itself"),
+    ("suppressed", "the RDSS centre suppresses it: wait, requests resume by themselves"),
     ("radio silence", "lift the radio silence at the terminal"),
 )
 _VERDICTS: dict[str, str] = {
-    "optimistic": "sigma is too small: raise what the configuration says of its noise",
-    "coloured": "its errors are alike from one to the next: see docs/consistency.md",
+    "optimistic": "sigma is too small: raise `sigma_scale` of its section",
+    "coloured": "its errors last from fix to fix: see docs/consistency.md",
 }
 
 
@@ -53,7 +53,9 @@ def _of_status(status: Said) -> Iterator[Advice]:
     injected = status.get("injected")
     if injected:
         faults = ", ".join(map(str, injected))
-        yield Advice("error", "injection", f"Faults are put in ({faults}): do not navigate by it.")
+        yield Advice(
+            "error", "injection", f"Simulated faults ({faults}): do not navigate by this solution."
+        )
     why = str(status.get("why", ""))
     if status.get("mode") != "navigating":
         steps = [REASONS[code] for code in recognised(why) if REASONS[code].advice]
@@ -61,14 +63,14 @@ def _of_status(status: Said) -> Iterator[Advice]:
             yield Advice(weight, "navigation", text)
     for fault in _objects(status, "faults"):
         source, text = str(fault.get("source", "")), str(fault.get("text", ""))
-        yield Advice("warning", source, f"Look after {source}: {text}.")
+        yield Advice("warning", source, f"Check {source}: {text}.")
     if status.get("protection") == "beyond":
         text = "The protection level is beyond its limit: do not rely on the position."
         yield Advice("error", "integrity", text)
     if status.get("recording") == "failed":
-        yield Advice("error", "recording", "It has failed: make room on the disk, or check it.")
+        yield Advice("error", "recording", "Recording failed: free disk space, or check the disk.")
     if status.get("mqtt_taken_over"):
-        text = "Another client has the daemon's name at the broker: give each a name."
+        text = "Another MQTT client has this daemon's name: give each its own `mqtt.client_id`."
         yield Advice("warning", "mqtt", text)
 
 
@@ -82,7 +84,13 @@ def _of_sources(health: Said) -> Iterator[Advice]:
             level, text = _STATES[state]
             yield Advice(level, name, f"{name} {text}.")
         if source.get("isolated") and not source.get("diagnosis"):
-            yield Advice("warning", name, f"{name} disagrees with the rest and is left out.")
+            yield Advice(
+                "warning",
+                name,
+                f"{name} disagrees with the other sources and is excluded: wait for its return.",
+            )
+        if source.get("service") == "probation":
+            yield Advice("info", name, f"{name} is back; checking it against the motion.")
         verdict = source.get("verdict")
         if verdict in _VERDICTS:
             yield Advice("info", name, f"{name}: {_VERDICTS[verdict]}.")
@@ -92,10 +100,12 @@ def _of_the_host(status: Said, health: Said) -> Iterator[Advice]:
     ticks, overruns = health.get("ticks"), health.get("overruns")
     # One tick in a thousand is what the daemon is held to (docs/configuration.md, [scheduler]).
     if isinstance(ticks, int) and isinstance(overruns, int) and overruns * 1000 > ticks > 1000:
-        text = "More than one tick in 1000 came too late: take load off the computer."
+        text = "More than one tick in 1000 was late: reduce the load on this computer."
         yield Advice("warning", "scheduler", text)
     if health.get("utc_settled") is False and status.get("mode") == "navigating":
-        yield Advice("info", "clock", "UTC may have jumped: nothing is dated until it settles.")
+        yield Advice(
+            "info", "clock", "UTC may have jumped: messages have no date until it settles."
+        )
 
 
 def _objects(said: Said, name: str) -> list[Said]:

@@ -1,10 +1,10 @@
 """Connections of the dashboard's web server: how many there may be, and what each may wait for.
 
-uvicorn waits for a request for ever, and for a browser to take its answer: a thousand who send a
-byte now and then would have all descriptors of the process, and nobody a page. So a connection has
-so long for a request, and so long for the next bytes of an answer. When there are as many as may
-be, the one that has waited longest without a request makes room; where none has, who comes is sent
-away. A WebSocket has its own (`fusiond.dashboard.viewer`).
+uvicorn waits indefinitely for a request, and for a browser to read its reply: a thousand slow
+clients would hold all descriptors of the process. A connection therefore has a deadline for its
+request, and for each next piece of a reply. At the limit the connection that has waited longest
+without a request makes room; without one the newcomer is refused. A WebSocket has its own deadlines
+(`fusiond.dashboard.viewer`).
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Rows of history by column: numbers as eight bytes each, each text once.
 
-As a list a row of five figures takes 500 bytes, which its floats, the list and the texts that every
-message brings anew share among them; as columns it takes 50. The rows of ten minutes are most of
-what the dashboard holds.
+A row of five figures takes 500 bytes as a list, including its share of texts, and 50 as columns.
+The rows of ten minutes are most of the dashboard's memory.
 
-`kinds` has a letter a column: `d` of a number or None, `o` of anything else. Each row has a number
-from a count that only grows, by which whoever looks asks for what is newer.
+`kinds` has a letter a column: `d` for a number or None, `o` for anything else. Each row has a
+number of a growing count, by which viewers ask for newer rows.
 """
 
 from __future__ import annotations

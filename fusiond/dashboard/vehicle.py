@@ -1,7 +1,7 @@
 """State of one vehicle: the latest of each topic, when it came, and ten minutes of history.
 
-Everything that is kept has a number from one count that only grows. Whoever looks remembers the
-count and asks for what is newer: a slow one gets the newest and never a queue of what is old.
+Every stored item has a number of one growing count, by which viewers ask for newer items: a slow
+viewer gets the newest and never a queue of old ones.
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ class Link:
 
 
 class Hub:
-    """Takes payloads in by topic. `now_s` is the clock of all that is shown: the host's, or that of
-    the log that is played, `speed` times as fast as the host's.
+    """Model of all vehicles, fed with payloads by topic. `now_s` is the clock of the display: the
+    host's, or that of the played log, `speed` times as fast.
 
     A message is used when it is what its topic carries by the published schemas, and refused as a
     whole when it is not: the last that was shown stays, and grows old.

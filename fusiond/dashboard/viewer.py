@@ -1,7 +1,7 @@
 """WebSocket connection of one browser: at most ten frames a second, each with all changes.
 
-A frame that the browser does not take holds up this viewer alone; what comes meanwhile takes the
-place of what was there, so that the next frame is the newest and nothing piles up.
+A frame that the browser does not read holds up this viewer alone; newer data replace older, so that
+the next frame is the newest.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """`fusiond demo`: the real daemon against a simulated car, with a broker of its own.
 
 The car stands for 8 s (levelling), drives off (heading from the GNSS course), and loses its GNSS
-receiver for 12 s of every minute: somebody pulls the plug; RDSS and inertial navigation carry on.
-What is shown comes out of the broker, as a dashboard would see it, with the true error beside it.
+receiver for 12 s of every minute, with RDSS and inertial navigation continuing. The display shows
+the broker's messages, as a dashboard would, beside the true error.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ def demo(
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
-    full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
-    are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
-    and `rejected` count measurements (IMU samples stand in `fused_by_source`). Raises `DemoError`
-    if something is not installed.
+    full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run are
+    correlated, so 0.5 to 5 is common). All three are None without navigation. `fused` and
+    `rejected` count measurements (IMU samples are in `fused_by_source`). Raises `DemoError` if a
+    package is missing.
     """
     with (
         DemoBroker() as broker,

@@ -1,8 +1,8 @@
 """Discovery of devices on ports and buses, for `fusiond config init`.
 
-Listening only, but that an RDSS terminal says nothing unless it is asked who it is; the question
-does not make it transmit, and is put only where that is wanted. On a bus every device that is known
-gets every frame through its driver's own decoder: the one that completes most samples fits.
+It only listens, but for an RDSS terminal, which is silent unless asked for its identity; the
+question does not make it transmit, and is sent only on request. On a bus every known device's own
+decoder gets every frame: the one that completes most samples fits.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ async def device_on_port(
 ) -> Device | SilentPort:
     """Device on a serial port, or the reason why none is recognised.
 
-    `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
+    `ask_terminal` allows asking an RDSS terminal for its card, which sends bytes on this port.
     """
     for baud in BAUDS:
         received = _Line()

@@ -1,8 +1,8 @@
 """`fusiond doctor`: opens every port through its own driver for some seconds; what is wrong.
 
-Each finding names the symptom and what would do; the exit status is 0 when there is none. Nothing
-is sent but what the daemon itself would send: an RDSS terminal is asked who it is and how it hears
-its satellites, and for fixes, with which it transmits, only if that is wanted.
+Each finding names symptom and remedy; the exit status is 0 without findings. Nothing is sent beyond
+the daemon's own bytes: an RDSS terminal is asked for identity and beams, and for fixes, which make
+it transmit, only on request.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Report:
 def doctor(config: Config, seconds: float, transmit: bool = False) -> int:
     """Listen for `seconds`, print the report; 0 when all is well, 1 otherwise.
 
-    With `transmit` an RDSS terminal is asked for fixes, too.
+    With `transmit` it also requests fixes from an RDSS terminal.
     """
     return asyncio.run(examine(config, seconds, sys.stdout, transmit))
 

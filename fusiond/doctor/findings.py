@@ -33,7 +33,7 @@ FINDINGS: Mapping[str, str] = {
     ),
     "server_missing": "{detail}: start its server, or correct port in [sources.{name}]",
     "server_silent": (
-        "{detail}: see what {port} sends with `nc` or `gpspipe`, and who may connect there"
+        "{detail}: check the output of {port} with `nc` or `gpspipe`, and who may connect there"
     ),
     # Buses
     "bus_interface": "{detail}: correct interface and channel in [sources.{name}]",
@@ -47,19 +47,19 @@ FINDINGS: Mapping[str, str] = {
     "bus_unusable": "{channel} cannot be used ({detail}): check the interface",
     "bus_silent": (
         "{detail}: check bit rate (ip -d link show {channel}), wiring and power; `candump "
-        "{channel}` shows what is on the bus, [sources.{name}] what is wanted"
+        "{channel}` shows the frames on the bus, [sources.{name}] those required"
     ),
     "bus_errors": (
         "{count} CAN error frames: check bit rate, wiring and the two 120 ohm terminators"
     ),
-    "bus_overflow": "{count} CAN frames overflowed: take load off this computer",
+    "bus_overflow": "{count} CAN frames overflowed: reduce the load on this computer",
     "samples_lost": (
-        "{lost} of {all} IMU samples lost: look at the bus load (canbusload), at `ip -s -d link "
-        "show`, and at what else keeps this computer busy"
+        "{lost} of {all} IMU samples lost: check the bus load (canbusload), `ip -s -d link show` "
+        "and the load on this computer"
     ),
     "checksums": (
-        "{bad} wrong checksums against {good} sound: check ground, cable length and that nobody "
-        "else reads this port"
+        "{bad} wrong checksums against {good} sound: check ground and cable length, and that no "
+        "other program reads this port"
     ),
     # RDSS terminal
     "terminal_silent": (
@@ -69,8 +69,10 @@ FINDINGS: Mapping[str, str] = {
     "no_card": "{detail}: insert the user card, or have it activated",
     "no_beam": "{detail}: give the antenna a free sky to the south (geostationary satellites)",
     "low_battery": "{detail}: charge the terminal or feed it from the vehicle",
-    "suppressed": "{detail}: the centre has switched the transmitter off; only it can lift that",
-    "silence": "{detail}: radio silence is set at the terminal; its operator lifts it",
+    "suppressed": (
+        "{detail}: the RDSS centre suppresses the transmitter: ask the operator of the service"
+    ),
+    "silence": "{detail}: radio silence is set at the terminal: lift it there",
     # Inertial unit
     "imu_rate": "{seen:.1f} samples a second, but [imu] rate_hz = {set:g}: correct one of them",
     "imu_force": (
@@ -92,11 +94,11 @@ FINDINGS: Mapping[str, str] = {
     ),
     "week_rollover": (
         "The receiver's date is {weeks:+d} weeks off the system clock's: its GPS week has rolled "
-        "over (1024 weeks); update the receiver, whose dates cannot be used"
+        "over (1024 weeks): update the receiver; its dates are not used"
     ),
     "system_clock": (
         "The system clock is {error:+.1f} s off GNSS: timedatectl set-ntp true, or chrony with "
-        "gpsd; navigation does not need it, logs and other programs do"
+        "gpsd; logs and other programs need it, navigation does not"
     ),
     "no_utc": (
         "UTC unknown, as neither system clock nor receiver has it: give the receiver a view of the "

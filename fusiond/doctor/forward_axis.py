@@ -46,7 +46,8 @@ Phase = Literal["unquiet", "standing", "moving", "found", "failed"]
 
 
 class ForwardAxis:
-    """Samples in; `phase`, `axis` once it is found, `reason` where it cannot be.
+    """Detector of the forward axis, fed with samples; `phase`, `axis` once found, `reason` where it
+    cannot be.
 
     `down` is the axis that gravity showed, such as `-z`.
     """

@@ -1,7 +1,7 @@
 """Devices with a shipped DBC file, each with its source options.
 
-The same as the blocks of `docs/can-imu.md` and `docs/can-gnss.md`, which say what is to be set in
-the device and what is uncertain.
+The same as the blocks of `docs/can-imu.md` and `docs/can-gnss.md`, which describe the settings of
+the device and the uncertain points.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ class _Served(NamedTuple):
 
 
 class Planner:
-    """Makes plans with the ephemerides of a store."""
+    """Factory of plans with the ephemerides of a store."""
 
     def __init__(self, store: EphemerisStore, options: RangeOptions) -> None:
         self.store = store

@@ -173,7 +173,7 @@ def nothing_kept() -> Array:
 
 
 class RangeModel:
-    """Turns epochs into rows with the ephemerides of a store."""
+    """Converter of epochs to rows, with the ephemerides of a store."""
 
     def __init__(self, store: EphemerisStore, options: RangeOptions | None = None) -> None:
         self.store = store

@@ -1,17 +1,15 @@
 """Catalogue of fault hypotheses: one for each kind of fault, with its signature.
 
-Each names its size in the unit in which people are told, the prior of that size and how often such
-a fault begins, each with its source; by which signature it enters the motion or the measurements
-(fusiond.estimators.fault_bank); and which measurements it spoils.
+Each states its size in the published unit, the prior of that size and its rate, with sources; its
+signature in the motion or the measurements (fusiond.estimators.fault_bank); and the measurements
+that it affects.
 
-Rates are an engineer's, of devices on vehicles in streets, where no standard counts them, and the
-same for all kinds for that reason: one an hour; but a device that is late by half a second or more
-from an instant on, a wheel whose scale changes, or ground that turns below a vehicle at rest, is
-one in a thousand hours, and one that is carried off, position and velocity together, one in ten
-thousand.
-Ten times the rate is what a chi-square of 4.6 is: it moves no decision by an epoch. Sizes are one
-sigma of a normal prior, which bounds an estimate and tells no kinds apart but those that are known
-to be of a size.
+Rates are engineering estimates for devices on vehicles in streets, for which no standard has
+counts, and therefore equal for all kinds: one an hour. A device that is late by half a second or
+more from an instant on, a wheel whose scale changes, or ground that turns below a vehicle at rest,
+has one in a thousand hours; spoofing of position and velocity together one in ten thousand. A
+tenfold rate equals a chi-square of 4.6, which moves no decision by an epoch. Sizes are one sigma of
+a normal prior, which bounds an estimate; it distinguishes only kinds of a known size.
 """
 
 from __future__ import annotations

@@ -7,13 +7,12 @@ A hypothesis is identified where
     log odds and log likelihood - those of every other class > APART
                                                     nobody else explains it nearly as well
 
-A fault that is a step of states (the inertial unit's, a clock's) is taken out of the state, V b
-with the covariance V M V^T, and navigation goes on. One of a source is taken out likewise, from its
-onset on, and the series that it spoils leave service (fusiond.integrity.service). Hypotheses of one
-class and device that are nearly as likely are taken together, by the moments of their mixture:
-kinds as well as onsets. There they are weighed by how well they fit alone: what nobody can tell
-apart is not told apart by a rate and a size that are an engineer's. Where two classes explain it
-nobody is accused, and what is published covers both.
+A fault that is a step of states (of the inertial unit, of a clock) is removed from the state, V b
+with the covariance V M V^T, and navigation continues. A source's fault is removed likewise, from
+its onset on, and the affected series leave service (fusiond.integrity.service). Hypotheses of one
+class and device with similar odds are combined by the moments of their mixture, kinds as well as
+onsets, weighted by their fit alone: an estimated rate and size must not decide between them. Where
+two classes explain the evidence none is accused, and the published covariance includes both.
 
 Where positions and velocities of a device fit each other and both are out, it is the filter that is
 wrong, by more than any hypothesis says: after `FITS_NS` where nothing has explained why they are

@@ -39,10 +39,10 @@ class Verdicts:
     A measurement may hold several series (`AidingMeasurement.series`), each with a monitor of its
     own: a receiver's raw epochs have one for each satellite system, `<source>_<system>`.
 
-    Innovations are kept as they come, and judged together by `report`: a run of minutes through
-    files has hundreds of them at once. `on_change(source, verdict)` hears then when a verdict
-    turns. Constraints are not judged. What the measurements of a source share by the states of
-    `model` no innovation shows (`AidingMeasurement.shares`).
+    Innovations are stored on arrival and judged together by `report`, since a run of minutes
+    through files has hundreds of them at once. `on_change(source, verdict)` then receives changed
+    verdicts. Constraints are not judged. Errors that a source's measurements share through states
+    of `model` show in no innovation (`AidingMeasurement.shares`).
     """
 
     def __init__(

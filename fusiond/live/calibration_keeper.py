@@ -34,7 +34,7 @@ SAVE_EVERY_S = 300
 class CalibrationKeeper:
     """Store of one vehicle's calibration, beside its saved state, if that is configured.
 
-    What is taken up is told in the log. `on_event(code, text)` hears `calibration_damaged` and
+    Restored values are logged. `on_event(code, text)` receives `calibration_damaged` and
     `calibration_refused`.
     """
 

@@ -1,7 +1,7 @@
 """Processing chain from inputs to the solution: clock, drivers, navigator, without I/O.
 
-It is a function of what it had loaded, its drivers' inputs, an operator's commands and its ticks.
-The daemon feeds it from devices, a replay from a recording: the same bits come of both.
+Its results depend only on its restored state, its drivers' inputs, the operator's commands and its
+ticks. The daemon feeds it from devices, a replay from a recording, with the same bits.
 """
 
 from __future__ import annotations

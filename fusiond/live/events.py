@@ -18,8 +18,7 @@ MOST_UNHEARD = 32
 
 
 class Events:
-    """Distributes the events of all parts as messages; a listener first gets those of before it
-    listened."""
+    """Distributor of all events as messages; a new listener first gets the earlier ones."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -1,8 +1,7 @@
 """Faults put in on purpose: `cmd/inject` falsifies what a source sends, and says so.
 
-It stands between drivers and clock, so that everything behind it lives through the fault as it
-would through a real one. What it does is a function of the command and of what comes in: a
-recording of both gives the same again.
+It stands between drivers and clock, so that all later parts treat the fault like a real one. Its
+effect depends only on command and input: a recording of both reproduces it.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ _VALUES = {
 
 
 class Injection:
-    """The faults that are in force. `on_event(source, code, text)` hears `injected` and
+    """The faults that are in force. `on_event(source, code, text)` receives `injected` and
     `injection_ended`."""
 
     def __init__(self, on_event: Callable[[str, str, str], None]) -> None:

@@ -15,8 +15,8 @@ The oldest are dropped."""
 
 
 class Innovations:
-    """Takes outcomes in the tick. Constraints that the filter makes by itself are left out: nobody
-    judges them, and they are many."""
+    """Collector of outcomes in the tick. Constraints of the filter are left out: they are many, and
+    have no verdict."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

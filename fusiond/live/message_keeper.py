@@ -1,7 +1,7 @@
 """Short messages on disk: those that wait and those that nobody was told outlive the process.
 
-Written whenever something has changed, in a thread, whole or not at all; what comes meanwhile is
-written next. Whoever queues a message is answered when it is on disk.
+Written after each change, in a thread and atomically; later changes are written next. The sender of
+a message gets the reply when it is on disk.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ log = logging.getLogger("fusiond")
 class MessageKeeper:
     """Store of one vehicle's messages, beside its saved state, if that is configured.
 
-    `on_event(code, text)` hears `messages_damaged`, and `messages_not_kept` once a row of failures.
-    """
+    `on_event(code, text)` receives `messages_damaged`, and `messages_not_kept` once a row of
+    failures."""
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
 """Short messages of the RDSS terminals: posted, reported, told to whoever listens.
 
-The queues themselves are the drivers' (drivers.rdss.outbox). Here they are filled, by an operator's
-command and by `[position_reports]`, and what comes of them is made into `message` and `fleet`. It
-is a function of what the drivers hand over, of commands and ticks, as the rest of the chain is.
+The queues belong to the drivers (drivers.rdss.outbox). This part fills them, by an operator's
+command and by `[position_reports]`, and builds `message` and `fleet` from the results. It depends
+only on the drivers' output, commands and ticks, like the rest of the chain.
 """
 
 from __future__ import annotations

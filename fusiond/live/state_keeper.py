@@ -35,9 +35,8 @@ FORGET_SPEED_M_S = 1.0
 class StateKeeper:
     """Store of one vehicle's state in `state_file`, else in systemd's state directory, else none.
 
-    Files are written and removed in a thread: a tick never waits for a disk. One that cannot be
-    is told in the log. `on_event(code, text)` hears `saved_state_damaged` and
-    `saved_state_refused`.
+    Files are written and removed in a thread: a tick never waits for a disk. Failures are logged.
+    `on_event(code, text)` receives `saved_state_damaged` and `saved_state_refused`.
     """
 
     def __init__(

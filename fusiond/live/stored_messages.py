@@ -1,6 +1,6 @@
 """Stored short messages: those that wait, and received ones not yet published.
 
-Instants are ages: a monotonic clock may start anew.
+Instants are stored as ages, since a monotonic clock may restart.
 """
 
 from __future__ import annotations

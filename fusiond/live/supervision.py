@@ -14,7 +14,7 @@ log = logging.getLogger("fusiond")
 async def supervise(
     name: str, serve: Callable[[], Awaitable[None]], on_fault: Callable[[str], None]
 ) -> None:
-    """Call `serve` again and again until cancelled; `on_fault(text)` hears each end of it."""
+    """Call `serve` again and again until cancelled; `on_fault(text)` receives each end of it."""
     backoff = Backoff()
     while True:
         try:

@@ -1,8 +1,8 @@
 """The navigation state in memory that outlives the process: for a start moments after its end.
 
-It lies in systemd's runtime directory, a tmpfs: written twice a second it would wear out flash (at
-6 kB each 45 MB an hour), and after a power cut it is worth nothing anyway, because its clock has
-begun anew. Writing is left to a thread; a tick only copies the arrays.
+The file is in systemd's runtime directory, a tmpfs: at two writes a second of 6 kB (45 MB an hour)
+it would wear out flash, and a power cut makes it useless, because its clock restarts. A thread
+writes; a tick only copies the arrays.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ KEPT_STATE = TypeAdapter(KeptState)
 
 
 class WarmKeeper:
-    """Keeps one vehicle's navigation state in systemd's runtime directory, else not.
+    """Store of one vehicle's navigation state in systemd's runtime directory, else none.
 
-    `on_event(code, text)` hears `warm_state_damaged` and `warm_state_refused`.
+    `on_event(code, text)` receives `warm_state_damaged` and `warm_state_refused`.
     """
 
     def __init__(

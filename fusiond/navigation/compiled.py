@@ -1,4 +1,4 @@
-"""The one way in which numerics are compiled: explicit signature, on disk, IEEE arithmetic.
+"""Compilation of kernels: explicit signature, on disk, IEEE arithmetic.
 
 With an explicit signature numba compiles when the module is imported and never again: no
 compilation can happen inside the navigation loop. A kernel that is in the cache already is linked
@@ -61,7 +61,8 @@ ROOMS = (
 
 
 def _cache_folder() -> Path:
-    """`NUMBA_CACHE_DIR`, else the user's cache folder, with the digest of the sources below it."""
+    """Folder `NUMBA_CACHE_DIR`, else the user's cache folder, with the digest of the sources below
+    it."""
     digest = hashlib.sha256(f"{sys.implementation.cache_tag} {numba.__version__}".encode())
     package = Path(__file__).resolve().parents[1]
     for room in ROOMS:
@@ -145,8 +146,8 @@ def compiled(
 
 @contextmanager
 def gathered() -> Iterator[list[Missing]]:
-    """List what is imported inside and lies in no cache, instead of compiling it. A kernel that is
-    called is compiled all the same."""
+    """Collect imported kernels without a cached file instead of compiling them: each item compiles
+    one kernel, with those that it calls, into the cache. A called kernel is compiled at once."""
     global _gathered  # noqa: PLW0603 - imports have no other way to be told
     missing: list[Missing] = []
     outer, _gathered = _gathered, missing
@@ -169,20 +170,19 @@ def needed(
 
 
 def kernels_can_be_kept() -> bool:
-    """True if other processes can compile for this one, and for the next start."""
+    """True if compiled kernels can be stored for other processes and the next start."""
     return can_keep(FOLDER)
 
 
 def load_compiler() -> None:
-    """Load what compiling needs, before processes are forked that compile: numba's tables of
-    implementations and its runtime come with the first function."""
+    """Load the compiler before compiling processes are forked: numba's tables and runtime otherwise
+    load with the first function."""
     numba.njit("f8(f8)")(lambda x: x)
 
 
 def load_kernels(variants: Collection[int]) -> None:
-    """Link every kernel that has been imported and not been called yet, before a loop that keeps
-    time; of those that one piece of source makes, these `variants`. One that is called all the same
-    is linked then."""
+    """Link every imported kernel not called yet, before a loop that keeps time; of those with one
+    source only these `variants`. Any other is linked at its call."""
     with global_compiler_lock:
         for name, load in [*_waiting.items()]:
             if name not in _variants or _variants[name] in variants:
@@ -190,10 +190,10 @@ def load_kernels(variants: Collection[int]) -> None:
 
 
 def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], None]:
-    """Link the kernel when it is first called, or compile it where the cache has none; returns what
-    does so at once. A dispatcher that knows no signature yet asks `_compile_for_args` for the one
-    of a call, and `get_call_template` is asked by the compiler for that of a kernel which calls:
-    it would compile one for the very types that it has there."""
+    """Link the kernel at its first call, or compile it without a cached file; returns the callable.
+    A dispatcher without signature asks `_compile_for_args` for that of a call, and the compiler
+    asks `get_call_template` for that of a calling kernel: it would compile for the very types at
+    hand."""
 
     def load() -> None:
         with global_compiler_lock:
@@ -223,8 +223,8 @@ def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], No
 
 
 def _type_of(kernel: Any, value: Any) -> Any:
-    """Type of an argument for numba's dispatcher, which it asks for once a kind of array:
-    to be sure that it is no masked one it would import them, as long as linking twenty kernels."""
+    """Type of an argument for numba's dispatcher, cached by kind of array: its test for masked
+    arrays imports them, which takes as long as linking twenty kernels."""
     kind = FROM_DTYPE.get(value.dtype) if type(value) is np.ndarray else None
     if kind is None:
         return type(kernel).typeof_pyval(kernel, value)

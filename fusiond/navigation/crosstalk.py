@@ -92,7 +92,7 @@ def _follow(
 
 
 class Crosstalk:
-    """Follows rates and forces. `period_s` is that of the samples, `misalignment_rad` m."""
+    """Noise equivalent of crosstalk for samples `period_s` apart; `misalignment_rad` is m."""
 
     def __init__(self, period_s: float, misalignment_rad: float) -> None:
         self._gain = 1.0 - math.exp(-period_s / SMOOTH_S)

@@ -139,7 +139,7 @@ class ImuBuffer:
         self.needed: int | None = None
         """Absolute number of the oldest sample that a rewind would use; nobody needs any: None."""
         self.backward_in_a_row = 0
-        """Samples refused as `backward_stamp` since the last that was taken."""
+        """Number of samples refused as `backward_stamp` since the last accepted one."""
         self.counters: Counter[str] = Counter()
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)

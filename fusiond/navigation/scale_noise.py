@@ -53,8 +53,8 @@ def _follow(
 
 
 class ScaleNoise(Crosstalk):
-    """Follows rates and forces, of axes out of square as well. `rate_scale` and `force_scale` are
-    one sigma, without unit."""
+    """Noise equivalent of scale factors, also with misaligned axes. `rate_scale` and `force_scale`
+    are one sigma, without unit."""
 
     def __init__(
         self, period_s: float, misalignment_rad: float, rate_scale: float, force_scale: float

@@ -145,8 +145,8 @@ def _follow(
 
 
 class Vibration:
-    """Follows each axis. `rate_noise` (rad/s/sqrt(Hz)) and `force_noise` (m/s^2/sqrt(Hz)) are the
-    data sheet's, `period_s` that of the samples."""
+    """Noise estimate of each axis. `rate_noise` (rad/s/sqrt(Hz)) and `force_noise` (m/s^2/sqrt(Hz))
+    are the data sheet's, `period_s` the interval of the samples."""
 
     def __init__(self, period_s: float, rate_noise: float, force_noise: float) -> None:
         self._period_s = period_s

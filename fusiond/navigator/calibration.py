@@ -162,8 +162,8 @@ def _published(block: Block, state: str) -> str:
 
 
 class CalibrationWatch:
-    """Follows the calibration of a filter of `model`; `on_event(code, text)` hears `calibrated`
-    when a parameter has settled, once for each, and when the last one has.
+    """Watch of the calibration in a filter of `model`; `on_event(code, text)` receives `calibrated`
+    for each settled parameter, and for the last.
 
     `misalignment_rad` is one sigma of what the IMU's axes are out of square by: to no more than
     that can anybody say how it is mounted.

@@ -30,8 +30,8 @@ IMU_QUEUE = 2000
 
 
 class ImuChoice:
-    """Keeps the samples of all units until a tick. `on_event(source, code, text)` hears of a
-    change."""
+    """Samples of all units until a tick, and the choice between them. `on_event(source, code,
+    text)` receives a change."""
 
     def __init__(self, imu: Imu, on_event: Callable[[str, str, str], None]) -> None:
         self._spare, self._gap_ns = imu.spare, round(imu.gap_s * 1e9)

@@ -29,7 +29,8 @@ STEP_NS = 1_000_000_000
 
 
 class ImuNoise:
-    """Watches the filter of a configuration; so do the vehicle's `drifts`, at the same instants."""
+    """Estimate of the IMU's noise from the filter of a configuration, with the vehicle's `drifts`
+    at the same instants."""
 
     def __init__(self, model: Model, imu: Imu, drifts: DriftLevels) -> None:
         self._drifts = drifts

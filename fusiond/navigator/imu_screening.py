@@ -67,7 +67,7 @@ class _Trouble:
 
 
 class ImuScreening:
-    """Admits samples; `on_event(code, text)` hears of each trouble once, and of its end."""
+    """Admits samples; `on_event(code, text)` receives each trouble once, and of its end."""
 
     def __init__(self, config: Imu, keep_s: float, on_event: Callable[[str, str], None]) -> None:
         self._config, self._event = config, on_event

@@ -134,10 +134,10 @@ class CourseTurns:
 
 
 class RateUnits:
-    """Watches the rates of a running vehicle. `wrong` is the sentence while they are in another
-    unit, by the last turns of 30 deg, the last way or the last ten seconds that could tell.
+    """Check of a running vehicle's rates. `wrong` is the sentence while they are in another unit,
+    by the last turns of 30 deg, the last chord or the last ten seconds with evidence.
 
-    `bias_sd` (rad/s) is one sigma of the data sheet's. `on_event(code, text)` hears of `imu_units`
+    `bias_sd` (rad/s) is one sigma of the data sheet's. `on_event(code, text)` receives `imu_units`
     and `imu_units_well`.
     """
 

@@ -73,7 +73,7 @@ UNKNOWN_TIME_S = 0.9
 
 
 class Navigator:
-    """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know;
+    """Navigation of one vehicle. `on_event(code, text)` receives what an operator should know;
     `estimator` makes the filter of the configuration and its model."""
 
     def __init__(

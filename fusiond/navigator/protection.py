@@ -31,7 +31,7 @@ NO_BOUND = Bound(BoundState.OFF)
 class ProtectionWatch:
     """Levels of an estimator; nothing where no alert limit is configured.
 
-    `on_event(code, text)` hears `protection_level` when a level passes its limit and
+    `on_event(code, text)` receives `protection_level` when a level passes its limit and
     `protection_restored` when both are back.
     """
 

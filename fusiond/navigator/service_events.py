@@ -9,7 +9,7 @@ from fusiond.navigator.timeline import Timeline
 
 
 class ServiceEvents:
-    """Changes since the last look; `on_event(code, text)` hears of it."""
+    """Changes since the last look; `on_event(code, text)` receives it."""
 
     def __init__(self, timeline: Timeline, on_event: Callable[[str, str], None]) -> None:
         self._timeline, self._event = timeline, on_event

@@ -74,7 +74,7 @@ class Counters:
 
 
 class Timeline:
-    """Runs an estimator over IMU samples and measurements in order of validity.
+    """Timeline of an estimator: IMU samples and measurements in order of validity.
 
     `on_outcome` is called with each entry whenever it has been applied, again after a rewind.
     """

@@ -1,8 +1,8 @@
 """`fusiond calibrate`: what one recorded drive shows of mounting, lever arms, offsets and scales.
 
-The drive goes through the daemon's navigator twice, the second time with what the first has found
-as the configured values and the same configured sigmas: a mounting that is 10 deg off bends lever
-arms and the start, and what is left of it in the second pass is small. The sigmas are those of the
+The drive passes through the daemon's navigator twice, the second time with the first result as
+configured values and with the same configured sigmas: a mounting that is 10 deg off affects lever
+arms and the start, and the remainder in the second pass is small. The sigmas are those of the
 second pass alone, so that nothing counts twice.
 
 Roll of the mounting is felt by no wheel and no axle. It is taken from gravity: roads lean to either
@@ -193,7 +193,7 @@ def _why(p: Parameter, drive: _Drive) -> str:
 
 
 class _Drive:
-    """Watches a navigator: its calibration, and what the vehicle did to show it.
+    """Watch of a navigator: its calibration, and the vehicle's motion that shows it.
 
     `rolled`: an earlier pass has taken a roll out.
     """

@@ -1,12 +1,11 @@
 """NMEA file, read by the daemon's decoders: `--aid nmea=FILE`.
 
-The receiver's decoder has the options of its source in the configuration, so the file is read as
-the daemon reads the line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of a
-talker that is no receiver are a compass', and are heard where the configuration has one; so is any
-HDT in a file without a receiver.
+The receiver's decoder has the options of its source in the configuration, so the file is read like
+the daemon's line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of other talkers
+belong to a compass, and are used if one is configured; so is any HDT in a file without a receiver.
 
-A file says no arrivals, so a measurement arrives when it is valid. What has no time of its own is
-of the epoch before it in the file, and what comes several times an epoch is spread evenly over it:
+A file has no arrivals, so a measurement arrives at its validity. A sentence without a time belongs
+to the epoch before it in the file, and several of a kind in an epoch are spread evenly over it:
 
     t = t_epoch + (k / n) (t_next - t_epoch),    k = 0 ... n - 1
 """

@@ -1,8 +1,8 @@
 """`fusiond process`: the daemon's navigator over recorded files, causal, a solution a sample.
 
-Samples come of a table or of a recorded CAN bus, measurements of that bus and of files. They are
-handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at each
-sample is what the daemon would have said then, before anything that arrived later.
+Samples come from a table or a recorded CAN bus, measurements from that bus and from files, in order
+of arrival (`t_arrival_s`, or `t_s` without it). The solution at each sample is the daemon's at that
+instant, before anything that arrived later.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ CHUNK = 50
 YOUNG = 50_000
 _SHOWN = 20
 _REPORT_EVERY = 2000
-"""Samples between two words on the progress: some tenths of a second of work."""
+"""Samples between two reports of progress: some tenths of a second of work."""
 
 
 def process(

@@ -1,11 +1,10 @@
 """`fusiond process --smooth`: the solution at each sample from all measurements, later ones too.
 
-The filter runs as ever and leaves a tape (fusiond.estimators.smoothing). What the daemon would have
-said at each sample, in the last pass over it, is kept until the navigation has ended; then the
-smoother goes back over the tape, and what was said is corrected by what it finds. Each start of the
-filter is smoothed by itself: what was measured before an alignment says nothing of the navigation
-after it. What the filter called invalid stays so: measurements that it could not be reconciled
-with make it no better from behind.
+The filter runs as usual and records a tape (fusiond.estimators.smoothing). The daemon's solution at
+each sample, in the last pass over it, is kept until the navigation has ended; then the smoother
+runs backward over the tape and corrects it. Each start of the filter is smoothed separately:
+measurements before an alignment are no evidence on the navigation after it. Invalid solutions
+remain invalid: measurements that contradicted the filter do not improve it backward.
 
 Measurements at 12 instants a second make 0.3 GB of tape an hour, samples at 100 Hz 0.06 GB of
 solutions. An hour is kept in memory, where it costs least; what comes beyond that goes to a

@@ -31,8 +31,8 @@ class Rows(NamedTuple):
 
 
 class RowsWriter:
-    """Writes rows to a file; a figure that the model holds (not `stated`, (9,)) has no sigma, and
-    a height that is not known no cell."""
+    """Writer of rows to a file; a value that the model holds (not `stated`, (9,)) has no sigma, and
+    an unknown height an empty cell."""
 
     def __init__(self, out: Path, stated: NDArray[np.bool_]) -> None:
         self._writer = SolutionWriter(out)

@@ -1,7 +1,7 @@
 """Fixes of a receiver whose GPS week has rolled over: their dates are 1024 weeks early.
 
-An IMU with POSIX time tells: fixes that are 1024 weeks off and else of its time. With GPS second of
-week nothing tells, and nothing is wrong but the leap seconds, which are those of the wrong date.
+An IMU with POSIX time reveals fixes that are 1024 weeks off. With GPS second of week nothing
+reveals it, and only the leap seconds are wrong, those of the wrong date.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ _FIRST_FD = 3
 def activated(name: str, environ: Mapping[str, str] = os.environ) -> socket.socket | None:
     """A listening socket of the unit's `FileDescriptorName=name`; None if there is none for us.
 
-    Each call gives a duplicate: who serves it may close it and ask again.
+    Each call gives a duplicate, which a server may close and request again.
     """
     try:
         meant, count = int(environ["LISTEN_PID"]), int(environ["LISTEN_FDS"])

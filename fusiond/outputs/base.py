@@ -19,8 +19,8 @@ from fusiond.outputs.topics import Topic
 class Output(Protocol):
     """An output. `counters` and `status` stand in `health`, under `name`.
 
-    `nav_rate_hz`: how often it takes `nav`. `sets_clocks`: whether who receives it may take its
-    time of day for a clock; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
+    `nav_rate_hz`: rate at which it takes `nav`. `sets_clocks`: True if clients may set clocks by
+    its time of day; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
     """
 
     @property
@@ -43,7 +43,7 @@ class Output(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Context of an output: `on_event(code, text)` hears what it reports."""
+    """Context of an output: `on_event(code, text)` receives what it reports."""
 
     vehicle: str
     on_event: Callable[[str, str], None]

@@ -30,9 +30,9 @@ _SECOND_NS = 1_000_000_000
 
 
 class ChronySocket:
-    """Samples to chronyd. Counters: `sent`; `failed`, chronyd is not there or does not read.
+    """Sender of samples to chronyd. Counters: `sent`; `failed`, chronyd is absent or does not read.
 
-    `on_event` hears `chrony_absent` once an outage.
+    `on_event` receives `chrony_absent` once an outage.
     """
 
     name = "chrony"

@@ -1,9 +1,9 @@
 """Places of a server: who gives way when all are taken and one more comes.
 
-First who owes something: a request that has not come, an answer that it does not take. Then, where
-one host has more connections than the newcomer's would have, the last of that host's: so one host
-can have all places, and keeps them only while nobody else wants one. Of IPv6 a host is its network
-of 64 bits, of which it may have every address (RFC 4291, 2.5.4).
+First a client that owes something: a missing request, or an answer that it does not read. Then, if
+one host has more connections than the newcomer's would have, that host's last one: a host may have
+all places while nobody else wants one. An IPv6 host is its network of 64 bits, all addresses of
+which it may have (RFC 4291, 2.5.4).
 """
 
 from __future__ import annotations

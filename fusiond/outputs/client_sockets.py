@@ -1,16 +1,16 @@
 """Client sockets of all servers, served in turns at little cost to a tick.
 
 All listeners and connections are in one epoll set, of which the event loop sees a single
-descriptor. When something is there the loop gives a turn: pieces of work, of each server one to
-send and one to receive, until none is left or the budget of the window is spent; what is left
-waits for the next window. A piece of work is one `accept`, one `recv` with what it holds, or what
-one guest is sent.
+descriptor. When it is readable the loop gives a turn: for each server one piece to send and one to
+receive, until none is left or the window's budget is spent; the rest waits for the next window. A
+piece of work is one `accept`, one `recv` with the handling of its data, or one piece sent to a
+client.
 
     spent in any window of 10 ms <= 1 ms + one piece of work
 
-Servers take turns, and so do the guests of each: whoever has been served goes to the end of his
-server's queue (epoll does so with level-triggered descriptors). With n guests at one of m servers
-each has a turn once in m n, and a guest of another waits for none of them.
+Servers take turns, and so do the clients of each: a served client goes to the end of its server's
+queue (epoll does so with level-triggered descriptors). With n clients at one of m servers each has
+a turn once in m n, and clients of other servers do not wait for them.
 
 Source: fair queueing, round robin by flow (Nagle, RFC 970).
 """
@@ -55,8 +55,8 @@ class Guest(Protocol):
 class Guests:
     """Connections of all servers of a daemon; at most `most` are open.
 
-    It needs a running event loop while something is watched, and is never called from outside it.
-    `postponed` counts windows whose budget was spent.
+    It needs a running event loop while a descriptor is watched, and is never called from outside
+    it. `postponed` counts windows with a spent budget.
     """
 
     def __init__(self) -> None:

@@ -5,10 +5,10 @@ command takes one. A command without a token is not read; the first of a row is 
 ends when the bucket is full again. Every command and every reply costs the tick's own loop time, so
 a client that has run wild costs an addition and a comparison each.
 
-A command is carried out once. MQTT's QoS 1 delivers at least once, a bridge or a script repeats:
-what comes again under a name and an id that were carried out is refused. A broker delivers a
-retained command at each subscription, and marks it: it is refused by that mark, whatever it says.
-To a client that is subscribed already it comes unmarked, is carried out, and refused from then on.
+A command is executed once. MQTT's QoS 1 delivers at least once, and bridges or scripts repeat: a
+name and id that were executed are refused. A broker delivers a retained command at each
+subscription, and marks it: the mark is a refusal. A client that is already subscribed receives it
+unmarked: it is executed, and refused from then on.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ Answer = ReplyMessage | Coroutine[None, None, ReplyMessage]
 
 
 class CommandIntake:
-    """Answers commands; `allowed` are those that the configuration lists.
+    """Executor of commands; `allowed` are those that the configuration lists.
 
     `counters`: `mqtt_commands`, `mqtt_commands_limited`, `mqtt_commands_refused`, and of these
-    `mqtt_commands_repeated` and `mqtt_commands_retained`. `on_event` hears
+    `mqtt_commands_repeated` and `mqtt_commands_retained`. `on_event` receives
     `mqtt_command_failed`, `now` is monotonic, s.
     """
 

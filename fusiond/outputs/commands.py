@@ -22,8 +22,7 @@ class Command(BaseModel):
 class SetPosition(Command):
     """Position of the vehicle: WGS 84, height above the ellipsoid; one sigma per horizontal axis.
 
-    It is fused like any fix, and gated like one; with `force` the filter is reset and aligns anew
-    from it.
+    It is gated and fused like any fix; with `force` the filter restarts its alignment from it.
     """
 
     lat_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
@@ -113,8 +112,8 @@ NAMES = {command: name for name, command in CARRIED_OUT.items()}
 Handler = Callable[[Command], str | Awaitable[str]]
 """Function that carries out a command.
 
-It returns what was done, or raises `CommandRefusedError`; an answer that waits for a disk comes
-later."""
+It returns a description of the result, or raises `CommandRefusedError`; a reply that waits for a
+disk comes later."""
 
 
 class CommandRefusedError(Exception):

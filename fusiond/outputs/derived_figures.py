@@ -5,7 +5,7 @@
     along  = sqrt((v_n sd_n)^2 + (v_e sd_e)^2) / speed     sigma of the speed
     across = sqrt((v_e sd_n)^2 + (v_n sd_e)^2) / speed     sigma of the velocity's other part
 
-Sigma of velocity is taken for uncorrelated between north and east, which is all that `nav` tells.
+North and east velocity errors are assumed uncorrelated, since `nav` has no correlation.
 """
 
 from __future__ import annotations

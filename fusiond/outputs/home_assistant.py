@@ -36,7 +36,8 @@ class Description(RootModel[dict[str, Any]]):
 
 
 class HomeAssistantDiscovery:
-    """Puts the description at the broker. Counters: `births`, how often it was asked for again."""
+    """Publisher of the entities' description. Counter: `births`, the number of repeated requests
+    for it."""
 
     name = "home_assistant"
     sets_clocks = False

@@ -1,7 +1,7 @@
 """Parser of a client's JSON, with one error for all invalid input.
 
-Refused beside what is no JSON: what is nested deeper than any request is, half a surrogate pair
-(no text that can be written out again), NaN and infinities.
+Besides invalid JSON it refuses excessive nesting, half a surrogate pair (which no text can encode),
+NaN and infinities.
 
 Source: RFC 8259, sections 8.2 and 9 (a parser may limit the depth).
 """

@@ -1,10 +1,9 @@
 """MQTT publisher: a supervised connection and bounded queues.
 
-`publish` puts a message in its place and returns: it never waits and never raises. One task sends
-the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
-the next); both belong to one connection and end with it. A broker that accepts bytes and does
-nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
-every quarter of `keepalive_s`, and has half of it to be confirmed.
+`publish` stores a message and returns: it never waits and never raises. One task sends the latest
+values (QoS 0), another status and events (QoS 1, each confirmed before the next); both belong to
+one connection and end with it. A missing confirmation reveals a frozen broker: a QoS 1 message goes
+out at least every quarter of `keepalive_s`, and must be confirmed within half of it.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ _LOG.setLevel(logging.ERROR)
 class MqttPublisher:
     """Publisher of a vehicle's topics, and receiver of its commands.
 
-    `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
+    `on_event(code, text)` receives `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
     `mqtt_flooded`, `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`.
-    `on_command` carries out a configured command; without it, or with none configured, nothing is
-    subscribed. `utc_now` (ns, None if unknown) dates the replies.
+    `on_command` executes a configured command; without it, or without configured commands, nothing
+    is subscribed. `utc_now` (ns, None if unknown) dates the replies.
 
     `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
     event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_taken_over`, connections lost

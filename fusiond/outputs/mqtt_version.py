@@ -1,10 +1,10 @@
 """Version of MQTT for a broker: 5, or 3.1.1 where it does not know that.
 
-A client of version 5 says how long a packet it takes at most (Maximum Packet Size, MQTT 5,
-3.1.2.11.4): what is longer stays with the broker. It also hears of a command whether it was meant
-to be kept (Retain As Published, 3.8.3.1). A broker of 3.1.1 alone refuses the version (CONNACK 1;
-MQTT 3.1.1, 3.1.2-2), hangs up, or says nothing, since it reads the properties as something else:
-so no answer counts as a refusal, too. What a broker has answered to is kept for the process.
+A client of version 5 states its largest packet (Maximum Packet Size, MQTT 5, 3.1.2.11.4): the
+broker keeps longer ones. It also learns whether a command was retained (Retain As Published,
+3.8.3.1). A broker of 3.1.1 refuses the version (CONNACK 1; MQTT 3.1.1, 3.1.2-2), disconnects, or is
+silent, since it misreads the properties: a missing reply counts as a refusal. The version of the
+first reply is kept for the process.
 """
 
 from __future__ import annotations

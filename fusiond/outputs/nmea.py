@@ -78,7 +78,7 @@ class NmeaServer:
 def sentences(nav: NavMessage, kinds: Sequence[str], geoid_separation_m: float | None) -> bytes:
     """An epoch: the sentences of `kinds`, in the order in which gpsd understands them.
 
-    GST and PASHR only while there is a solution: they have no field that says there is none.
+    GST and PASHR are sent only with a solution: they have no field for its absence.
     """
     epoch = _Epoch(nav, geoid_separation_m)
     makers: dict[str, Callable[[], list[str] | None]] = {

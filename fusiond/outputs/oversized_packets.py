@@ -1,10 +1,10 @@
 """Limit on a broker's packets: longer ones are read to their end and discarded.
 
-MQTT lets a message have 256 MB. A client of MQTT 5 tells its broker what it takes at most
-(`outputs.mqtt_version`); a broker of 3.1.1 is told nothing. So the length is looked at here, before
-anything is decoded: of a packet that is too long the first bytes are kept, enough for its topic and
-for whoever takes it to see that it is too long; the rest is read from the socket and forgotten. The
-connection goes on: to close it would meet the same retained message again, and again.
+MQTT allows messages of 256 MB. A client of MQTT 5 tells its broker the largest packet
+(`outputs.mqtt_version`); a client of 3.1.1 cannot. So the length is checked here before decoding:
+of a longer packet the first bytes are kept, enough for its topic and for its size to be recognised;
+the rest is read and discarded. The connection continues: a new one would receive the same retained
+message again.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ class Location(RootModel[dict[str, str | int | float]]):
 
 
 class OwnTracksLocations:
-    """Publishes `owntracks/<user>/<vehicle>`, retained. Counters: `locations`; `undated`, left out
-    because UTC is not settled."""
+    """Publisher of `owntracks/<user>/<vehicle>`, retained. Counters: `locations`; `undated`, left
+    out because UTC is not settled."""
 
     name = "owntracks"
     sets_clocks = True

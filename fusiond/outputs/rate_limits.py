@@ -2,8 +2,8 @@
 
     left(t) = min(burst, left(t0) + rate (t - t0))
 
-What is spent may take a bucket below nothing, by one piece of work at most; then the guest waits
-until it is full enough again, or is a flood. Time is `time.perf_counter_ns`.
+A piece of work may overdraw a bucket; the client then waits until it is full enough again, or is
+dropped for a flood. Time is `time.perf_counter_ns`.
 """
 
 from __future__ import annotations

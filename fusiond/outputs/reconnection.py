@@ -1,9 +1,8 @@
 """Reconnection to the broker, and detection of a second client with our name.
 
-A broker ends the older of two connections of one client identifier (MQTT 3.1.1, 3.1.4-2). In that
-version it does not say why; but a connection that it ends moments after it was made, again and
-again, is the mark of a rival who comes back as we do. Each then waits longer, or the two would
-throw each other out several times a second for ever.
+A broker ends the older of two connections with one client identifier (MQTT 3.1.1, 3.1.4-2), in that
+version without a reason. Repeated ends moments after connecting reveal a rival that reconnects as
+we do. Each then waits longer; otherwise the two would disconnect each other several times a second.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ PEACE_S = 2.0 * LONGEST_CONTESTED_S
 
 
 class Reconnecting:
-    """Waits between connections; `taken` while another client seems to have our name."""
+    """Wait between connections; `taken` while another client seems to have our name."""
 
     def __init__(self) -> None:
         self.taken = False

@@ -1,13 +1,12 @@
 """Subscriptions to publications of others, counted before they are parsed.
 
-A broker hands on whatever anybody publishes, as fast as it comes, on the connection that our own
-messages are confirmed on: behind a hundred thousand commands a confirmation comes seconds late, and
-what is sent meanwhile may be lost unseen, so it is not sent. Reading faster is no answer, and more
-slowly makes it worse. So who is flooded stops listening: the broker is told (UNSUBSCRIBE), what it
-has sent already is read and dropped, and some time later it is listened to again.
+A broker forwards publications at any rate on the connection of our own confirmations: behind a
+hundred thousand commands a confirmation is seconds late, and QoS 0 messages are withheld meanwhile,
+since they may be lost unseen. Reading faster does not help, reading more slowly makes it worse. A
+flooded client therefore unsubscribes, drops what was already sent, and subscribes again later.
 
-What is on its way at that moment is little, as the kernel holds `HELD_BYTES` for us, not the
-megabytes that it would take otherwise.
+Little is in flight at that moment, since the kernel buffers only `HELD_BYTES` for us instead of
+megabytes.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """TCP server whose clients hold up neither each other nor a tick.
 
-Whatever a client causes is done in a turn of the door (`fusiond.outputs.client_sockets`) and
-charged to its allowance: who sends too much is read more slowly, who asks too often is dropped.
-What a client has not read waits in its connection: 16 KiB in the process and as much again in the
-kernel. While that is full its epochs are skipped; who skips thirty in a row, or takes nothing for
-half a minute, is dropped. A connection counts until its descriptor is closed.
+All work for a client is done in turns (`fusiond.outputs.client_sockets`) and charged to its
+allowance: a client that sends too much is read more slowly, one with too many requests is dropped.
+Unread output waits in its connection: 16 KiB in the process and as much again in the kernel. While
+these are full its epochs are skipped; after thirty skipped in a row, or half a minute without
+reading, it is dropped. A connection counts until its descriptor is closed.
 """
 
 from __future__ import annotations

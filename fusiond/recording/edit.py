@@ -1,6 +1,6 @@
 """Logs made of logs: a part cut out, parts joined, what can be had of a damaged one.
 
-What comes out is a log like any other, with index, metadata and attachments.
+The result is an ordinary log with index, metadata and attachments.
 """
 
 from __future__ import annotations

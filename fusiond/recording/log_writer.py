@@ -1,8 +1,8 @@
 """A thread that writes logs: no tick ever waits for a disk.
 
-What is to be written is put into a bounded queue; when a disk is so slow that it fills, messages
-are lost and counted, and the log says where by their sequence. Twice a second the thread writes
-what is there, closes the chunk and syncs: a power cut loses that and what the disk itself takes.
+Messages go into a bounded queue; when a slow disk fills it, messages are lost and counted, and
+their sequence shows the gap. Twice a second the thread writes the queue, closes the chunk and
+syncs: a power cut loses that and the disk's own delay.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class Item:
 
 
 class LogWriter:
-    """Writes one recording into files `STEM_0000.mcap`, ... of `folder` until it is closed.
+    """Writer of one recording into files `STEM_0000.mcap`, ... of `folder`, until closed.
 
-    `about()` describes it; it is called in the thread, since it reads files.
-    The attributes may be read at any time: `path` of the file under way, whether any was `synced`,
-    `stopped`, why it had to stop by itself, `dropped` messages, `free_mb` of the disk.
+    `about()` describes it; it is called in the thread, since it reads files. The attributes may be
+    read at any time: `path` of the current file, `synced` True after a first sync, `stopped` the
+    reason of an end by itself, `dropped` messages, `free_mb` of the disk.
     """
 
     def __init__(

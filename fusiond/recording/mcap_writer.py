@@ -1,7 +1,7 @@
 """Writer of one MCAP file: its description first, then messages in chunks.
 
-Every file carries configuration, DBC files, version and host: each split can be read alone. What is
-flushed and synced outlives a power cut; a chunk that was under way then is lost, no more.
+Every file carries configuration, DBC files, version and host, so that it can be read alone. Synced
+data survive a power cut; only an open chunk is lost.
 """
 
 from __future__ import annotations

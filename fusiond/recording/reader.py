@@ -1,8 +1,8 @@
 """Reading logs: whole, cut off, damaged, and several parts of one recording as one.
 
-A file is read from its beginning and needs no index: what a power cut has left of it is read up to
-its last whole chunk. A chunk that is damaged is passed over, and one that would become more than a
-chunk of ours can be: 57 kB of such a file were 3.3 GB. `problems` says what was wrong.
+A file is read from its beginning and needs no index: after a power cut it is readable up to its
+last whole chunk. Damaged chunks are skipped, as are those that decompress to more than ours can: 57
+kB of such a file became 3.3 GB. `problems` lists the defects.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Log:
     """A recording in one or several files, in order. Raises `LogError`, and OSError for what cannot
     be read.
 
-    `problems` fills while messages are read: what is wrong with the files, each sentence once.
+    `problems` fills while messages are read: the defects of the files, each sentence once.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:

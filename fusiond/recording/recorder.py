@@ -59,9 +59,9 @@ class RecordingRefusedError(Exception):
 class Recorder:
     """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
 
-    `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`;
-    a recording that failed takes up again by itself (`fusiond.recording.retry`).
-    `begin` and `end` may be called whenever; `listen` connects the drivers.
+    `on_event(code, text)` receives `recording_started`, `recording_stopped` and `recording_failed`;
+    a failed recording resumes by itself (`fusiond.recording.retry`). `begin` and `end` may be
+    called at any time; `listen` connects the drivers.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Recorder:
     def begin(self, restored: Mapping[str, Any] | None = None) -> str:
         """Record from now on; the file's name. Raises `RecordingRefusedError`.
 
-        `restored` is None for a recording that begins on the way.
+        `restored` is None for a recording that starts during a run.
         """
         if self.state == "recording":
             raise RecordingRefusedError(f"recording already, into {self._path().name}")

@@ -12,8 +12,8 @@ Records stand in the order in which the daemon handled them: a log is played by 
 
     kind        payload
     start       JSON: what the daemon had loaded when the recording began
-    tick        inputs u64, overruns u64, latency_ns i64, digest 8 bytes; t_ns is the tick's deadline
-    read        bytes of one read
+    tick        inputs u64, overruns u64, latency_ns i64, digest 8 bytes; t_ns is the tick's
+    deadline read        bytes of one read
     frame       CAN id u32, flags u8 (1 extended, 2 remote, 4 error, 8 stamped), realtime_ns i64,
                 data
     open        nothing

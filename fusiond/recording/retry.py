@@ -1,7 +1,7 @@
 """A recording that failed is tried again: at first soon, then once a minute, until it writes.
 
-An attempt is a log that holds nothing yet; once the disk has taken it the recording goes on.
-What happens meanwhile is not kept, since nobody knows whether it could be.
+An attempt is an empty log; once it is on the disk, recording resumes in it. Input meanwhile is not
+kept, since it might not fit.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ class RecordedTime:
 class RecordedReadings(Readings):
     """Clock readings of the daemon, in the same order.
 
-    A filter that reports other events asks another number of times: what a record does not hold is
-    answered with what was read last, and what is left over waits for nobody (`pending`).
+    A filter with other events makes another number of readings: missing readings repeat the last
+    one, and surplus ones are ignored (`pending`).
     """
 
     def __init__(self, time: RecordedTime, system_clock: Mapping[str, int | None]) -> None:

@@ -74,9 +74,9 @@ class Replay:
     """One replay of a log with a configuration. `exact`: the log's own digests should be
     reproduced, which needs its configuration and the start of the drive.
 
-    `on_event`, `on_outcome` and `on_arrival` (of each measurement, with its instant) hear what the
-    daemon's parts say. Without `navigate` the filter does not run, and there are no ticks. `afresh`
-    leaves aside what the daemon had loaded.
+    `on_event`, `on_outcome` and `on_arrival` (each measurement, with its instant) receive the
+    reports of the daemon's parts. Without `navigate` the filter does not run, and there are no
+    ticks. `afresh` ignores the daemon's restored state.
     """
 
     def __init__(

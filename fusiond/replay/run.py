@@ -50,8 +50,7 @@ class ReplayOptions:
 def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
     """Replay a recording; the summary. `times_real_time` is by CPU time.
 
-    `identical` is None where there is nothing to compare with. Raises `LogError`, `ConfigError`,
-    OSError.
+    `identical` is None without digests to compare. Raises `LogError`, `ConfigError`, OSError.
     """
     recording = Log(paths)
     with TemporaryDirectory(prefix="fusiond-replay-") as folder, contextlib.ExitStack() as stack:

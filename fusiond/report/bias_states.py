@@ -24,8 +24,8 @@ _NUMBERS = TypeAdapter(tuple[float, ...])
 
 
 class Biases:
-    """Takes `/fusiond/state`. An axis' bias is the sum of the model's terms of it: turn-on, Markov.
-    The blocks that measurements add come behind them in the state."""
+    """Biases from `/fusiond/state`. An axis' bias is the sum of the model's terms for it: turn-on,
+    Markov. Blocks of measurements follow in the state."""
 
     def __init__(self, config: bytes | None) -> None:
         self._slots = _bias_slots(config)

@@ -47,7 +47,7 @@ _TRIAL = 200
 
 
 class InputStatistics:
-    """Takes the input's records in order; `folder` is for the log's DBC files while it does."""
+    """Statistics of the input's records in order; `folder` holds the log's DBC files meanwhile."""
 
     def __init__(self, about: About, folder: Path) -> None:
         self._epoch_ns = about.epoch_ns

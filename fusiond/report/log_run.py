@@ -128,7 +128,7 @@ def _facts(log: Log, known: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 class _Channels:
-    """Takes the messages of the JSON channels, in order."""
+    """Collector of the JSON channels' messages, in order."""
 
     def __init__(self, log: Log) -> None:
         self._epoch_ns = log.about.epoch_ns

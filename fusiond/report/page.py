@@ -1,7 +1,7 @@
 """The page: everything in one file, which asks nothing of a network.
 
-uPlot 1.6.32 (MIT, `assets/uplot/LICENSE`) is laid into it as it was published. A policy in the page
-forbids the browser to fetch anything, and what comes from files is only ever shown as text.
+uPlot 1.6.32 (MIT, `assets/uplot/LICENSE`) is included unchanged. A policy in the page forbids the
+browser to fetch anything, and content of files is only shown as text.
 """
 
 from __future__ import annotations

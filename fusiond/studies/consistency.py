@@ -190,10 +190,7 @@ def _quiet(
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Run the study with `runs` windows a false-alarm rate, 1/40 of them (>= 50) runs a power.
-
-    A run has 1,800 epochs. The same arguments give the same result.
-    """
+    """Run the study with `runs` windows a false-alarm rate, 1/40 of them (>= 50) runs a power."""
     windows = runs or DEFAULT_RUNS
     drives = max(50, windows // 40)
     options = ConsistencyOptions()

@@ -1,10 +1,10 @@
 """Forked child processes that run jobs for their side effects, then end.
 
-A job finds everything as its caller has it, and what it takes of memory goes when its child ends.
-One child forks the others and tells how many jobs are done by a pipe, so that whoever waits may do
-so in an event loop and never forks in it. Children work side by side, each at one job; one that
-holds more than its share of memory is followed by another. A job whose child dies is given to a
-child alone, once more; what has failed then is left to the caller, who can say why.
+A job has its caller's memory, and its own memory is freed when its child ends. One child forks the
+others and reports the number of finished jobs through a pipe, so that the caller can wait in an
+event loop and never forks in it. Children work in parallel, each on one job; one with more than its
+share of memory is replaced. A job whose child dies is given to a child alone, once more; a second
+failure is left to the caller, who can report the reason.
 
 They run by normal priority, and go before the caller does where memory ends.
 """

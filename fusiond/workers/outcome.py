@@ -16,7 +16,7 @@ class Outcome(Generic[R]):
     """Outcome of item `index`: its result or the reason for its failure.
 
     `error`: an exception left the run; `died`: its process ended; `timeout`: it took too long.
-    `reason` says more, and is empty for what is done.
+    `reason` is the explanation, empty for a success.
     """
 
     index: int
@@ -26,7 +26,7 @@ class Outcome(Generic[R]):
 
 
 class Runner(Protocol):
-    """Runs a function of each item on other processes. `workers` run at a time."""
+    """Runner of a function of each item on other processes; `workers` at a time."""
 
     @property
     def workers(self) -> int: ...

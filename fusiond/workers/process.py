@@ -1,7 +1,7 @@
 """Worker process: takes chunks of items from its socket and replies item by item.
 
-What comes is the pickle of (work, [(index, item), ...]). What goes is pickled, too: `STARTED` when
-`work` has been loaded, then for each item (index, ended, reason, result).
+Input is the pickle of (work, [(index, item), ...]). Output is pickled, too: `STARTED` when `work`
+has been loaded, then for each item (index, ended, reason, result).
 """
 
 from __future__ import annotations

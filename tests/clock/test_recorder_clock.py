@@ -84,7 +84,7 @@ def test_a_pause_that_utc_shows_is_one_and_may_hide_a_step() -> None:
     assert times == [t + (300 * S if k >= 500 else 0) for k, t in enumerate(even())]
 
 
-def test_what_was_recorded_before_is_no_step() -> None:
+def test_stamps_before_the_trigger_are_no_step() -> None:
     """Two logs in the wrong order: UTC went back as well."""
     stamps = [*even(), *(t - 7200 * S for t in even())]
     clock, _, verdicts = replayed(stamps, lambda k: 0)

@@ -355,7 +355,7 @@ def test_a_restarted_process_knows_utc_from_its_first_report(pause: int) -> None
     assert receiver.epoch(late=100 * MS)[1] > 90 * MS
 
 
-def test_what_is_old_or_of_the_future_is_learnt_anew() -> None:
+def test_old_or_future_utc_is_learnt_again() -> None:
     _, clock = _restarted(61 * S)
     assert clock.status().utc_source == "system"
     _, clock = _restarted(-10 * S)

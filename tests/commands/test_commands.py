@@ -252,7 +252,7 @@ def test_interrupt_exits_130(tmp_path: Path) -> None:
     assert "Traceback" not in text
 
 
-def test_what_runs_at_the_end_runs_whatever_becomes_of_the_output() -> None:
+def test_exit_functions_run_after_a_broken_output() -> None:
     """A command ends the process by itself: after what is registered for that, and by its code."""
     code = (
         "import atexit, sys\n"

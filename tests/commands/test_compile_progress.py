@@ -82,7 +82,7 @@ def test_a_pipe_and_systemd_hear_how_far_it_is(tmp_path: Path) -> None:
     assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 4
 
 
-def test_what_cannot_be_kept_is_compiled_here_and_told(tmp_path: Path) -> None:
+def test_uncacheable_kernels_are_compiled_here_and_reported(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(KERNELS)
     (tmp_path / "cache").write_text("no folder")
     done = subprocess.run(
@@ -129,7 +129,7 @@ def test_a_terminal_has_one_line_and_a_dumb_one_lines(
     assert out.getvalue() == written
 
 
-def test_what_has_been_loaded_is_left_alone_by_the_collector() -> None:
+def test_loaded_objects_are_exempt_from_collection() -> None:
     before = gc.get_threshold()
     gc.unfreeze()
     try:

@@ -107,7 +107,7 @@ print(fusiond.recording.log_metadata._versions().keys() >= {"numpy"})
     assert done.stdout == "True\n"
 
 
-def test_what_needs_them_says_so_by_name(environment: dict[str, str], tmp_path: Path) -> None:
+def test_commands_name_the_missing_extra(environment: dict[str, str], tmp_path: Path) -> None:
     for command in (("study", "rdss-static"), ("bench",)):
         done = _fusiond(environment, *command, status=69)
         for words in ("scipy", "pywt", "matplotlib", "-m pip", "'scipy>=1.11' 'PyWavelets>=1.5'"):

@@ -40,7 +40,7 @@ def test_examples_leave_no_doubt(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"[sources.gnss]\n{GNSS}", "sources: none is an IMU"),
+        (f"[sources.gnss]\n{GNSS}", "sources: no IMU"),
         (f"{SOUND}[sources.imu2]\n{IMU}", "sources: imu and imu2 are IMUs"),
         (f"{SOUND}[imu]\nrate_hz = 0.01\n", "imu.rate_hz = 0.01: samples 100 s apart"),
         (
@@ -117,7 +117,7 @@ def test_no_doubt_about_what_may_well_be(tmp_path: Path) -> None:
     assert found(tmp_path, known) == []
 
 
-def test_what_drivers_give_holds_the_defaults() -> None:
+def test_measurement_kinds_of_drivers_cover_the_defaults() -> None:
     assert {
         driver: section().kind in GIVES[driver] for driver, section in _DEFAULT_AIDING.items()
     } == (dict.fromkeys(_DEFAULT_AIDING, True))

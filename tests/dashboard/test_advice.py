@@ -56,15 +56,16 @@ def test_why_becomes_a_step(mode: str, why: str, step: str) -> None:
 @pytest.mark.parametrize(
     ("changed", "step"),
     [
-        ({"state": "absent"}, "gnss cannot be opened: check plug, power and port."),
-        ({"state": "silent"}, "gnss is open and says nothing: check power, wiring and baud rate."),
+        ({"state": "absent"}, "gnss cannot be opened: check cable, power and port."),
+        ({"state": "silent"}, "gnss is open but silent: check power, wiring and baud rate."),
         ({"state": "failed"}, "gnss cannot work as configured: correct its section, then restart."),
-        ({"state": "silent", "detail": "No card in the terminal"}, "gnss: put a card into the"),
-        ({"isolated": "jumped by 40 m"}, "gnss disagrees with the rest and is left out."),
+        ({"state": "silent", "detail": "No card in the terminal"}, "gnss: insert a card into the"),
+        ({"isolated": "jumped by 40 m"}, "gnss disagrees with the other sources and is excluded"),
+        ({"service": "probation"}, "gnss is back; checking it against the motion."),
         ({"verdict": "optimistic"}, "gnss: sigma is too small"),
     ],
 )
-def test_what_a_source_needs(changed: dict[str, Any], step: str) -> None:
+def test_advice_for_a_source(changed: dict[str, Any], step: str) -> None:
     (only,) = texts(status(), health(**changed))
     assert only.startswith(step)
 
@@ -72,16 +73,16 @@ def test_what_a_source_needs(changed: dict[str, Any], step: str) -> None:
 def test_a_fault_is_told_once_with_its_size() -> None:
     found = texts({**status(), **said("status")}, said("health"))
     assert [text for text in found if "gnss" in text] == [
-        "Look after gnss: gnss velocity is off by 0.521 m/s, 0.081 at one sigma, north,"
+        "Check gnss: gnss velocity is off by 0.521 m/s, 0.081 at one sigma, north,"
         " since 12 s: left out."
     ]
 
 
-def test_what_is_left_out_and_diagnosed_is_not_said_to_disagree() -> None:
+def test_a_diagnosed_exclusion_has_one_advice() -> None:
     fault = said("status")["faults"][0]
     found = texts(status(faults=[fault]), health(isolated=fault["text"], diagnosis=fault))
     assert len(found) == 1
-    assert found[0].startswith("Look after gnss: ")
+    assert found[0].startswith("Check gnss: ")
 
 
 def test_the_most_urgent_comes_first_and_nothing_twice() -> None:
@@ -90,12 +91,12 @@ def test_the_most_urgent_comes_first_and_nothing_twice() -> None:
         {**health(state="absent"), "overruns": 5000, "utc_settled": False},
     )
     assert [step.level for step in found] == ["error", "error", "warning", "warning"]
-    assert found[0].text == "Faults are put in (gnss drop): do not navigate by it."
+    assert found[0].text == "Simulated faults (gnss drop): do not navigate by this solution."
     assert len(set(found)) == len(found)
 
 
 def test_the_host_is_judged_by_its_ticks() -> None:
-    late = "More than one tick in 1000 came too late: take load off the computer."
+    late = "More than one tick in 1000 was late: reduce the load on this computer."
     assert texts(status(), {**health(), "ticks": 5000, "overruns": 6}) == [late]
     assert texts(status(), {**health(), "ticks": 5000, "overruns": 5}) == []
     assert texts(status(), {**health(), "ticks": 900, "overruns": 30}) == []  # it has just begun

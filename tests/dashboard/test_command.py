@@ -91,7 +91,7 @@ def test_the_broker_of_a_configuration(
     assert serving.loopback
 
 
-def test_who_serves_to_others_is_told(served: list[tuple[Access, PageAddress]]) -> None:
+def test_serving_beyond_loopback_is_announced(served: list[tuple[Access, PageAddress]]) -> None:
     result = CliRunner().invoke(app, ["dashboard", "--host", "0.0.0.0"])
     assert result.exit_code == 0
     assert "everyone who reaches this address sees the vehicle" in result.output
@@ -106,7 +106,7 @@ def test_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "pip install 'starlette>=1.0'" in result.output
 
 
-def test_what_is_no_recording_exits_65(tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_exits_65(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(b"no log")
     result = CliRunner().invoke(app, ["dashboard", str(path)])

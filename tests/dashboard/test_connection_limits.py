@@ -93,7 +93,7 @@ async def test_a_request_that_does_not_come_is_not_waited_for(
         await browser.until(lambda b: b.frames > frames + 5)
 
 
-async def test_who_takes_nothing_of_an_answer_is_given_up(
+async def test_a_client_that_reads_no_answer_is_disconnected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection_limits, "STUCK_S", 0.3)

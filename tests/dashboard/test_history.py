@@ -44,7 +44,7 @@ def test_of_each_key_there_is_the_newest_row(puts: list[tuple[int, Any]], count:
 
 
 @pytest.mark.parametrize("value", [10**400, -(10**400), math.nan])
-def test_what_no_double_holds_is_no_figure(value: float) -> None:
+def test_integers_beyond_doubles_become_nan(value: float) -> None:
     ring = Ring(3, "d")
     ring.add(1, [value])
     assert ring.newer(0) == [[None]]

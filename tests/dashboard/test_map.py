@@ -48,7 +48,7 @@ async def test_without_a_map_the_page_is_told_so_and_not_that_something_is_wrong
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PMTiles\x02", b"SQLite format 3\0"])
-def test_what_is_no_map_is_refused_at_the_start(tmp_path: Path, content: bytes | None) -> None:
+def test_an_invalid_map_is_refused_at_start(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "x.pmtiles"
     if content is not None:
         path.write_bytes(content)

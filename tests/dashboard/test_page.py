@@ -154,7 +154,7 @@ async def test_several_vehicles_are_offered_and_one_is_shown() -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", '"x"', "{}", '{"command": 5}', "x" * 5000])
-async def test_what_is_no_request_is_answered(text: str) -> None:
+async def test_invalid_requests_are_answered(text: str) -> None:
     async with at_work(make_hub()) as address, browsing(address) as page:
         await page.connection.send(text)
         await page.until(lambda p: p.answers)
@@ -261,7 +261,7 @@ async def test_every_file_of_the_page_is_served_and_asks_nobody_else() -> None:
 # ------------------------------------------------------------------ the hub
 
 
-def test_what_cannot_be_read_is_counted_and_left() -> None:
+def test_unreadable_messages_are_counted_and_skipped() -> None:
     hub = make_hub()
     for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b"", b'{"lat_deg": -1e999}', b"[" * 60_000):
         hub.receive("truck", "nav", bad)

@@ -12,7 +12,7 @@ from tests.outputs.test_hostile_requests import HOSTILE
 @pytest.mark.parametrize(
     "text", [*HOSTILE, '{"command":"\\ud800","token":"\\udfff"}', "[]", "x" * 5000]
 )
-async def test_it_is_not_understood_and_the_page_goes_on(text: str) -> None:
+async def test_unknown_input_leaves_the_page_running(text: str) -> None:
     hub = make_hub()
     hub.send_command = lambda *sent: pytest.fail(f"sent {sent}")
     async with at_work(hub, token="s3cret-token") as address, browsing(address) as page:

@@ -29,11 +29,11 @@ def test_the_file_of_schemas_is_of_today() -> None:
 
 
 @pytest.mark.parametrize("topic", [topic for topic in SHOWN if topic in EXAMPLES])
-def test_what_the_daemon_says_is_read_as_it_is(topic: str) -> None:
+def test_messages_of_the_daemon_are_parsed_unchanged(topic: str) -> None:
     assert topics()[topic](said(topic)) == said(topic)
 
 
-def test_what_another_version_says_is_read_as_far_as_it_is_known() -> None:
+def test_unknown_fields_of_other_versions_are_ignored() -> None:
     nav = said("nav")
     older = {name: value for name, value in nav.items() if not name.startswith("protection_")}
     assert topics()["nav"](older) == older
@@ -66,9 +66,7 @@ WRONG: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("topic", "message", "why"), WRONG)
-def test_what_is_not_as_published_is_refused_with_its_place(
-    topic: str, message: Any, why: str
-) -> None:
+def test_schema_violations_are_refused_with_their_field(topic: str, message: Any, why: str) -> None:
     with pytest.raises(RefusedError) as refused:
         topics()[topic](message)
     assert str(refused.value).startswith(why)

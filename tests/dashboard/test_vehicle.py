@@ -75,7 +75,7 @@ def test_only_what_is_new_is_told() -> None:
     assert [row[5] for row in vehicle.since(count)["rows"]["nav"]] == [6.0]
 
 
-def test_what_the_broker_has_kept_has_no_age() -> None:
+def test_retained_messages_have_no_age() -> None:
     vehicle = Vehicle("truck")
     vehicle.receive("status", said("status"), 100.0, kept=True)
     vehicle.receive("health", said("health"), 100.0, kept=True)
@@ -103,7 +103,7 @@ def test_a_long_silence_does_not_make_what_comes_later_young() -> None:
     assert vehicle.limit_s("nav") == LIMITS_S["nav"]
 
 
-def test_what_is_no_message_is_left() -> None:
+def test_invalid_messages_are_ignored() -> None:
     vehicle = Vehicle("truck")
     vehicle.receive("nav", [1, 2], 0.0)
     vehicle.receive("online", "maybe", 0.0)

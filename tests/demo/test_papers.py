@@ -83,7 +83,7 @@ class Run:
 
 
 @pytest.mark.parametrize("number", ["000", "001", "002", "003"])
-async def test_its_model_navigates_by_its_devices(number: str, tmp_path: Path) -> None:
+async def test_the_papers_model_navigates_by_its_devices(number: str, tmp_path: Path) -> None:
     run = Run(number, tmp_path)
     estimator = PAPERS[number].lines["estimator"]
     assert run.daemon.navigator.model.name == estimator["model"]

@@ -46,7 +46,7 @@ RAWX = rawx(measurement())
 HDM, HDT = (f"{made(text)}\r\n".encode() for text in ("HCHDM,101.5,M", "HEHDT,97.2,T"))
 
 
-async def test_what_is_plugged_in_becomes_a_file_that_check_passes(tmp_path: Path) -> None:
+async def test_found_devices_become_a_file_that_check_passes(tmp_path: Path) -> None:
     bus = str(tmp_path)  # virtual buses are shared
     car = SimulatedVehicle(
         SCENARIOS["static"],
@@ -82,7 +82,7 @@ async def test_what_is_plugged_in_becomes_a_file_that_check_passes(tmp_path: Pat
     assert "--force overwrites it" in again.stderr
 
 
-async def test_what_is_not_answered_is_measured_or_left_open_by_name(tmp_path: Path) -> None:
+async def test_unanswered_questions_are_measured_or_named(tmp_path: Path) -> None:
     bus = str(tmp_path)
     car = SimulatedVehicle(
         SCENARIOS["static"],
@@ -148,7 +148,7 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
         (bytes(range(256)) * 4, None, "none of 9 baud rates makes sense of them"),
     ],
 )
-async def test_what_speaks_on_a_port(
+async def test_devices_recognised_on_a_port(
     tmp_path: Path, data: bytes, driver: str | None, said: str
 ) -> None:
     device = Device(tmp_path / "port")

@@ -258,7 +258,7 @@ async def test_suppressed_terminal(tmp_path: Path) -> None:
             if code:
                 break
     assert code == 1
-    assert "the centre has switched the transmitter off" in text
+    assert "the RDSS centre suppresses the transmitter" in text
 
 
 async def test_damaged_sentences(tmp_path: Path) -> None:

@@ -214,7 +214,7 @@ async def _answer(port: int, context: ssl.SSLContext | None) -> bytes:
     return b""
 
 
-async def test_who_shows_no_certificate_of_ours_is_refused(
+async def test_a_client_without_our_certificate_is_refused(
     broker: Broker, certificates: Path, stranger: ssl.SSLContext
 ) -> None:
     with broker:

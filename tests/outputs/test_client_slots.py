@@ -181,7 +181,7 @@ class Placed(NamedTuple):
         ("abBA", "c", 2),
     ],
 )
-def test_who_gives_way(taken: str, comes: str, gives: int | None) -> None:
+def test_eviction_order_of_clients(taken: str, comes: str, gives: int | None) -> None:
     """Hosts are letters, great ones owe something."""
     placed = [Placed(letter.lower(), letter.isupper()) for letter in taken]
     found = gives_way(placed, comes, 0)
@@ -226,7 +226,7 @@ async def test_one_host_keeps_all_places_only_while_nobody_else_comes() -> None:
             sock.close()
 
 
-async def test_who_takes_nothing_of_an_answer_gives_way(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_client_that_reads_no_answer_gives_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would have half a minute, as long as no one else wants its place."""
     monkeypatch.setattr(tcp, "HASTY_S", 0.0)
     output = PrometheusEndpoint(Prometheus(port=free_port()), Around().surroundings)

@@ -31,7 +31,7 @@ S = 1_000_000_000
 # ------------------------------------------------------------------ turns
 
 
-async def test_what_is_to_be_done_waits_for_the_next_window(
+async def test_work_beyond_the_budget_waits_for_the_next_window(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each piece costs a third of the budget on a clock of the test's own: three a window."""
@@ -85,7 +85,7 @@ async def test_a_server_waits_for_no_guest_of_another(monkeypatch: pytest.Monkey
         other.forget(two.fileno())
 
 
-async def test_who_is_loud_does_not_silence_the_others() -> None:
+async def test_a_flooding_client_does_not_block_others() -> None:
     """Sixty-three who ask without end, and one who asks once."""
     async with gpsd() as server, connected(server.server.port.address) as patient:
         server.publish(NAV, nav())
@@ -129,7 +129,7 @@ def test_no_more_is_spent_than_the_rate_allows(
             assert spent <= burst + per_s * now_ns / S + largest + 1e-6
 
 
-async def test_who_asks_too_often_is_dropped() -> None:
+async def test_a_client_above_the_request_rate_is_dropped() -> None:
     async with gpsd() as server, connected(server.server.port.address) as client:
         client.writer.write(b"?POLL;" * 10_900)
         await client.ended()
@@ -161,7 +161,7 @@ async def test_a_poll_is_made_once_an_epoch(monkeypatch: pytest.MonkeyPatch) -> 
         assert made == 2
 
 
-async def test_who_sends_too_much_is_read_more_slowly() -> None:
+async def test_a_client_above_the_byte_rate_is_read_slowly() -> None:
     """Its bytes wait at its own side; nothing of them is kept here."""
     server = NmeaServer(NmeaServed(port=free_port()), Around().surroundings)
     async with at_work(server), connected(server.server.port.address) as talker:
@@ -182,7 +182,7 @@ def test_a_plotter_may_talk_as_it_does() -> None:
 # ------------------------------------------------------------------ who does not read
 
 
-async def test_who_asks_and_never_reads_is_dropped_in_time(
+async def test_a_client_that_never_reads_is_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It has no epoch to skip, so that only time tells; and its descriptor goes with it."""

@@ -58,7 +58,7 @@ async def test_subscriptions_are_bounded() -> None:
     [b"", b"GET / HTTP/1.1\r\n", b"\xff" * 100, b"X: y\r\n" * 5000],
     ids=["nothing", "half", "bytes", "lines"],
 )
-async def test_who_is_gone_leaves_nothing_to_the_garbage_collector(said: bytes) -> None:
+async def test_a_closed_viewer_leaves_no_cyclic_garbage(said: bytes) -> None:
     """Fifty thousand objects in circles, of those who came and went, cost a tick 0.1 s."""
     seen: list[weakref.ref[object]] = []
     async with foxglove() as server:
@@ -222,7 +222,7 @@ async def test_pages_of_other_sites_are_refused(origin: str | None, may: bool) -
     assert [code for code, _ in around.events] == ([] if may else ["foxglove_origin_refused"])
 
 
-def test_what_is_no_origin_is_not_loopback() -> None:
+def test_invalid_origins_are_not_loopback() -> None:
     for text in ("", "://", "http://[", "file://", "http://127.1", "localhost"):
         assert not loopback(text)
 

@@ -52,5 +52,5 @@ def test_configured_separation_takes_its_place() -> None:
         {"mode": Mode.INVALID},
     ],
 )
-def test_what_is_not_known_has_no_height(missing: dict[str, object]) -> None:
+def test_unknown_solutions_have_no_sea_height(missing: dict[str, object]) -> None:
     assert sea_height(nav(**missing), None) is None

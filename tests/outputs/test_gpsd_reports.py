@@ -46,7 +46,7 @@ def test_requests_however_they_end_and_are_cut(data: bytes, requests: list[Reque
 @pytest.mark.parametrize(
     "data", [b"GET / HTTP/1.1\r\n", b"?WATCH={nonsense};", b"?WATCH=7;", b"?;", b"x" * 20_000]
 )
-def test_what_is_no_request_is_said_to_be_none(data: bytes) -> None:
+def test_invalid_requests_get_an_error(data: bytes) -> None:
     reader = RequestReader()
     assert [type(r) for r in reader.feed(data)] == [Malformed]
     assert list(reader.feed(b"?POLL;")) == [Request("POLL")]
@@ -95,7 +95,7 @@ def test_tpv_is_the_solution_in_gpsds_units() -> None:
     assert "altMSL" not in reports.known_only(reports.tpv("d", nav(sd_d_m=None), None))
 
 
-def test_what_may_not_be_used_is_no_fix() -> None:
+def test_unusable_solutions_are_no_fix() -> None:
     waiting = nav_message(Solution(0, Mode.WAITING, "no IMU data yet"), None)
     assert json.loads(reports.encoded(reports.tpv("d", waiting, 11.3))) == {
         "class": "TPV",

@@ -33,7 +33,7 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_it_is_refused_in_one_way(text: str) -> None:
+def test_invalid_json_has_one_refusal(text: str) -> None:
     for given_ in (text, text.encode()):
         with pytest.raises(NotUnderstoodError) as refused:
             parsed(given_)
@@ -42,14 +42,14 @@ def test_it_is_refused_in_one_way(text: str) -> None:
         parsed(b"\xff\xfe\x00")
 
 
-def test_what_is_a_request_is_understood() -> None:
+def test_valid_requests_are_parsed() -> None:
     assert parsed('{"op":"a","b":[1,{"c":"\\ud83d\\ude00 \u00e9"}]}')["b"][1]["c"] == "😀 é"
     assert parsed("[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)) is not None
 
 
 @given(st.text(max_size=60) | st.binary(max_size=60))
 @settings(max_examples=200, deadline=None)
-def test_whatever_comes_is_a_value_that_can_be_said_again_or_refused(text: str | bytes) -> None:
+def test_any_bytes_give_a_serialisable_value_or_a_refusal(text: str | bytes) -> None:
     try:
         value = parsed(text)
     except NotUnderstoodError:

@@ -97,7 +97,7 @@ def _coming(monkeypatch: pytest.MonkeyPatch) -> tuple[Incoming, Any, list[int], 
     return it, come, through, now_s
 
 
-async def test_what_people_and_scripts_send_is_no_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_ordinary_command_rates_are_not_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     it, come, through, now_s = _coming(monkeypatch)
     for _ in range(200):
         now_s[0] += 1.0

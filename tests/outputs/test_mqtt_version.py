@@ -76,7 +76,7 @@ async def test_the_broker_of_the_demo_is_spoken_to_in_its_version() -> None:
             await it.until(lambda r: r.publisher.counters["mqtt_published"] >= 2)
 
 
-async def test_what_is_too_long_stays_with_a_broker_of_version_5(
+async def test_oversized_packets_stay_with_a_version_5_broker(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Longer than we answer to but short of the limit it comes, and its sender is told why."""
@@ -153,7 +153,7 @@ async def test_an_attempt_that_is_cancelled_ends_in_silence(
     assert not caplog.records
 
 
-def test_who_refuses_us_for_another_reason_is_asked_in_the_same_version() -> None:
+def test_other_refusals_keep_the_protocol_version() -> None:
     version = MqttVersion(1000)
     for error in (
         aiomqtt.MqttCodeError(135, "Not authorized"),

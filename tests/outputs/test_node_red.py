@@ -30,7 +30,7 @@ def test_every_node_is_wired_to_one_that_there_is() -> None:
             assert node.get(key, "fusiond_base") in {*BY_ID, "localhost"}, node["id"]
 
 
-def test_it_reads_topics_and_fields_that_are_published() -> None:
+def test_the_flow_reads_published_topics_and_fields() -> None:
     asked = 0
     for node in FLOW:
         if node["type"] != "mqtt in":

@@ -86,7 +86,7 @@ def test_the_metrics_are_what_the_messages_say() -> None:
     assert said[series] == 1.0
 
 
-def test_what_is_not_known_is_left_out() -> None:
+def test_unknown_values_are_left_out() -> None:
     said = read(exposition(endpoint(nav=nav(sd_d_m=nan, protection_horizontal_m=inf)).families()))
     assert 'fusiond_position_sigma_meters{axis="down"}' not in said
     assert said['fusiond_protection_level_meters{direction="horizontal"}'] == inf
@@ -113,7 +113,7 @@ async def ask(output: PrometheusEndpoint, request: bytes) -> tuple[bytes, bytes]
     return head, body
 
 
-async def test_it_answers_http() -> None:
+async def test_metrics_are_served_over_http() -> None:
     output = endpoint()
     async with at_work(output):
         head, body = await ask(output, b"GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n")

@@ -114,9 +114,7 @@ async def test_a_user_who_may_not_write_there_records_nothing_and_says_why() -> 
 
 
 @pytest.mark.parametrize("what", ["a link", "a folder"])
-async def test_what_is_no_file_of_ours_is_neither_counted_nor_removed(
-    tmp_path: Path, what: str
-) -> None:
+async def test_foreign_files_are_neither_counted_nor_removed(tmp_path: Path, what: str) -> None:
     """By the form of its name a log, and the oldest of all: a link to somebody's gigabytes."""
     elsewhere = tmp_path / "somebodys.mcap"
     elsewhere.write_bytes(bytes(5_000_000))

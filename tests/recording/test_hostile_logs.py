@@ -119,7 +119,7 @@ def test_a_log_that_describes_itself_wrongly_is_refused(
         Log([log_with(tmp_path / "a.mcap", **changed)])
 
 
-def test_what_a_message_says_may_be_nested_too_deep(tmp_path: Path) -> None:
+def test_deeply_nested_messages_are_refused(tmp_path: Path) -> None:
     deep = b"[" * 100_000
     message = b"\x05" + struct.pack("<QHIQQ", 22 + len(deep), 1, 0, 9, 9) + deep
     zipped = zstd(message, sized=True)
@@ -184,7 +184,7 @@ def test_a_length_inside_a_record_asks_for_no_memory(tmp_path: Path) -> None:
     assert any("cut off" in text for text in log.problems)
 
 
-def test_what_is_wrong_is_told_a_hundred_times(tmp_path: Path) -> None:
+def test_at_most_a_hundred_problems_are_listed(tmp_path: Path) -> None:
     wrong = [pack(Record(Kind.READ, 1, 2, b"a")) for _ in range(500)]
     log = input_log(tmp_path / "a.mcap", *wrong)
     assert list(log.records()) == []

@@ -99,7 +99,7 @@ def test_everything_is_there_in_its_order(make: Callable[..., Bench]) -> None:
     assert codes == ["recording_started"]
 
 
-def test_it_begins_and_ends_when_told(make: Callable[..., Bench]) -> None:
+def test_recording_starts_and_stops_by_command(make: Callable[..., Bench]) -> None:
     bench = make(when="command")
     bench.recorder.arm({})
     bench.tick(2)

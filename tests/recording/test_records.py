@@ -38,7 +38,7 @@ FRAMES = st.builds(
 
 
 @given(st.lists(RECORDS, max_size=8))
-def test_what_is_packed_is_unpacked(records: list[Record]) -> None:
+def test_records_survive_packing_and_unpacking(records: list[Record]) -> None:
     assert list(unpack(b"".join(map(pack, records)))) == records
 
 

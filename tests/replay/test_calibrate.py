@@ -58,13 +58,13 @@ def test_a_drive_is_either_a_recording_or_files(tmp_path: Path) -> None:
         assert "Give LOG.mcap alone" in " ".join(done.stderr.split())
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_is_reported(tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     other.write_text("no log")
     assert _called(tmp_path, str(other)).exit_code == 65
 
 
-def test_what_the_daemon_had_loaded_is_left_aside(tmp_path: Path) -> None:
+def test_saved_calibration_of_the_daemon_is_ignored(tmp_path: Path) -> None:
     """Each pass begins without alignment, and is seen to the end."""
     recording = Log([DEMO])
     config = config_of(recording.about, tmp_path)

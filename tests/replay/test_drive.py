@@ -249,7 +249,7 @@ def test_a_damaged_chunk_costs_itself(recorded: Recorded, tmp_path: Path) -> Non
         (b"\x89MCAP0\r\n" + bytes(200), "no MCAP file"),
     ],
 )
-def test_what_is_no_log_is_refused_by_name(tmp_path: Path, data: bytes, why: str) -> None:
+def test_a_file_that_is_no_log_is_refused_by_name(tmp_path: Path, data: bytes, why: str) -> None:
     path = tmp_path / "foreign.mcap"
     path.write_bytes(data)
     for command in ("info", "merge"):

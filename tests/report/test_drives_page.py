@@ -86,7 +86,7 @@ def test_outcomes_modes_and_verdicts_over_all_drives(page: Path) -> None:
     assert item(document, "Verdicts", "Of each")["rows"][0] == ["aaa", "gnss", "10 consistent"]
 
 
-def test_what_is_no_file_of_rows_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_has_no_rows_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.parquet"
     write_rows(other, [{"t_s": 1.0}])
     call = ["report", "--out", str(tmp_path / "page.html")]

@@ -22,7 +22,7 @@ HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)"><!--'
 
 
 @pytest.mark.parametrize("content", [b"", b"t_s,lat\n" * 20, b"\x89MCAP0\r\n"])
-def test_what_is_no_log_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+def test_a_file_that_is_no_log_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     code, text = fusiond(path, "--out", tmp_path / "x.html")

@@ -63,7 +63,7 @@ def test_stretches_are_not_joined_in_the_spectrum() -> None:
     assert float(density.max()) < 1e-9
 
 
-def test_what_differs_from_the_defaults() -> None:
+def test_settings_that_differ_from_the_defaults() -> None:
     config = Config.model_validate(
         {
             "vehicle": "truck",

@@ -96,7 +96,7 @@ def test_a_job_that_raises_says_why(tmp_path: Path, capfd: pytest.CaptureFixture
     assert "ValueError: a mistake" in capfd.readouterr().err
 
 
-def test_it_can_be_waited_for_and_ended_in_the_middle(tmp_path: Path) -> None:
+def test_a_forked_job_can_be_awaited_and_cancelled(tmp_path: Path) -> None:
     def endless() -> None:
         _noted(tmp_path, 1)
         signal.pause()

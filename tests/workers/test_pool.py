@@ -29,7 +29,7 @@ def test_workers_stay_warm_with_one_thread() -> None:
         assert [o.result for o in pool.outcomes(threads, [0])] == ["1"]
 
 
-def test_what_goes_wrong_costs_its_own_item_alone() -> None:
+def test_a_failure_costs_only_its_own_item() -> None:
     items = ["a", "killed", "b", "crashed", "raises", "exit", "c"]
     with Pool(1) as pool:
         found = {items[o.index]: o for o in pool.outcomes(mishap, items, chunk=len(items))}
@@ -48,7 +48,7 @@ def test_what_goes_wrong_costs_its_own_item_alone() -> None:
     assert found["raises"].reason.startswith("ValueError: a mistake (jobs.py:")
 
 
-def test_what_never_ends_is_ended() -> None:
+def test_an_endless_item_is_killed() -> None:
     with Pool(1, timeout_s=0.25) as pool:
         found = list(pool.outcomes(mishap, ["endless", "endless"], chunk=2))
     assert [(o.index, o.ended, o.reason) for o in found] == [

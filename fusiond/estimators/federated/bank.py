@@ -117,10 +117,9 @@ def combine(
 ) -> bool:
     """Fuse the estimates `dxs` (k, n), `covs` (k, width, width) with `weight` (k,) above 0.
 
-    Of the states `order` (a,) it writes the scaled information w P^-1 (k + 1, a, a) and w P^-1 x
-    (k + 1, a), the last of each their sum, the `scale` (a,) of these, the fused covariance (a, a)
-    and estimate (a,), and the trace of each P over the squares of the scale. False if a covariance
-    is not positive definite: then nothing of it counts.
+    For the states `order` (a,) it writes the scaled information w P^-1 (k + 1, a, a) and w P^-1 x
+    (k + 1, a), the last their sum, their `scale` (a,), the fused covariance (a, a) and estimate
+    (a,), and each P's scaled trace. False, and void, if a covariance is not positive definite.
     """
     k, a = covs.shape[0], order.shape[0]
     work, sigma = np.empty((a, a)), np.empty((k, a))

@@ -85,7 +85,7 @@ def _no_heading(by: Basis) -> str:
 
 
 def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
-    """Samples that come at another rate than configured."""
+    """Reason for samples at another rate than configured."""
     first = imu.index_after(imu.latest_ns - COUNTED_NS)
     span_ns = imu.latest_ns - int(imu.times[first]) if first < imu.end else 0
     if span_ns < LEAST_COUNTED_NS:

@@ -1,4 +1,4 @@
-"""Checks of a start by the first motion: headings that were claimed, and how the IMU is mounted."""
+"""Checks of a start by the first motion: claimed headings, and the mounting of the IMU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COURSE_NS = 1_000_000_000
 
 
 class StartCheck:
-    """Watches a start; `refuted` says why it was a wrong one."""
+    """Check of a start; `refuted` is the reason why it was wrong."""
 
     def __init__(self, options: AlignmentOptions, start: Start) -> None:
         self._options = options

@@ -50,7 +50,8 @@ KINDS: tuple[Kind, ...] = (
 
 
 class Intake:
-    """Holds `aiding` by source name; a source without a section takes its kind's defaults.
+    """Intake of measurements, with `aiding` by source name; a source without a section has its
+    kind's defaults.
 
     `limits` are those of the vehicle's class; `report(code, text)` hears of a source that is too
     fast.

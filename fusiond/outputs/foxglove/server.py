@@ -7,9 +7,9 @@ a minute is disconnected, as is one that is gone without a word (`fusiond.output
 
 A browser says whose page connects (`Origin`): pages of this computer may, and those of `origins`.
 
-Source: Foxglove WebSocket Protocol v1 (`foxglove.websocket.v1`, and `foxglove.sdk.v1`, which is
-alike in what is used here): serverInfo, advertise, subscribe, unsubscribe; binary message data is
-opcode 1, subscription (u32), receive time (u64, ns), payload, little-endian.
+Source: Foxglove WebSocket Protocol v1 (`foxglove.websocket.v1`, and `foxglove.sdk.v1`, which is the
+same for this server): serverInfo, advertise, subscribe, unsubscribe; binary message data is opcode
+1, subscription (u32), receive time (u64, ns), payload, little-endian.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class FoxgloveServer:
     """The protocol at `host:port`. Counters: those of `TcpServer`; `skipped` are messages that were
     replaced by a newer one before they were sent; `subscriptions_refused`, `origins_refused`.
 
-    `on_event` hears `foxglove_origin_refused`, once a minute at most.
+    `on_event` receives `foxglove_origin_refused`, once a minute at most.
     """
 
     name = "foxglove"

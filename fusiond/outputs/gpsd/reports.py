@@ -1,8 +1,8 @@
-"""Reports of gpsd's protocol, made of the daemon's messages; no I/O.
+"""Reports of gpsd's protocol, built from the daemon's messages; no I/O.
 
 Units m, m/s, degrees; `climb` up, `velD` down; the errors of TPV at 95 %, those of GST one sigma.
-What is not known is left out: null and NaN are no part of the protocol. Nothing stands in TPV that
-gpsd 3.22 does not know, since its library discards the whole report for that.
+Unknown values are left out, since the protocol has neither null nor NaN. TPV has only fields of
+gpsd 3.22, whose library discards a report with any other.
 
 Source: gpsd_json(5) of gpsd 3.22; the order of keys is gpsd's own.
 """

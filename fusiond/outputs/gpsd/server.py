@@ -1,4 +1,4 @@
-"""Serves gpsd's clients in the place of gpsd: VERSION on connecting, reports to those who watch."""
+"""Server for gpsd's clients in place of gpsd: VERSION on connection, reports to watchers."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class _Asking:
 class GpsdServer:
     """gpsd's protocol at `host:port`. Counters: those of `TcpServer`, and `requests`, `malformed`.
 
-    `raw`, `pps` and `timing` are taken and answered, and nothing is sent for them: there is none.
+    `raw`, `pps` and `timing` are accepted, but nothing is sent for them.
     """
 
     name = "gpsd"

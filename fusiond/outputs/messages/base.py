@@ -1,7 +1,7 @@
 """Base of every message: the instant that it speaks of, null while the daemon knows no UTC.
 
-A quantity that is not known is `null` (NaN here). The bounds of quantities stand in the published
-schemas alone: the daemon makes its messages of what it has itself, and a NaN is within no bound.
+An unknown quantity is `null` (NaN here). Only the published schemas have bounds: the daemon builds
+messages from its own values, and NaN is within no bound.
 """
 
 from __future__ import annotations

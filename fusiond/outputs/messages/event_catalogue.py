@@ -65,7 +65,7 @@ DEVICES: Mapping[str, Entry] = {
     "error_warning": warning("The CAN controller counts errors.", "Check wiring and termination."),
     "error_active": info("The CAN controller works normally again."),
     "ntrip_starting": info("The NTRIP client connects."),
-    "ntrip_waiting": info("The caster waits for a position of the receiver."),
+    "ntrip_waiting": info("The caster needs a position of the receiver."),
     "ntrip_running": info("Corrections arrive from the NTRIP caster."),
     "ntrip_lost": warning(
         "Corrections no longer arrive.", "Check the network; the client reconnects."
@@ -98,14 +98,14 @@ RECEIVERS: Mapping[str, Entry] = {
         "Only GLL has a position: no height, large sigma.", "Switch on GGA, RMC and GST."
     ),
     "attitude_left_out": info(
-        "A receiver tells its heading in a sentence of its maker's alone.",
+        "A receiver sends its heading only in a proprietary sentence.",
         "Switch on THS or HDT at the receiver.",
     ),
     "compass_left_out": info(
         "Headings of a compass arrive on a receiver's port.",
         'Give it a source with driver = "compass".',
     ),
-    "bad_date": warning("RMC's date is not a date.", "Set the receiver's date."),
+    "bad_date": warning("The date in RMC is invalid.", "Set the receiver's date."),
     "integrated": info(
         "Positions come from a plotter or adapter, not from a receiver.",
         "Connect the receiver itself (talker GP or GN).",
@@ -130,7 +130,7 @@ TERMINAL: Mapping[str, Entry] = {
     ),
     "rdss_no_card": error("The terminal has no user card.", "Insert the card."),
     "rdss_no_beam": warning(
-        "The terminal hears no satellite.", "Give its antenna a free view to the equator."
+        "The terminal receives no satellite.", "Give its antenna a free view to the equator."
     ),
     "rdss_no_fixes": warning(
         "Several requests in a row brought no fix.",
@@ -178,7 +178,8 @@ MESSAGES: Mapping[str, Entry] = {
         "A message is from a later version.", "Update fusiond on this vehicle."
     ),
     "message_other_card": warning(
-        "A message for another card arrived.", "Nothing; tell the sender if it was meant for you."
+        "A message for another card arrived.",
+        "Nothing to do; if it was for you, inform the sender.",
     ),
     "messages_damaged": warning("The file of stored messages is damaged; it was set aside.", DISK),
     "messages_not_kept": warning("Messages cannot be stored over a restart.", DISK),
@@ -192,7 +193,7 @@ CLOCK: Mapping[str, Entry] = {
     ),
     "host_resumed": warning("The computer was suspended.", "Switch suspend off on a vehicle."),
     "system_clock_stepped": warning(
-        "The system clock was set; navigation goes on.", "Nothing to do."
+        "The system clock was set; navigation continues.", "Nothing to do."
     ),
 }
 
@@ -236,11 +237,11 @@ NAVIGATION: Mapping[str, Entry] = {
     ),
     "calibration_damaged": warning("The saved calibration is damaged; it was set aside.", DISK),
     "saved_state_refused": warning(
-        "The saved state is too old or not for this setup.", "Nothing to do: it aligns."
+        "The saved state is too old or of another setup.", "Nothing to do: alignment runs."
     ),
     "saved_state_damaged": warning("The saved state is damaged; it was set aside.", DISK),
     "warm_state_refused": warning(
-        "The state of the last run is not used.", "Nothing to do: it aligns."
+        "The state of the last run is not used.", "Nothing to do: alignment runs."
     ),
     "warm_state_damaged": warning("The state of the last run is damaged; it was set aside.", DISK),
     "warm_start_refused": warning(
@@ -253,7 +254,7 @@ NAVIGATION: Mapping[str, Entry] = {
     ),
     "readmitted": info("A source is used again."),
     "sensor_fault": error(
-        "A step of a sensor was corrected; navigation goes on.",
+        "A step of a sensor was corrected; navigation continues.",
         "Check mounting, temperature and wiring of the device.",
     ),
     "fault_over": info("A slow drift of a source ended; the solution was corrected."),
@@ -295,7 +296,7 @@ IMU: Mapping[str, Entry] = {
     ),
     "imu_stamp_ahead": warning("IMU stamps are ahead of later ones.", "Check the unit's clock."),
     "imu_time": warning("IMU stamps went back; alignment restarts.", "Check the unit's clock."),
-    "imu_axis_dead": warning("One IMU axis stands still.", "Check the DBC; replace the unit."),
+    "imu_axis_dead": warning("One IMU axis is stuck.", "Check the DBC; replace the unit."),
     "imu_sound": info("IMU samples are accepted again."),
     "imu_units": warning("IMU data are in another unit.", "Correct `gyro_unit` or `accel_unit`."),
     "imu_units_well": info("IMU rates fit the motion again."),
@@ -321,7 +322,7 @@ DAEMON: Mapping[str, Entry] = {
         "The new configuration has mistakes.", "Run `fusiond check`, then reload."
     ),
     "reload_fault": error("The reload failed.", BUG),
-    "injected": warning("A simulated fault is in force.", "Do not navigate by this solution."),
+    "injected": warning("A simulated fault is active.", "Do not navigate by this solution."),
     "injection_ended": info("The simulated fault ended."),
     "recording_started": info("Recording started."),
     "recording_stopped": info("Recording stopped."),

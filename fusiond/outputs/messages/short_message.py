@@ -18,8 +18,8 @@ Card = Annotated[
 class ShortMessage(Message):
     """Stage of one message: each change of one of ours, and each that comes, once.
 
-    Its time is that of the change. What a daemon that was killed could not tell any more it tells
-    when it is back: the same `serial` again is the same message.
+    Its time is that of the change. A report that a killed daemon could not publish follows after
+    its restart: the same `serial` marks the same message.
     """
 
     serial: Count = Field(description="grows with each; the same again says the same")

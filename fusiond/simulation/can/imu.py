@@ -21,7 +21,7 @@ SIM_IMU = CanImuOptions(
 
 
 class CanImu:
-    """Encodes samples; no bus and no clock. Raises `PermanentDriverError` for wrong options."""
+    """Encoder of samples; no bus and no clock. Raises `PermanentDriverError` for wrong options."""
 
     def __init__(self, options: CanImuOptions = SIM_IMU) -> None:
         self._encoder = CanEncoder(CanImuDecoder("imu", options), options.source_address)

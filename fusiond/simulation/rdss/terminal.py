@@ -54,7 +54,7 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions
 
 Carry = Callable[[int, TextRequest, float], None]
-"""Takes a message that has left: the sender's card, the message, the instant (s)."""
+"""Callback for a message that has left: the sender's card, the message, the instant (s)."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FOREIGN_USER = 242407

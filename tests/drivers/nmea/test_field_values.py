@@ -109,7 +109,7 @@ def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length:
     try:
         wanted = NMEAReader.parse(made(",".join([address, *printed])), validate=0)
     except NMEATypeError:
-        # Here an angle that is none raises as well: the field that raises there is found without it.
+        # Here an angle that is none raises as well: without it the other bad field is met.
         plain = [
             "" if text and (address[2:], k) in _ANGLES and dmm2ddd(text) == "" else text
             for k, text in enumerate(printed)
