@@ -37,7 +37,7 @@ class NmeaDriver(ReceiverDriver):
         return self._nmea.cause if self.counters["bytes_in"] else ""
 
     @property
-    def cautions(self) -> dict[str, str]:
+    def _decoder_cautions(self) -> dict[str, str]:
         """As `ReceiverDriver`."""
         return self._nmea.cautions
 

@@ -185,7 +185,9 @@ def test_what_the_unpacking_skips_is_told(tmp_path: Path) -> None:
     damaged.write_bytes(head + b"END OF HEADER" + b"\n".join(lines[:second]) + b"\n?\n")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found, lost = READERS["raw"](damaged, read_imu(standing(tmp_path / "imu.csv", FROM_S)), "raw")
+        found, lost = READERS["raw"](
+            damaged, read_imu(standing(tmp_path / "imu.csv", FROM_S)), "raw"
+        )
     assert found
     assert {each.reason for each in lost} & {"damaged", "file_cut"}
 
