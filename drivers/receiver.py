@@ -19,6 +19,7 @@ from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, Measurement, TimeReport
 from drivers.network_port import PortName, on_network, open_port
 from drivers.ntrip.client import NtripClient, NtripOptions
+from drivers.rate_search import ENOUGH_BYTES, RateSearch
 from drivers.raw.messages import NavigationMessage, RawEvent
 from drivers.serial_line import SerialLine
 
@@ -87,6 +88,7 @@ class ReceiverDriver:
         self.inputs.on("watch", self._on_watch)
         self._now_ns = self.inputs.now_ns
         self._line = SerialLine(options.port, options.baud, now_ns, open_port=open_port)
+        self._rates = RateSearch(options.baud)
         self._open = False
         self._reported: set[str] = set()
         """Cautions that have been an event."""
@@ -113,7 +115,22 @@ class ReceiverDriver:
     @property
     def cautions(self) -> dict[str, str]:
         """Cautions by counter: limits on the quality of fixes, and the actions taken."""
+        found, rates = self._decoder_cautions, self._rates
+        if rates.baud != rates.configured and self.status.state == "running":
+            return {**found, "baud_followed": self._other_rate()}
+        return found
+
+    @property
+    def _decoder_cautions(self) -> dict[str, str]:
+        """Cautions of what arrives."""
         return {}
+
+    def _other_rate(self) -> str:
+        rates = self._rates
+        return (
+            f"{self._port} makes sense at {rates.baud} baud, and not at {rates.configured} as "
+            "configured: it is read at that; correct baud, or set the receiver's rate"
+        )
 
     def _make_decoder(self) -> ReceiverDecoder:
         """Make the decoder, which counts in `self.counters`."""
@@ -188,6 +205,7 @@ class ReceiverDriver:
         self._hand_over(self._decoder.feed(data, t_seen_ns))
         if self._signs_of_life() > before:
             self._mark_alive()
+            self._rates.understood()
             self._set_state("running", self._running_detail())
 
     def _on_silence(self, _: None, t_ns: int) -> None:
@@ -214,9 +232,21 @@ class ReceiverDriver:
         if not self._open:
             self._set_state("absent", self._line.detail or self._why_closed)
         elif t_ns - self._alive_ns > self._timeout_s * 1e9:
-            self._set_state("silent", self._silent_detail())
+            detail = self._silent_detail()
+            self._set_state("silent", detail)
+            if detail.endswith(self._where_to_look()) and not on_network(self._port):
+                self._try_next_rate(t_ns)
         elif self.status.state == "running":
             self._set_state("running", self._running_detail())
+
+    def _try_next_rate(self, t_ns: int) -> None:
+        if self._since_alive("bytes_in") < ENOUGH_BYTES:
+            return
+        baud = self._rates.next(t_ns, self.counters["bytes_in"])
+        if baud is not None:
+            self.counters["bauds_tried"] += 1
+            self._reported.discard("baud_followed")
+            self._line.set_baud(baud)
 
     def _signs_of_life(self) -> int:
         return sum(self.counters[name] for name in self.alive_by)

@@ -84,7 +84,7 @@ class SolutionDriver(ReceiverDriver):
         return "" if f'driver = "{self.kind}"' in found else found
 
     @property
-    def cautions(self) -> dict[str, str]:
+    def _decoder_cautions(self) -> dict[str, str]:
         """Cautions, as in `ReceiverDriver`."""
         found: dict[str, str] = self._solutions.cautions
         return found

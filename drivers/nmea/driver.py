@@ -38,7 +38,7 @@ class NmeaDriver(ReceiverDriver):
         return self._nmea.cause if self.counters["bytes_in"] else ""
 
     @property
-    def cautions(self) -> dict[str, str]:
+    def _decoder_cautions(self) -> dict[str, str]:
         """Cautions, as in `ReceiverDriver`."""
         return self._nmea.cautions
 

@@ -290,7 +290,7 @@ class GnssDriver(ReceiverDriver):
         return ""
 
     @property
-    def cautions(self) -> dict[str, str]:
+    def _decoder_cautions(self) -> dict[str, str]:
         """Cautions, as in `ReceiverDriver`."""
         return self._gnss.cautions
 

@@ -26,16 +26,13 @@ from drivers.can.imu import CanImuDriver
 from drivers.measurements import ImuSample
 from drivers.nmea.compass import FORMATTERS
 from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
+from drivers.rate_search import BAUDS, LISTEN_NS
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.sbf.framing import BlockSplitter
 from drivers.serial_line import SerialLine
 from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
-BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_800)
-"""Baud rates to try, the most common ones first."""
-LISTEN_S = 2.2
-"""Listening time at each baud rate: two epochs of a 1 Hz receiver and the end of a third."""
 SOUND_ITEMS = 3
 """Correct checksums that identify a protocol: one in 256 random lines has a correct one."""
 TERMINAL_S = 25.0
@@ -135,7 +132,7 @@ def _kind(item: Sentence | Frame) -> str:
 
 
 async def device_on_port(
-    port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S
+    port: str, *, ask_terminal: bool, listen_s: float = LISTEN_NS * 1e-9
 ) -> Device | SilentPort:
     """Device on a serial port, or the reason why none is recognised.
 

@@ -144,7 +144,9 @@ class Series:
         unit."""
         self.failed += 1
         again = self.state is Service.PROBATION
-        if again or (self.failed >= REFUSED_IN_A_ROW and not explained):
+        if again:  # what was wrong comes again, so it is known why
+            self.exclude(t_ns, self.reason)
+        elif self.failed >= REFUSED_IN_A_ROW and not explained:
             self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns

@@ -6,6 +6,7 @@ import codecs
 import importlib
 import importlib.resources
 import subprocess
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -165,13 +166,21 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
             f"{install('rinex')}"
         ) from error
     try:
-        return str(hatanaka.decompress(data).decode("ascii", "replace")), []
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always")
+            text = str(hatanaka.decompress(data).decode("ascii", "replace"))
+        return text, [Rejection(0, "damaged", _said(doubt), 0) for doubt in doubts]
     except Exception as error:  # it hands on what zip, ncompress and crx2rnx raise
         text = _before_damage(data) if label == COMPRESSED_LABEL else ""
         if not text:
             raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
         why = str(error).partition(".")[0]
         return text, [Rejection(0, "file_cut", f"used up to the damage: {why}", 0)]
+
+
+def _said(doubt: warnings.WarningMessage) -> str:
+    """What the unpacking program has left out, in its words, on one line."""
+    return f"the unpacking says: {' '.join(str(doubt.message).split())}"
 
 
 def _before_damage(data: bytes) -> str:

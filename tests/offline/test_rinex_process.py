@@ -175,6 +175,23 @@ def test_a_cut_hatanaka_file_is_used_up_to_the_cut(tmp_path: Path, share: float)
         assert "up to the damage" in note.detail
 
 
+def test_what_the_unpacking_skips_is_told(tmp_path: Path) -> None:
+    """An epoch line whose differences nobody can follow: no Python warning, a line of the file's
+    account."""
+    head, _, epochs = gzip.decompress(OBSERVATIONS.read_bytes()).partition(b"END OF HEADER")
+    lines = epochs.split(b"\n")
+    second = next(k for k, line in enumerate(lines[2:], 2) if b">" not in line and b"&" in line)
+    damaged = tmp_path / "damaged.crx"
+    damaged.write_bytes(head + b"END OF HEADER" + b"\n".join(lines[:second]) + b"\n?\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, lost = READERS["raw"](
+            damaged, read_imu(standing(tmp_path / "imu.csv", FROM_S)), "raw"
+        )
+    assert found
+    assert {each.reason for each in lost} & {"damaged", "file_cut"}
+
+
 def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
     """The first of each satellite and message at the start, the others not before their time."""
     imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))

@@ -84,6 +84,10 @@ RECEIVERS: Mapping[str, Entry] = {
     "implausible_date": warning(
         "The receiver's date cannot be right.", "Update the receiver's firmware."
     ),
+    "baud_followed": warning(
+        "The receiver sends at another baud rate; it is read at that.",
+        "Correct `baud`, or set the receiver's rate.",
+    ),
     "checksum_missing": info("Sentences without a checksum are rejected.", "Switch checksums on."),
     "height_above_sea": info(
         "The receiver gives no geoid separation; sigma is 62 m.",
