@@ -68,7 +68,7 @@ class Aligner:
         self._journal = Journal(on_event)
         self._news, self._said = True, -1
         """True if anything has come since the reason was said, and when (`SAID_NS`) that was."""
-        self._basis = Basis(options, noise, model, saved, self.known, self._track)
+        self._basis = Basis(options, model, saved, self.known, self._track)
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """Receive the aiding measurements of one device measurement."""

@@ -13,11 +13,15 @@ from fusiond.navigator.saved_state import SavedState
 
 
 class Basis(NamedTuple):
-    """Options, the IMU's noise, the filter's model, the saved state, what has come in."""
+    """Options, the filter's model, the saved state, what has come in."""
 
     options: AlignmentOptions
-    noise: ImuNoise
     model: Model
     saved: SavedState | None
     known: AlignmentEvidence
     track: Track
+
+    @property
+    def noise(self) -> ImuNoise:
+        """Of the inertial unit, as far as it has been seen."""
+        return self.known.noise

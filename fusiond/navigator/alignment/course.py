@@ -161,6 +161,7 @@ def _moved_off(
     sd = by_course.sd * sd_sensed_angle / math.hypot(by_course.sd, sd_sensed_angle)
     yaw = math.atan2(velocity.v_ned[1], velocity.v_ned[0]) - angle
     at_rest = dcm_from_rpy(*level(standstill.mean_force), yaw - turned)
+    bias = rest_bias(by.noise, standstill, at_rest, lat)
     return _build(
         by,
         imu,
@@ -171,11 +172,12 @@ def _moved_off(
         rate,
         "GNSS course" + (BACKWARD if backward else ""),
         (
-            rest_bias(by.noise, standstill, at_rest, lat),
+            bias,
             Levelled(
                 at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)
             ),
         ),
+        grades=by.known.grades(standstill, *bias, g),
     )
 
 
@@ -345,6 +347,7 @@ def _build(
     how: str,
     rested: tuple[tuple[Array, float], Levelled] | None = None,
     fitted: Fitted | None = None,
+    grades: Array | None = None,
 ) -> Start:
     """With the antenna's velocity taken to the body; `rested`: bias and level of a standstill."""
     bias, levelled = (None, None) if rested is None else rested
@@ -370,4 +373,5 @@ def _build(
         fitted=fitted,
         unexplained=by.known.unexplained,
         moves=Moves(candidate, rate, acceleration),
+        grades=by.known.unrested_grades if grades is None else grades,
     )
