@@ -9,6 +9,10 @@ one in `WRONG`, else any that is larger, each octave as likely as the next.
 Classes lie on a ladder: a unit whose gyros have biases between those of two has the other errors
 between theirs too, by logarithm. What it is worse than its sheet says, it is in all of them.
 
+On the move biases come out of a fit (fusiond.navigator.alignment.motion_fit), with those of its
+class as a prior: there a worse class is taken where its fit is better by more than what makes it
+likelier.
+
 Source: Berger, Robust Bayesian analysis: sensitivity to the prior, J. Stat. Plan. Inference 25
 (1990), 303 (a contaminated class of priors).
 """
@@ -64,6 +68,24 @@ def widened(noise: ImuNoise, grade: float) -> ImuNoise:
         there = math.exp(float(np.interp(math.log(bias), biases, values)))
         found[name] = max(getattr(noise, name), there)
     return replace(noise, **{**found, "rate_bias_initial": bias})
+
+
+def worse_classes(noise: ImuNoise) -> list[ImuNoise]:
+    """Units as bad as each class whose gyros are worse, the best first."""
+    bias = noise.rate_bias_initial
+    return [
+        widened(noise, (each.rate_bias_initial / bias) ** 2)
+        for each in _ladder()
+        if each.rate_bias_initial > bias
+    ]
+
+
+def evidence_against(noise: ImuNoise, worse: ImuNoise) -> float:
+    """By how much lower (chi-square) a fit of biases must be with those of a worse unit for it to
+    be likelier: one unit in `WRONG` is, and it spreads its biases over so much more."""
+    rate = math.log(worse.rate_bias_initial / noise.rate_bias_initial)
+    force = math.log(worse.force_bias_initial / noise.force_bias_initial)
+    return 2.0 * (math.log(WRONG) + 3.0 * rate + 3.0 * force)
 
 
 def grades_of(noise: ImuNoise, sheet: ImuNoise, misalignment_rad: float) -> Array:

@@ -51,6 +51,7 @@ from fusiond.navigator.alignment.start import (
     velocity_of,
 )
 from fusiond.navigator.reasons import reason
+from fusiond.navigator.sensor_ladder import evidence_against, worse_classes
 
 Array = NDArray[np.float64]
 
@@ -295,9 +296,19 @@ def _on_the_move(
     delay_v = _sd_delay_s(by, velocity)
     m, g = sensed_motion.measured(usable, sensed_motion.MOST_FIXES), gravity(lat, height)
     either = ways(imu, m, usable[-1], by.options, by.noise, g, delay_v)
-    rate = either.sensed.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
+    for worse in worse_classes(by.noise):
+        beyond = evidence_against(by.noise, worse)
+        if best.cost - best.degrees <= beyond:
+            break
+        other = ways(imu, m, usable[-1], by.options, worse, g, delay_v)
+        fits = other.fit(backward=False), other.fit(backward=True)
+        better = min(fits, key=lambda x: x.cost)
+        if best.cost - better.cost > beyond:
+            by.known.noise, either, best = worse, other, better
+            forward_fit, backward_fit = fits
+    rate = either.sensed.rates[-1]
     # Where even the better fit is poor, the sigmas are too small by as much.
     doubt = max(1.0, best.cost / best.degrees)
     ratio = 0.5 * (backward_fit.cost - forward_fit.cost) / doubt
