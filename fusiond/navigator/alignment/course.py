@@ -298,7 +298,7 @@ def _on_the_move(
     either = ways(imu, m, usable[-1], by.options, by.noise, g, delay_v)
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
-    for worse in worse_classes(by.noise):
+    for worse in () if by.known.judged_at_rest else worse_classes(by.noise):
         beyond = evidence_against(by.noise, worse)
         if best.cost - best.degrees <= beyond:
             break

@@ -346,6 +346,11 @@ class AlignmentEvidence:
             self.unexplained[self.unexplained < BIAS_SIGMAS * self.noise.rate_bias_initial] = 0.0
 
     @property
+    def judged_at_rest(self) -> bool:
+        """True if rates at rest have told whether the unit is as its sheet says."""
+        return self._longest_run > 1
+
+    @property
     def unrested_grades(self) -> Array:
         """Grades (13,) of a unit whose errors were not seen at rest."""
         if self.noise is self._sheet:
