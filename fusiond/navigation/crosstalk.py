@@ -1,4 +1,6 @@
-r"""Noise equivalent of sensor-axis non-orthogonality while the vehicle turns and accelerates.
+r"""Noise equivalent of sensor-axis errors without states, while the vehicle turns and accelerates.
+
+Axes that are not square:
 
     e_i = sum m_ij w_j,   d_i = sum n_ij f_j,   j other than i,   m_ij, n_ij ~ N(0, m^2)
 
@@ -25,7 +27,21 @@ Rates and forces are smoothed: shaking turns and moves the vehicle nowhere. Stat
 third parameter of each axis in the kernels; what is measured with this noise stands in
 docs/vehicle.md.
 
-Source: Groves, 2nd ed., section 4.4.2 (cross-coupling errors).
+Scale factors, of a model that has no states for them:
+
+    e_i = s_i w_i,   d_i = k_i f_i,   s_i ~ N(0, s^2), k_i ~ N(0, k^2)
+
+A bend of angle Theta about an axis leaves s Theta of attitude about it, a change V of the velocity
+along an axis k V; the bend back, or the stop, takes it away again. A filter without states for them
+takes it for white noise that adds as much in a bend, or in that part V' of a stop that a filter
+which gets fixes takes together:
+
+    density of e_i = s^2 Theta |w_i|,   of d_i = k^2 V' |f_i|
+
+w and f less their means, which are biases and gravity: what k makes of gravity is a bias. Bends the
+same way round add up to more than this says, and there and back to less.
+
+Source: Groves, 2nd ed., section 4.4.2 (cross-coupling and scale factor errors).
 """
 
 from __future__ import annotations
@@ -52,7 +68,7 @@ MEAN_S = 60.0
 """The mean force is gravity, the mean rate a bias: a vehicle speeds up and brakes in a minute."""
 
 
-@compiled("void(f8[:, ::1], f8, f8, f8, f8, f8, f8[::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], f8, f8, f8, f8, f8, f8, f8, f8[::1], f8[:, ::1], f8[:, ::1])")
 def _follow(
     samples: Array,
     gain: float,
@@ -60,11 +76,15 @@ def _follow(
     of_rates: float,
     along_up: float,
     across_up: float,
+    rate_scale: float,
+    force_scale: float,
     mean: Array,
     out: Array,
+    scaled: Array,
 ) -> None:
-    """Add to `out` (m, 6) the density after each of `samples` (m, 6). `mean` (13,) persists from
-    call to call: smoothed rates and forces, their means, and the number of samples."""
+    """Add to `out` (m, 6) the density after each of `samples` (m, 6) by axes out of square, to
+    `scaled` (m, 6) that by scale factors. `mean` (13,) persists from call to call: smoothed rates
+    and forces, their means, and the number of samples."""
     for i in range(samples.shape[0]):
         mean[12] += 1.0
         fast, slow = max(gain, 1.0 / mean[12]), max(slow_gain, 1.0 / mean[12])
@@ -72,6 +92,8 @@ def _follow(
         for axis in range(6):
             mean[axis] += fast * (samples[i, axis] - mean[axis])
             mean[6 + axis] += slow * (samples[i, axis] - mean[6 + axis])
+            factor = rate_scale if axis < 3 else force_scale
+            scaled[i, axis] += factor * abs(mean[axis] - mean[6 + axis])
         for axis in range(3):
             along += (mean[axis] - mean[6 + axis]) * mean[9 + axis]
             square += mean[9 + axis] * mean[9 + axis]
@@ -92,15 +114,24 @@ def _follow(
 
 
 class Crosstalk:
-    """Noise equivalent of crosstalk for samples `period_s` apart; `misalignment_rad` is m."""
+    """Noise equivalent of crosstalk and of scale factors without states for samples `period_s`
+    apart; `misalignment_rad` is m, `rate_scale` and `force_scale` one sigma of scale factors."""
 
-    def __init__(self, period_s: float, misalignment_rad: float) -> None:
+    def __init__(
+        self,
+        period_s: float,
+        misalignment_rad: float,
+        rate_scale: float = 0.0,
+        force_scale: float = 0.0,
+    ) -> None:
         self._gain = 1.0 - math.exp(-period_s / SMOOTH_S)
         self._slow_gain = 1.0 - math.exp(-period_s / MEAN_S)
         square = misalignment_rad**2
         self._times = (
             *(square * BEND_RAD, 2.0 * square * STOP_M_S),
             0.5 * square * WITHIN_FIXES_M_S,
+            rate_scale**2 * BEND_RAD,
+            force_scale**2 * WITHIN_FIXES_M_S,
         )
         self._mean = np.zeros(13)
         self.squares = FromInstants()
@@ -110,7 +141,8 @@ class Crosstalk:
         """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) at `times`
         (m,) ns to `densities` (m, 6)."""
         found = np.zeros_like(densities)
-        _follow(samples, self._gain, self._slow_gain, *self._times, self._mean, found)
+        gains = self._gain, self._slow_gain
+        _follow(samples, *gains, *self._times, self._mean, found, densities)
         for rows, square in self.squares.rows(times):
             found[rows] *= square
         densities += found

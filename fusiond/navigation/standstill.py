@@ -2,9 +2,11 @@ r"""Standstill detector: the sensor is quiet over a window.
 
 Over the samples of a window of the IMU (about 1 s), per axis,
 
-    s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |mean w| < c
+    s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |u mean w| < c
 
-and if the mean force is that of the rest's first window, to within b: a smooth start is not rest.
+u the direction of the mean force, and if that force is what the rest's first window had, to within
+b: a smooth start is not rest, and what turns about a level axis takes gravity along, so that rates
+about those are biases, however large.
 An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
 vehicle and stand in its configuration. Windows lie on a fixed grid of time, so the verdict is a
 function of the samples alone, however they were handed over.
@@ -14,6 +16,8 @@ T-BME 57 (2010), the moving-variance and rate-energy detectors.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +38,8 @@ LONGEST_RUN = 10
 
 @immutable()
 class QuietLimits:
-    """Upper limits: standard deviations per axis and mean rate, SI units; the window in ns."""
+    """Upper limits: standard deviations per axis and mean rate about the vertical, SI units; the
+    window in ns."""
 
     window_ns: int
     rate_sd: float
@@ -121,6 +126,12 @@ def next_cell(times: NDArray[np.int64], first: int, end: int, width_ns: int, cel
     return -1
 
 
+def _about(rate: list[float], force: list[float]) -> float:
+    """Size of the part of a rate (3,) about the axis of a force (3,)."""
+    along = sum(w * f for w, f in zip(rate, force, strict=True))
+    return abs(along) / max(math.hypot(*force), 1e-9)
+
+
 class StandstillDetector:
     """Detector of standstills; it divides the samples into windows on a fixed grid and judges each
     once."""
@@ -162,7 +173,7 @@ class StandstillDetector:
             end - first >= FEWEST_SAMPLES
             and max(rate_sd) < limits.rate_sd
             and max(force_sd) < limits.force_sd
-            and max(map(abs, mean_rate)) < limits.mean_rate
+            and _about(mean_rate, mean_force) < limits.mean_rate
         )
         if quiet and self._reference is not None:
             both = zip(mean_force, self._reference, strict=True)

@@ -25,7 +25,6 @@ from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.scale_noise import ScaleNoise
 from fusiond.navigation.vibration import Vibration
 
 if TYPE_CHECKING:
@@ -113,9 +112,9 @@ def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
     for."""
     imu, noise = config.imu, imu_noise(config.imu)
     period_s, misalignment = 1.0 / imu.rate_hz, imu.misalignment_deg * DEG
-    crosstalk = Crosstalk(period_s, misalignment) if misalignment else None
-    if not model.scale_factors:
-        crosstalk = ScaleNoise(period_s, misalignment, noise.rate_scale, noise.force_scale)
+    left_out = (0.0, 0.0) if model.scale_factors else (noise.rate_scale, noise.force_scale)
+    any_noise = misalignment > 0.0 or not model.scale_factors
+    crosstalk = Crosstalk(period_s, misalignment, *left_out) if any_noise else None
     return ImuBuffer(
         imu.rate_hz,
         config.estimator.buffer_s,

@@ -49,9 +49,12 @@ TYPED = (SIDE_DRIFT, WHEEL_DRIFT, DISTURBANCE)
 GRID: Final = 4.0 ** np.arange(-3.0, 0.1, 0.25)
 """Levels: the full variance, down to an eighth of the sigma."""
 FIRST = 6.0
-"""Prior weight of the full variance, in instants (a minute): a filter that was too sure of its
-course once stays so, and slip comes with bends, of which a street has one a minute. With two a
-calibrated `drive_0708` had one false isolation more, just before an outage."""
+"""Instants, a minute of them, that it counts that all of it is there: a filter that has once been
+too sure of its course stays so, and slip comes with bends, of which a street has one a minute. It
+is a choice after results: log likelihoods of estimates 20 s ahead, summed over `drive_0708`,
+`css_164` and four simulated drives, are above those of a full level by 34 with six, 56 with two and
+68 with one. But with one or two a calibrated `drive_0708` has a false isolation more, just before
+an outage, and a heading that was lost in silent bends is found by no slip."""
 FORGETS = 180.0
 """Instants after which old ones are forgotten, half an hour: loads, tyres and roads change."""
 MOVES_M_S = 2.0

@@ -19,6 +19,7 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.drift_levels import DriftLevels
 from fusiond.navigator.noise_share import COUNTS_NS, EVERY_NS, NoiseShares
 from fusiond.navigator.timeline import Timeline
@@ -39,7 +40,8 @@ class ImuNoise:
         self._unit = UnitGrade(model) if of_class else None
         self._grade = self._unit
         """Grade of the unit; None without evidence of its quality."""
-        self._axes_sd_rad = imu.misalignment_deg * DEG
+        self._square_rad2 = self._sheet_rad2 = (imu.misalignment_deg * DEG) ** 2
+        """Variance of the angles by which axes of its class are out of square, and its sheet's."""
         self._cell = self._at_ns = -1
 
     @property
@@ -61,6 +63,15 @@ class ImuNoise:
         self._cell = self._at_ns = -1
         self._grade = self._unit
 
+    def started(self, start: Start, estimator: Estimator, imu: ImuBuffer) -> None:
+        """The filter has been started: its unit counts as good as it was at rest."""
+        if self._grade is None:
+            return
+        self._grade.begin(start.grades)
+        axes = float(start.grades[-1])
+        self._square_rad2 = max(axes, 1.0) * self._sheet_rad2
+        self._count(estimator, imu, start.t_ns, min(axes, 1.0))
+
     def change(self) -> None:
         """The samples from now on are a spare's: nothing tells how good the one or the other is."""
         self._unit = None
@@ -70,7 +81,7 @@ class ImuNoise:
         """A fault was taken out of the state: what is left of it is no error of a good unit's axes,
         which are those of its class until it aligns anew."""
         if self._grade is not None and isinstance(estimator, KalmanEstimator):
-            estimator.axes_known(self._axes_sd_rad)
+            estimator.axes_known(math.sqrt(self._square_rad2))
         self._grade = None
 
     def look(self, timeline: Timeline, imu: ImuBuffer) -> None:
@@ -97,7 +108,13 @@ class ImuNoise:
                 self._shares.begin(e)
         if shares is not None:
             vibration.shares.add(at_ns + COUNTS_NS, shares)
-        if self._grade is not None and imu.crosstalk is not None:
-            imu.crosstalk.squares.add(at_ns + COUNTS_NS, np.array([grade]))
-            if isinstance(timeline.estimator, KalmanEstimator):
-                timeline.estimator.axes_known(math.sqrt(grade) * self._axes_sd_rad)
+        if self._grade is not None:
+            self._count(timeline.estimator, imu, at_ns, grade)
+
+    def _count(self, estimator: Estimator, imu: ImuBuffer, at_ns: int, grade: float) -> None:
+        """Axes are of that grade within the class, as found at `at_ns`."""
+        square = grade * self._square_rad2
+        if imu.crosstalk is not None:
+            imu.crosstalk.squares.add(at_ns + COUNTS_NS, np.array([square / self._sheet_rad2]))
+        if isinstance(estimator, KalmanEstimator):
+            estimator.axes_known(math.sqrt(square))

@@ -298,6 +298,7 @@ class Navigator:
             if isinstance(self.estimator, InvariantFilter):
                 self.estimator.turns = start.turns
             self.timeline.start(start.used)
+            self._imu_noise.started(start, self.estimator, self.imu)
             self.verdicts.reset()
             self.started = start
             self._start_check = StartCheck(alignment_options(self.config), start)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.navigation.crosstalk import STOP_M_S, WITHIN_FIXES_M_S
-from fusiond.navigation.scale_noise import ScaleNoise
+from fusiond.navigation.crosstalk import STOP_M_S, WITHIN_FIXES_M_S, Crosstalk
 from fusiond.navigator.navigator import Navigator
 
 PERIOD_S, G = 0.02, 9.8
@@ -22,7 +21,7 @@ def left(samples: np.ndarray, chunk: int = 1 << 20) -> np.ndarray:
     """One sigma (6,) of what it adds over `samples`, behind two minutes at rest."""
     said = np.vstack((REST, samples))
     out, times = np.zeros_like(said), np.arange(len(said)) * round(PERIOD_S * 1e9)
-    noise = ScaleNoise(PERIOD_S, 0.0, RATE_SCALE, FORCE_SCALE)
+    noise = Crosstalk(PERIOD_S, 0.0, RATE_SCALE, FORCE_SCALE)
     for start in range(0, len(said), chunk):
         part = slice(start, start + chunk)
         noise.follow(times[part], said[part], out[part])
@@ -60,6 +59,25 @@ def test_biases_and_gravity_are_none_of_it_and_chunks_do_not_count() -> None:
 
 @pytest.mark.parametrize(("model", "noisy"), [("ins15", True), ("ins20", True), ("ins21", False)])
 def test_a_model_with_states_for_them_has_no_such_noise(model: str, noisy: bool) -> None:
+    """Of the configuration's default the axes are square."""
     navigator = Navigator(Config.model_validate({"estimator": {"model": model}}))
-    assert isinstance(navigator.imu.crosstalk, ScaleNoise) is noisy
+    assert (navigator.imu.crosstalk is not None) is noisy
     assert navigator.model.scale_factors is not noisy
+
+
+def test_one_mean_serves_axes_out_of_square_and_scale_factors() -> None:
+    """Together they add what each adds alone; a grade of the axes is none of the scale factors."""
+    samples = np.vstack((REST, bend(0, 0.4, 4.0)))
+    times = np.arange(len(samples)) * round(PERIOD_S * 1e9)
+
+    def added(misalignment: float, scales: tuple[float, float], square: float) -> np.ndarray:
+        out = np.zeros_like(samples)
+        noise = Crosstalk(PERIOD_S, misalignment, *scales)
+        noise.squares.add(0, np.array([square]))
+        noise.follow(times, samples, out)
+        return out
+
+    both = added(3e-3, (RATE_SCALE, FORCE_SCALE), 0.25)
+    alone = added(3e-3, (0.0, 0.0), 0.25) + added(0.0, (RATE_SCALE, FORCE_SCALE), 1.0)
+    assert both == pytest.approx(alone, rel=1e-12)
+    assert added(3e-3, (0.0, 0.0), 0.25) == pytest.approx(0.25 * added(3e-3, (0.0, 0.0), 1.0))

@@ -2,7 +2,7 @@
 
 At one speed straight on nothing tells a lever arm from the place, a roll from a bias of the lateral
 accelerometer, or the heading; without measurements, nothing tells a heading that was lost while the
-inertial unit was silent in a bend.
+inertial unit was silent in a bend. So it is for every estimator.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fusiond.configuration.schema import Config
 from fusiond.models.vehicle import ANTENNA_LEVER
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.receiver import GnssReceiver
+from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults.published import against, published
@@ -24,9 +26,11 @@ from fusiond.studies.faults.scenes import CODE, RTK, Receiver, Vehicle, drawing,
 
 Array = NDArray[np.float64]
 
-STRAIGHT_S, END_S = 40.0, 160.0
+STRAIGHT_S, END_S = 40.0, 100.0
+REST_S = 45.0
 SILENT_S, BEND_RAD_S = 1.6, 0.15
 DEG = 180.0 / np.pi
+ESTIMATORS = ("kalman", "unscented", "federated", "multiscale")
 
 
 def _straight(duration_s: float) -> Path:
@@ -34,18 +38,32 @@ def _straight(duration_s: float) -> Path:
     return follow(legs, duration_s, course_deg=30.0)
 
 
-@pytest.mark.parametrize("receiver", [RTK, CODE])
-def test_straight_on_lever_roll_and_heading_stay_as_they_were(receiver: Receiver) -> None:
-    vehicle = Vehicle("consumer", receiver, lever_given=False)
-    config = vehicle.config()
+def _config(estimator: str, receiver: Receiver, **sections: object) -> Config:
+    told = Vehicle("consumer", receiver, lever_given=False).config()
+    own = {**told.model_dump(exclude_unset=True), **sections}
+    return Config.model_validate({**own, "estimator": {"model": "ins21", "filter": estimator}})
+
+
+def _recorded(config: Config, receiver: Receiver, end_s: float) -> tuple[Recording, Truth]:
+    """The straight, of an antenna of which nothing is said."""
     car = replace(SCENARIOS["drive"], path=_straight).fitted(config)
-    truth = car.truth(END_S)
+    truth = car.truth(end_s)
     sensed = car.imu_output(truth, drawing("looked", 0, 1))
-    options = replace(vehicle.receiver.options, lever_arm_m=(0.5, -0.4, -1.2))
+    options = replace(receiver.options, lever_arm_m=(0.5, -0.4, -1.2))
     fixes = gnss_fixes(GnssReceiver(truth, options, drawing("looked", 0, 2)))
     stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
     samples = np.hstack((sensed.gyro, sensed.accel))
-    recording = Recording(stamps, stamps, samples, ()).with_received(fixes)
+    return Recording(stamps, stamps, samples, ()).with_received(fixes), truth
+
+
+@pytest.mark.parametrize(
+    ("estimator", "receiver"), [("kalman", CODE), *((name, RTK) for name in ESTIMATORS)]
+)
+def test_straight_on_lever_roll_and_heading_stay_as_they_were(
+    estimator: str, receiver: Receiver
+) -> None:
+    config = _config(estimator, receiver)
+    recording, truth = _recorded(config, receiver, END_S)
     found: list[Array] = []
 
     def watch(navigator: Navigator) -> None:
@@ -60,9 +78,35 @@ def test_straight_on_lever_roll_and_heading_stay_as_they_were(receiver: Receiver
     against(config, recording, ticks, watch=watch)
     sigmas = np.array(found)
     print((sigmas.min(axis=0) / sigmas[0]).round(3), sigmas[0].round(4), sigmas[-1].round(4))
-    assert len(sigmas) > 1000
+    assert len(sigmas) > 500
     # What is learned of the roll gyro's bias tells how far the roll has gone since the bend.
     assert (sigmas.min(axis=0) > (0.95, 0.95, 0.95, 0.8, 0.95) * sigmas[0]).all()
+
+
+@pytest.mark.xfail(strict=True, reason="at rest a told heading shrinks by 4 % in 40 s, 13 % in 200")
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_at_rest_a_heading_that_was_told_stays_as_it_was_told(estimator: str) -> None:
+    """Five seconds at rest, and forty more: the rate that a phone's gyros feel of the Earth's is a
+    thousandth of their biases."""
+    alignment = {"heading": ["config"], "heading_deg": 30.0, "heading_sd_deg": 5.0}
+    config = _config(estimator, RTK, alignment=alignment)
+    car = replace(SCENARIOS["drive"], path=lambda s: follow((Leg(s),), s, course_deg=30.0))
+    truth = car.fitted(config).truth(REST_S)
+    sensed = car.fitted(config).imu_output(truth, drawing("looked", 0, 1))
+    fixes = gnss_fixes(GnssReceiver(truth, RTK.options, drawing("looked", 0, 2)))
+    stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
+    samples = np.hstack((sensed.gyro, sensed.accel))
+    recording = Recording(stamps, stamps, samples, ()).with_received(fixes)
+    found: list[float] = []
+
+    def watch(navigator: Navigator) -> None:
+        if navigator.started is not None:
+            found.append(float(navigator.estimator.covariance[2, 2]) ** 0.5)
+
+    against(config, recording, truth.at(np.arange(0.1, REST_S, 0.1)), watch=watch)
+    print(estimator, len(found), DEG * found[0], DEG * min(found))
+    assert len(found) > 300
+    assert min(found) > 0.98 * found[0]
 
 
 @pytest.mark.parametrize("number", [900, 901, 902])

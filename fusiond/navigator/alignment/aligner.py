@@ -70,7 +70,7 @@ class Aligner:
         self._news, self._said = True, -1
         """True if input has arrived since the last report, and the instant of that report
         (`SAID_NS`)."""
-        self._basis = Basis(options, noise, model, saved, self.known, self._track)
+        self._basis = Basis(options, model, saved, self.known, self._track)
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """Receive the aiding measurements of one device measurement."""

@@ -13,12 +13,15 @@ from fusiond.navigator.saved_state import SavedState
 
 
 class Basis(NamedTuple):
-    """Input of a start: options, the IMU's noise, the filter's model, the saved state, the
-    evidence."""
+    """Input of a start: options, the filter's model, the saved state, the evidence."""
 
     options: AlignmentOptions
-    noise: ImuNoise
     model: Model
     saved: SavedState | None
     known: AlignmentEvidence
     track: Track
+
+    @property
+    def noise(self) -> ImuNoise:
+        """Of the inertial unit, as far as it has been seen."""
+        return self.known.noise

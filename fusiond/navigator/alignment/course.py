@@ -51,6 +51,7 @@ from fusiond.navigator.alignment.start import (
     velocity_of,
 )
 from fusiond.navigator.reasons import reason
+from fusiond.navigator.sensor_ladder import evidence_against, worse_classes
 
 Array = NDArray[np.float64]
 
@@ -161,6 +162,7 @@ def _moved_off(
     sd = by_course.sd * sd_sensed_angle / math.hypot(by_course.sd, sd_sensed_angle)
     yaw = math.atan2(velocity.v_ned[1], velocity.v_ned[0]) - angle
     at_rest = dcm_from_rpy(*level(standstill.mean_force), yaw - turned)
+    bias = rest_bias(by.noise, standstill, at_rest, lat)
     return _build(
         by,
         imu,
@@ -171,11 +173,12 @@ def _moved_off(
         rate,
         "GNSS course" + (BACKWARD if backward else ""),
         (
-            rest_bias(by.noise, standstill, at_rest, lat),
+            bias,
             Levelled(
                 at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)
             ),
         ),
+        grades=by.known.grades(standstill, *bias, g),
     )
 
 
@@ -293,9 +296,19 @@ def _on_the_move(
     delay_v = _sd_delay_s(by, velocity)
     m, g = sensed_motion.measured(usable, sensed_motion.MOST_FIXES), gravity(lat, height)
     either = ways(imu, m, usable[-1], by.options, by.noise, g, delay_v)
-    rate = either.sensed.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
+    for worse in () if by.known.judged_at_rest else worse_classes(by.noise):
+        beyond = evidence_against(by.noise, worse)
+        if best.cost - best.degrees <= beyond:
+            break
+        other = ways(imu, m, usable[-1], by.options, worse, g, delay_v)
+        fits = other.fit(backward=False), other.fit(backward=True)
+        better = min(fits, key=lambda x: x.cost)
+        if best.cost - better.cost > beyond:
+            by.known.noise, either, best = worse, other, better
+            forward_fit, backward_fit = fits
+    rate = either.sensed.rates[-1]
     # Where even the better fit is poor, the sigmas are too small by as much.
     doubt = max(1.0, best.cost / best.degrees)
     ratio = 0.5 * (backward_fit.cost - forward_fit.cost) / doubt
@@ -345,6 +358,7 @@ def _build(
     how: str,
     rested: tuple[tuple[Array, float], Levelled] | None = None,
     fitted: Fitted | None = None,
+    grades: Array | None = None,
 ) -> Start:
     """Start by the antenna's velocity in the body; `rested`: bias and level of a standstill."""
     bias, levelled = (None, None) if rested is None else rested
@@ -370,4 +384,5 @@ def _build(
         fitted=fitted,
         unexplained=by.known.unexplained,
         moves=Moves(candidate, rate, acceleration),
+        grades=by.known.unrested_grades if grades is None else grades,
     )

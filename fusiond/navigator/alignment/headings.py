@@ -12,7 +12,7 @@ import numpy as np
 
 from fusiond.aiding.candidates import HeadingCandidate
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
-from fusiond.navigation.earth import EARTH_RATE_RAD_S
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.basis import Basis
@@ -59,7 +59,8 @@ def _at_standstill(
         return None
     roll, pitch = level(standstill.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
-    wide = sd > PLAIN_CLAIM_RAD
+    lat, wide = float(place[1][0]), sd > PLAIN_CLAIM_RAD
+    bias = rest_bias(by.noise, standstill, dcm, lat, sd if wide else 0.0)
     start = build_start(
         by.model,
         standstill.end_ns,
@@ -69,9 +70,10 @@ def _at_standstill(
         np.zeros(3),
         REST_VELOCITY_SD,
         how,
-        bias=rest_bias(by.noise, standstill, dcm, place[1][0], sd if wide else 0.0),
+        bias=bias,
         levelled=Levelled(dcm),
         heading=candidate,
+        grades=by.known.grades(standstill, *bias, gravity(lat, float(place[1][2]))),
     )
     return turned_at_rest(by.model, start, place, dcm) if wide else start
 
@@ -152,6 +154,7 @@ def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         "gyrocompass",
         levelled=Levelled(dcm),
         compassed=True,
+        grades=by.known.unrested_grades,
     )
 
 

@@ -19,7 +19,7 @@ class AlignmentOptions:
     standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from
     the IMU to the point that does not slide, where it is known, `quiet_rad_s` and `quiet_m_s2` the
     standard deviations below which the sensor is quiet, `misalignment_rad` how far the axes are out
-    of square."""
+    of square, `graded` whether the unit is known by its class."""
 
     heading: tuple[str, ...]
     heading_rad: float | None
@@ -41,6 +41,7 @@ class AlignmentOptions:
     quiet_rad_s: float
     quiet_m_s2: float
     misalignment_rad: float
+    graded: bool
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
@@ -68,5 +69,6 @@ def alignment_options(config: Config) -> AlignmentOptions:
         quiet_rad_s=rest.gyro_sd_deg_s * DEG,
         quiet_m_s2=rest.accel_sd_m_s2,
         misalignment_rad=config.imu.misalignment_deg * DEG,
+        graded=config.imu.sensor_class is not None and config.imu.misalignment_deg > 0.0,
         max_reverse_m_s=math.inf if config.vehicle_class == "rail" else MAX_REVERSE_M_S,
     )

@@ -4,7 +4,7 @@ covariance."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +26,17 @@ from fusiond.navigation.earth import (
     meridian_radius,
     transverse_radius,
 )
-from fusiond.navigation.error_model import DR, DV, FORCE_ERROR, FORCE_SCALE, PHI, RATE_ERROR
+from fusiond.navigation.error_model import (
+    COLUMN_END,
+    DR,
+    DV,
+    FORCE_ERROR,
+    FORCE_SCALE,
+    PHI,
+    RATE_ERROR,
+)
 from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
+from fusiond.navigator.unit_grade import AS_ITS_CLASS
 
 Array = NDArray[np.float64]
 
@@ -128,6 +137,8 @@ class Start:
     contradicted: bool = False
     used: tuple[Candidate, ...] = ()
     confirmed: bool = True
+    grades: Array = field(default_factory=lambda: AS_ITS_CLASS)
+    """Of the unit (13,), with which its errors' priors count: fusiond.navigator.unit_grade."""
 
     @property
     def origin(self) -> str:
@@ -157,6 +168,7 @@ def build_start(
     unexplained: Array | None = None,
     moves: Moves | None = None,
     heading: HeadingCandidate | None = None,
+    grades: Array = AS_ITS_CLASS,
 ) -> Start:
     """Start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
@@ -166,7 +178,7 @@ def build_start(
     of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
     `sd_yaw` is then the least.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
-    `moves`: what the velocity was measured of, `heading`: the yaw.
+    `moves`: what the velocity was measured of, `heading`: the yaw. `grades`: of the unit (13,).
     """
     fix, where, sd_position, sd_height = place
     lat, height = float(where[0]), float(where[2])
@@ -179,6 +191,9 @@ def build_start(
     if model.hold_height and sd_height >= UNKNOWN_HEIGHT_SD_M:
         nav[2] = nav[5] = 0.0  # HELD_UNKNOWN_M tells it from a height
     p = np.diag(model.initial**2)
+    for column in range(RATE_ERROR, COLUMN_END):
+        for slot in model.parameters(column):
+            p[slot, slot] *= grades[column - RATE_ERROR]
     tilt_sd = MOTION_LEVEL_SD_RAD if levelled is None else levelled.sd
     p[0, 0] = p[1, 1] = tilt_sd**2
     p[2, 2] = sd_yaw**2
@@ -206,7 +221,8 @@ def build_start(
     made_of = fix, moves.candidate if moves is not None else None, heading
     used = tuple(candidate for candidate in made_of if candidate is not None)
     confirmed = not how.endswith(BACKWARD)
-    return Start(t_ns, nav, xi, by @ p @ by.T, how, used=used, confirmed=confirmed)
+    covariance = by @ p @ by.T
+    return Start(t_ns, nav, xi, covariance, how, used=used, confirmed=confirmed, grades=grades)
 
 
 def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
@@ -296,7 +312,8 @@ def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Star
     by_turn = np.eye(len(start.xi))
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
-        taken = 1.0 - float(start.covariance[slot, slot] / model.initial[slot] ** 2)
+        prior = start.grades[axis] * model.initial[slot] ** 2
+        taken = 1.0 - float(start.covariance[slot, slot] / prior)
         rate = EARTH_RATE_RAD_S * math.cos(float(place[1][0])) * float(dcm[1, axis])
         by_turn[slot, PHI + 2] = taken * rate
     p = by_turn @ start.covariance @ by_turn.T
