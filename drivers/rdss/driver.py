@@ -221,7 +221,7 @@ class RdssDriver:
         self._wake.set()
 
     def report_stages(self, t_ns: int) -> None:
-        """Hand over where messages are that have come further."""
+        """Report the stages of messages that have progressed."""
         for change in self.outbox.take_changes():
             m = change.message
             wording = m.wordings[0]

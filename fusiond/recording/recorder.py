@@ -115,7 +115,7 @@ class Recorder:
             self.state = "waiting"
 
     def begin(self, restored: Mapping[str, Any] | None = None) -> str:
-        """Record from now on; the file's name. Raises `RecordingRefusedError`.
+        """Start recording; the file's name. Raises `RecordingRefusedError`.
 
         `restored` is None for a recording that starts during a run.
         """

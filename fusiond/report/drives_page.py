@@ -32,7 +32,7 @@ MOST_PLOTS = 12
 
 
 class Shown(NamedTuple):
-    """A figure of a row: its column, how it is called, its unit, what good looks like."""
+    """Figure of a row: column, title, unit and reference value."""
 
     column: str
     title: str

@@ -53,7 +53,7 @@ class PtyLine:
         self._master = None
 
     def _open_by_host(self) -> bool:
-        """Linux reports a hang-up on the master while no slave is open."""
+        """True while the host has the slave open; else Linux reports a hang-up on the master."""
         return self._master is not None and not self._hangup.poll(0)
 
     def read(self) -> bytes:

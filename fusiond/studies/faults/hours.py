@@ -81,7 +81,7 @@ MOTORWAY_LEGS = (
 
 
 def around(legs: tuple[Leg, ...], duration_s: float) -> Path:
-    """The legs, over and over."""
+    """Legs of the circuit, repeated."""
     rounds = int(duration_s / sum(leg.duration_s for leg in legs)) + 1
     return follow((Leg(REST_S), *legs * rounds), duration_s, course_deg=40.0, bank_ratio=-0.08)
 

@@ -93,7 +93,7 @@ def _recursions_for(width: int) -> Callable[..., None]:
 
 
 def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
-    """A function that times the recursion of a model: CPU seconds of one."""
+    """Function that measures the CPU time of one recursion of a model."""
     nav = flight.true_nav(flight.truth(float(LIVE_S)))[1]
     scene = flight.scenes(float(LIVE_S), all_in_view)[0]
     state = State(nav, np.zeros(of.size), np.zeros(STEP_SIZE), of)
