@@ -44,11 +44,14 @@ WHITE: dict[str, Any] = {"bias_sd_m": 0.0, "time_offset_sd_s": 0.0, "lever_arm_s
 """Of a receiver: the simulated one's errors are white, and the papers' models have no others."""
 AS_TAKEN: dict[str, Any] = {
     "ionosphere_sd": 0.5,
+    "ionosphere_local_sd": 0.15,
+    "ionosphere_as_broadcast": True,
     "wet_delay_sd_m": 0.12,
     "signal_in_space_sd_m": 0.6,
 }
 """A sky that errs as the daemon takes it to (`fusiond.gnss.plan`): orbits, clocks, and what models
-leave of ionosphere and troposphere. That of `Scenario` is a better one."""
+leave of ionosphere and troposphere: half of what is broadcast, and 0.3 of that from satellite to
+satellite. That of `Scenario` is a better one, but for models that are a third off."""
 NO_SCALES = {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}
 """Of an inertial unit whose model has no states for scale factors, as the papers' have none."""
 
