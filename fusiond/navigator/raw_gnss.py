@@ -415,7 +415,7 @@ class RawGnss:
         covariance = axes.T @ found.covariance @ axes
         n, e, d = np.sqrt(np.diag(covariance)).tolist()
         lever = self._section.lever_arm_m
-        # Its errors last: the ranges that follow have them, and prove none of it.
+        # Its errors last: the ranges that follow have them, and are no proof of it.
         shape = Displacement.of(found.rows, 0.0, found.rows.lasting).shape.tolist()
         share = tuple(tuple(row) for row in shape)
         of = (n, e, d), lever, RANGE_BIAS, "", "", share
