@@ -2,9 +2,9 @@
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
-of errors that all measurements of the device share; `bias_share` is what
-part of a state of `bias` there is in each axis, `markov_m` how many metres of `markov` north and
-east.
+of errors that all measurements of the device share; row i of `bias_share`
+has what a unit of each state of `bias` displaces along axis i, `markov_m` is how many metres of
+`markov` there are north and east.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import math
 from typing import NamedTuple
 
 Vector3 = tuple[float, float, float]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+UNIT: Matrix3 = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 # Sigma (m/s) and time (s) of a speed that does not drift.
 STEADY = (0.0, 1.0)
 
@@ -30,7 +32,7 @@ class PositionCandidate(NamedTuple):
     bias: tuple[str, ...] = ()
     time: str = ""
     rest: str = ""
-    bias_share: Vector3 = (1.0, 1.0, 1.0)
+    bias_share: Matrix3 = UNIT
     markov: str = ""
     markov_m: float = 0.0
 

@@ -275,5 +275,7 @@ class PositionMeasurement(AidingMeasurement):
 
     def candidates(self) -> tuple[PositionCandidate, ...]:
         measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever
-        shared = self.bias, self.time, self.rest, self.bias_share, self.markov, self.markov_m
+        n, e, d = self.bias_share
+        along = (n, 0.0, 0.0), (0.0, e, 0.0), (0.0, 0.0, d)
+        shared = self.bias, self.time, self.rest, along, self.markov, self.markov_m
         return (PositionCandidate(*measured, *shared),)

@@ -1,15 +1,21 @@
 r"""Displacement of the antenna's position by slowly varying range errors.
 
 Errors of orbits, clocks, group delays and of what is left of the ionosphere last for many minutes,
-each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. Of
-all of them a place feels, with one clock offset c a system
+each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. A
+filter that takes e for white and n for another one at each epoch solves place and clock with the
+weights of an epoch, R + S S^T, and what it finds of them is off, for as long as they last, by
 
-    b = G (e + S n),     G = first three rows of (H^T V^-1 H + L)^-1 H^T V^-1
+    b = G (e + S n),     G = first three rows of (A^T R^-1 A + L)^-1 A^T R^-1,   A = [H  S]
     B = cov(b) = G V G^T + (G S)(G S)^T,      b = K t,  K = B^1/2 symmetric,  t ~ N(0, I)
 
-H = [-u 1_system], u unit vectors to the satellites north, east, down, L what else knows of place
-(30 m) and clock (1 m). So u . K t is the part of the errors that looks like a displacement: all of
-it with three satellites, whose geometry makes much of little, and little with thirty.
+H = [-u 1_system], u unit vectors to the satellites north, east, down, R the variance of a range
+with what lasts, L what else knows of place (30 m), of the errors that all share (their unit
+variance), and of the clock: nothing does. Its offset is solved of the same ranges, so that delay of
+a whole sky goes into clock and height together. With a clock known to 1 m half of it cancels: low
+satellites, which are longer, lift the place that a later clock sinks (10 satellites with 1 m of
+ionosphere unknown at the zenith: 0.9 m downwards for 2.3). So u . K t is the part of the errors
+that looks like a displacement: all of it with four satellites, whose geometry makes much of little,
+and little with thirty.
 
 Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
 satellites' levels (fusiond.gnss.levels) do not know of their errors, V_k,
@@ -17,7 +23,8 @@ satellites' levels (fusiond.gnss.levels) do not know of their errors, V_k,
     K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
 
 with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
-what levels know they know of what all share, too. A filter that lets K grow and adds nothing solves
+what levels know they know of what all share, too. Here the clock is known, for it is that of the
+sky before, from which it has gone a metre. A filter that lets K grow and adds nothing solves
 t of how the ranges part when satellites go, and is sure of a place that it does not know.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
@@ -37,9 +44,13 @@ from fusiond.navigation.compiled import compiled
 
 Array = npt.NDArray[np.float64]
 
-PLACE_M, CLOCK_M = 30.0, 1.0
-"""One sigma of position and clock before the epoch: an inertial unit over a minute; a crystal with
-a random walk of 0.1 m by the root of a second, over a hundred."""
+PLACE_M, FREE_M, CLOCK_M = 30.0, 1e3, 1.0
+"""One sigma of what is known of the place but for the epoch (an inertial unit over a minute), of
+the clock, and of the clock since the sky before: a crystal whose phase walks by 0.1 m by the root
+of a second, over a hundred."""
+SHARED = (rk.COMMON, rk.TROPOSPHERE_SIGMA, rk.BEIDOU_2_SIGMA)
+"""Rows of S. What a receiver delays BeiDou-2 more has a state that lasts: no displacement is of
+it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
@@ -106,31 +117,39 @@ def roots(b: Array, out: Array) -> None:
                     out[3 + i, j] += v[i, k] / root * v[j, k]
 
 
-@compiled("void(f8[:, ::1], i8[::1], i8, f8[::1], f8[:, ::1], f8[:, ::1])", allocates=True)
+@compiled(
+    "void(f8[:, ::1], i8[::1], i8, f8[::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True
+)
 def displace(
     values: Array,
     clock: npt.NDArray[np.int64],
     clocks: int,
+    noise: Array,
     variance: Array,
+    clock_m: float,
     effect: Array,
     out: Array,
 ) -> None:
-    """Write the effect of errors of `variance` (n,), and its roots.
+    """Write the effect of errors of `variance` (n,) on ranges that are weighted by `noise` (n,),
+    and its roots.
 
     `effect` (3, n + 2): G and G S by rows' `values`; `out` (6, 3): K and its inverse.
 
-    `clock` (n,) below `clocks`: which of the clocks' offsets each has.
+    `clock` (n,) below `clocks`: which of the clocks' offsets each has, known to `clock_m`.
     """
-    n, m = clock.shape[0], 3 + clocks
-    normal, row = np.zeros((m, m)), np.zeros(m)
+    n, shared = clock.shape[0], 3 + clocks
+    m = shared + len(SHARED)
+    normal, rows = np.zeros((m, m)), np.zeros((n, m))
     for i in range(m):
-        known = PLACE_M if i < 3 else CLOCK_M
+        known = PLACE_M if i < 3 else clock_m if i < shared else 1.0
         normal[i, i] = 1.0 / (known * known)
     for k in range(n):
-        row[:] = 0.0
+        row = rows[k]
         row[0], row[1] = -values[rk.NORTH, k], -values[rk.EAST, k]
         row[2], row[3 + clock[k]] = math.sin(values[rk.ELEVATION, k]), 1.0
-        w = 1.0 / variance[k]
+        for j in range(len(SHARED)):
+            row[shared + j] = values[SHARED[j], k]
+        w = 1.0 / noise[k]
         for i in range(m):
             for j in range(m):
                 normal[i, j] += w * row[i] * row[j]
@@ -139,9 +158,10 @@ def displace(
     for i in range(3):
         effect[i, n] = effect[i, n + 1] = 0.0
         for k in range(n):
-            g = -normal[i, 0] * values[rk.NORTH, k] - normal[i, 1] * values[rk.EAST, k]
-            g += normal[i, 2] * math.sin(values[rk.ELEVATION, k]) + normal[i, 3 + clock[k]]
-            effect[i, k] = g / variance[k]
+            g = 0.0
+            for j in range(m):
+                g += normal[i, j] * rows[k, j]
+            effect[i, k] = g / noise[k]
             effect[i, n] += effect[i, k] * values[rk.COMMON, k]
             effect[i, n + 1] += effect[i, k] * values[rk.TROPOSPHERE_SIGMA, k]
     for i in range(3):
@@ -172,8 +192,14 @@ class Displacement(NamedTuple):
         n = len(rows.satellites)
         effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
         clocks = int(rows.clock.max(initial=0)) + 1
-        displace(rows.values, rows.clock, clocks, rows.values[rk.LASTING].copy(), effect, out)
-        displace(rows.values, rows.clock, clocks, variance + FLOOR_M**2, effect, left)
+        lasting, of = rows.values[rk.LASTING].copy(), (rows.values, rows.clock, clocks)
+        noise = rows.values[rk.VARIANCE] - variance + lasting
+        # Fewer satellites than unknowns leave the clock as it was: free, it would take a direction
+        # of the place that the displacement of the sky before has.
+        free = FREE_M if n >= 3 + clocks else CLOCK_M
+        displace(*of, noise, lasting, free, effect, out)
+        unknown = variance + FLOOR_M**2
+        displace(*of, unknown, unknown, CLOCK_M, effect, left)
         known = np.sqrt(variance / rows.values[rk.LASTING])
         for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
             effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)

@@ -414,7 +414,11 @@ class RawGnss:
         covariance = axes.T @ found.covariance @ axes
         n, e, d = np.sqrt(np.diag(covariance)).tolist()
         lever = self._section.lever_arm_m
-        candidates: list[Candidate] = [PositionCandidate(t_ns, lat, lon, height, (n, e, d), lever)]
+        # Its errors last: the ranges that follow have them, and are no proof of it.
+        shape = Displacement.of(found.rows, 0.0, found.rows.lasting).shape.tolist()
+        share = tuple(tuple(row) for row in shape)
+        of = (n, e, d), lever, RANGE_BIAS, "", "", share
+        candidates: list[Candidate] = [PositionCandidate(t_ns, lat, lon, height, *of)]
         if found.velocity is not None:
             v_n, v_e, v_d = (axes.T @ found.velocity).tolist()
             sd = self._section.start_velocity_sd_m_s

@@ -44,11 +44,14 @@ WHITE: dict[str, Any] = {"bias_sd_m": 0.0, "time_offset_sd_s": 0.0, "lever_arm_s
 """Receiver with white errors only, as in the papers' models."""
 AS_TAKEN: dict[str, Any] = {
     "ionosphere_sd": 0.5,
+    "ionosphere_local_sd": 0.15,
+    "ionosphere_as_broadcast": True,
     "wet_delay_sd_m": 0.12,
     "signal_in_space_sd_m": 0.6,
 }
 """Sky whose errors match the daemon's assumptions (`fusiond.gnss.plan`): orbits, clocks, and
-residuals of ionosphere and troposphere models. That of `Scenario` is better."""
+residuals of ionosphere and troposphere models: half of what is broadcast, and 0.3 of that from
+satellite to satellite. That of `Scenario` is better, but for models that are a third off."""
 NO_SCALES = {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}
 """Inertial unit without scale factor errors, for which the papers' models have no states."""
 

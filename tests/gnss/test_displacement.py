@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from fusiond.gnss import range_kernel as rk
-from fusiond.gnss.displacement import CLOCK_M, FLOOR_M, PLACE_M, Displacement, roots
+from fusiond.gnss.displacement import (
+    CLOCK_M,
+    FLOOR_M,
+    FREE_M,
+    PLACE_M,
+    SHARED,
+    Displacement,
+    roots,
+)
 from fusiond.gnss.levels import FORGOTTEN_S, Levels, take_off
 from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
 from tests.gnss.test_corrections import sky, solved, store_of
@@ -29,15 +37,15 @@ def rows(keep: int | None = None) -> Rows:
     return found.only(np.arange(len(found.satellites)) < keep)
 
 
-def gain(r: Rows, variance: Any) -> Any:
+def gain(r: Rows, noise: Any, clock_m: float) -> Any:
     """G (3, n) by its equation."""
-    h = np.zeros((len(variance), 5))
-    v = r.values
-    h[:, :3] = -np.column_stack([v[rk.NORTH], v[rk.EAST], -np.sin(v[rk.ELEVATION])])
-    h[np.arange(len(variance)), 3 + r.clock] = 1.0
-    prior = np.diag([1.0 / PLACE_M**2] * 3 + [1.0 / CLOCK_M**2] * 2)
-    normal = h.T @ (h / variance[:, None]) + prior
-    return (np.linalg.inv(normal) @ h.T / variance)[:3]
+    n, v = len(noise), r.values
+    a = np.zeros((n, 8))
+    a[:, :3] = -np.column_stack([v[rk.NORTH], v[rk.EAST], -np.sin(v[rk.ELEVATION])])
+    a[np.arange(n), 3 + r.clock] = 1.0
+    a[:, 5:] = v[list(SHARED)].T
+    prior = np.diag([1.0 / PLACE_M**2] * 3 + [1.0 / clock_m**2] * 2 + [1.0] * 3)
+    return (np.linalg.inv(a.T @ (a / noise[:, None]) + prior) @ a.T / noise)[:3]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -54,11 +62,31 @@ def test_roots_of_a_matrix(seed: int) -> None:
 def test_root_is_that_of_the_errors_effect(keep: int | None) -> None:
     r = rows(keep)
     d = Displacement.of(r, T_S, r.lasting)
-    g = gain(r, r.lasting)
+    g = gain(r, r.variance, FREE_M if keep != 3 else CLOCK_M)
     shared = g @ r.values[[rk.COMMON, rk.TROPOSPHERE_SIGMA]].T
     expected = (g * r.lasting) @ g.T + shared @ shared.T
     assert d.root @ d.root == pytest.approx(expected, rel=1e-9, abs=1e-9)
-    assert d.effect[:, : len(r.satellites)] == pytest.approx(gain(r, r.lasting + FLOOR_M**2))
+    assert d.effect[:, : len(r.satellites)] == pytest.approx(
+        gain(r, r.lasting + FLOOR_M**2, CLOCK_M)
+    )
+
+
+def test_least_squares_with_a_clock_that_nothing_tells_err_by_it() -> None:
+    """Drawn errors that last, solved of by the weights of an epoch: their scatter is K K^T."""
+    r, rng = rows(12), np.random.default_rng(3)
+    n, v = 12, r.values
+    h = np.zeros((n, 5))
+    h[:, :3] = -np.column_stack([v[rk.NORTH], v[rk.EAST], -np.sin(v[rk.ELEVATION])])
+    h[np.arange(n), 3 + r.clock] = 1.0
+    s = v[list(SHARED)].T
+    w = np.linalg.inv(np.diag(r.variance) + s @ s.T)
+    solve = np.linalg.inv(h.T @ w @ h) @ h.T @ w
+    e = rng.normal(size=(20_000, n)) * np.sqrt(r.lasting)
+    e += rng.normal(size=(20_000, 3)) * [1.0, 1.0, 0.0] @ s.T
+    found = np.cov((e @ solve.T)[:, :3].T)
+    d = Displacement.of(r, T_S, r.lasting)
+    assert d.root @ d.root == pytest.approx(found, abs=0.07 * found.max())
+    assert np.sqrt(np.diag(d.root @ d.root)) == pytest.approx(np.sqrt(np.diag(found)), rel=0.05)
 
 
 def test_three_satellites_may_be_off_by_all_of_their_errors() -> None:

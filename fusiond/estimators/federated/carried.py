@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.federated.filter import FederatedFilter
 from fusiond.estimators.federated.isolation import DIFFERENCE
-from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -26,17 +24,11 @@ class CarriedFilter(FederatedFilter):
 
     carries_transition = True
 
-    def __init__(
-        self,
-        model: Model,
-        gap_s: float,
-        names: tuple[str, ...],
-        options: FederatedOptions,
-        estimates: int,
-    ) -> None:
-        super().__init__(model, gap_s, names, options, estimates)
-        self._unit: Array = np.eye(model.width)
-        self._before: Array = np.zeros((model.width, model.width))
+    def _arrange(self, used: NDArray[np.bool_]) -> None:
+        super()._arrange(used)
+        width = self.model.width
+        self._unit: Array = np.eye(width)
+        self._before: Array = np.zeros((width, width))
 
     def _mark(self) -> None:
         """The local filters hold at the present."""

@@ -242,13 +242,13 @@ def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
 def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocity: Array) -> None:
     """Rows of the position in `by` (n, n): an innovation of 0 (fusiond.aiding.position) says
 
-        dr = e + s db + w dc + v dtau + C dl - [C l x] phi,   e the fix's noise
+        dr = e + S db + w dc + v dtau + C dl - [C l x] phi,   e the fix's noise
 
     and a start without it would take the next fixes for proof that b, c, tau and dl are 0.
     """
     by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
-    for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
-        by[DR + row, slot] = fix.bias_share[row]
+    for state, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
+        by[DR : DR + 3, slot] = [along[state] for along in fix.bias_share]
     for row, slot in enumerate(model.slots_of(fix.markov)):
         by[DR + row, slot] = markov_sd_of(row, fix.markov_m, fix.sd)
     for slot in model.slots_of(fix.time):

@@ -103,6 +103,11 @@ class GnssRawOptions:
     wet_delay_sd_m: float = 0.04
     ionosphere_sd: float = 0.0
     """One sigma of the day's ionosphere, as a share of an ordinary one: models leave half of it."""
+    ionosphere_local_sd: float = 0.0
+    """Likewise of the part of it that each satellite's path meets by itself."""
+    ionosphere_as_broadcast: bool = False
+    """True if an ordinary day is what both systems broadcast; their models miss it by a third
+    otherwise."""
     clock_offset_sd_m: float = 3000.0
     clock_drift_constant_sd_m_s: float = 20.0
     clock_drift_sd_m_s: float = 0.5
@@ -173,15 +178,21 @@ class GnssRaw:
         self._wet_error = float(rng.standard_normal()) * o.wet_delay_sd_m
         isb = float(rng.standard_normal()) * o.inter_system_sd_m
         self.inter_system_m: dict[System, float] = {"G": 0.0, "C": isb}
+        gps, beidou = (GPS_ALPHA, GPS_BETA), (BEIDOU_ALPHA, BEIDOU_BETA)
+        if o.ionosphere_as_broadcast:
+            gps = beidou = TRUE_ALPHA, TRUE_BETA
         self.ionosphere = (
-            Klobuchar("simulation", 0, "G", GPS_ALPHA, GPS_BETA),
-            Klobuchar("simulation", 0, "C", BEIDOU_ALPHA, BEIDOU_BETA),
+            Klobuchar("simulation", 0, "G", *gps),
+            Klobuchar("simulation", 0, "C", *beidou),
         )
         self.reflected_m = self._draw_reflections(n, step)
         """(n, satellites), m: what a satellite's ranges have more, satellites as `satellites`."""
-        # The last one drawn: what has no such days is as before.
+        # The last ones drawn: what has no such days is as before.
         more = float(rng.standard_normal()) * o.ionosphere_sd if o.ionosphere_sd else 0.0
-        self.ionosphere_factor = max(1.0 + more, LEAST_IONOSPHERE)
+        own = rng.standard_normal(len(self._slots)) if o.ionosphere_local_sd else 0.0
+        factors = 1.0 + more + np.broadcast_to(own * o.ionosphere_local_sd, len(self._slots))
+        self.ionosphere_factor: Array = np.maximum(factors, LEAST_IONOSPHERE)
+        """(satellites,), of an ordinary day's."""
         self.begin(*start)
 
     @property
@@ -310,7 +321,7 @@ class GnssRaw:
             ionosphere = (CARRIER_HZ["G", "1"] / hz) ** 2 * klobuchar_gps(
                 self._coefficients, tow_s, lat, lon, e, math.cos(azimuth[i]), math.sin(azimuth[i])
             )
-            ionosphere *= self.ionosphere_factor
+            ionosphere *= float(self.ionosphere_factor[i])
             cno = 36.0 + 12.0 * math.sin(e)
             weaker = 10.0 ** ((45.0 - cno) / 20.0)
             noise = self._white[k, cell].astype(np.float64)
