@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.estimators.base import Estimator
@@ -24,8 +23,6 @@ from fusiond.navigator.state_file import RefusedStateError
 
 if TYPE_CHECKING:
     from fusiond.navigator.warm_start import WarmStart
-
-Array = NDArray[np.float64]
 
 # Sigmas of heading and course beyond which a claimed heading is contradicted, and for how long: an
 # obstacle that the vehicle slides at takes less.
