@@ -145,7 +145,7 @@ def restarted(old: Process, data: Received, row: int, gap_s: float) -> tuple[Arr
         navigator.estimator, navigator.imu, "GNSS course", "", "boot", 0, confirmed=True
     )
     new = Process(data, row + round(gap_s * RATE_HZ))
-    new.navigator.warm = WarmStart(state, new.navigator.model)
+    new.navigator.trial.warm = WarmStart(state, new.navigator.model)
     new.clock.resume(clock.known())
     found = [
         new.ratios(k) for k, _ in zip(new.run(), range(round(WATCHED_S * RATE_HZ)), strict=False)

@@ -97,10 +97,10 @@ LOG_PRIOR = 7
 # row width of the transition, by how much the unit has been found to have turned on the vehicle in
 # pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
 # back of the velocity in all (m/s), and behind how many eights of groups with three numbers, and of
-# those with one, no V is other than zero.
+# those with one, no V is other than zero; and when (s) something measured was taken in last.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEAD = 21, 22, 25, 26, 32
+UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, MEASURED_S, HEAD = 21, 22, 25, 26, 31, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8

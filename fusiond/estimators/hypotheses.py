@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Linearised
+from fusiond.estimators.constraint_odds import UNMEASURED_S, judge_by_constraints
 from fusiond.estimators.fault_bank import (
     ALL,
     EXPLAINED,
     LOG_ODDS,
+    MEASURED_S,
     MOVES,
     NOTHING,
     ONSET,
@@ -124,6 +126,7 @@ class Hypotheses:
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
+        self.bank[MEASURED_S] = t_ns * 1e-9
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, measurement: Linearised, nav: Array, step: Array) -> None:
@@ -154,9 +157,13 @@ class Hypotheses:
         """Update after rows of a measurement: the result `found` if they were `measured` and
         `used`; unless a hypothesis is identified, the covariance that the weighted hypotheses add
         is written to `wider`. None if `fused` rows allow deferring all to `conclude`."""
+        if measured:
+            self.bank[MEASURED_S] = t_ns * 1e-9
         if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
             self.bank[UNJUDGED] = t_ns * 1e-9
             return None
+        if not measured and used and t_ns * 1e-9 - self.bank.item(MEASURED_S) > UNMEASURED_S:
+            judge_by_constraints(self.bank, *self.table[:3], t_ns * 1e-9, self.found)
         judge_and_widen(*self._judged, t_ns * 1e-9, measured, used, *self._widened)
         return self.found
 

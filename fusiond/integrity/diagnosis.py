@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import PositionCandidate
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.device_agreement import Agreement
+from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
 from fusiond.integrity.fault_finding import Finding, Lasting
 from fusiond.integrity.service import (
     DISAGREES,
@@ -49,25 +49,14 @@ from fusiond.integrity.service import (
     value_of,
 )
 from fusiond.integrity.shared_error import renewed_slots
-from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
 Array = NDArray[np.float64]
 
-PLACE_ROW = 6
-"""First row of the position in the error state."""
 ALIKE = 7.0
 """Log likelihood difference beyond which another hypothesis of the class is ignored."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
 """Five fixes of a receiver that sends each second; a minute is what a vehicle's MEMS unit keeps to
 within a hundred metres."""
-
-
-class Correction(NamedTuple):
-    """Correction of the error state, mean (n,), and its covariance (n, n)."""
-
-    mean: Array
-    spread: Array
 
 
 class Memory(NamedTuple):
@@ -231,7 +220,7 @@ class Diagnosis:
         others = self._over_by_others(one)
         one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others)
         if self._goes_its_own_way(one):
-            correction = _somewhere_else(measurement, estimator)
+            correction = somewhere_else(measurement, estimator)
             one.readmit(t_ns)
         if not one.out:
             self._is_over(one)
@@ -253,31 +242,23 @@ class Diagnosis:
         """Faults that are identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
-        fits = np.array([each.log_likelihood for each in taken])
-        weights = np.exp(fits - fits.max())
-        weights /= weights.sum()
-        mean, spread = np.zeros(bank.n), np.zeros((bank.n, bank.n))
-        for w, each in zip(weights, taken, strict=True):
-            mean += w * each.mean
-        for w, each in zip(weights, taken, strict=True):
-            apart = each.mean - mean
-            spread += w * (each.spread + np.outer(apart, apart))
+        correction, best_fit = mixed(taken), max(each.log_likelihood for each in taken)
         finding = self._finding(measurement.t_ns, max(taken, key=lambda each: each.log_odds))
         steps = [each for each in taken if self._kinds[each.kind].signature == POSITION]
         if steps:
             step = max(steps, key=lambda each: each.log_likelihood)
-            less = float(fits.max()) - step.log_likelihood
+            less = best_fit - step.log_likelihood
             if slots := renewed_slots(measurement, estimator, step, less):
                 sd = tuple(np.sqrt(np.diagonal(step.covariance)).tolist())
                 kind = changed_kind(finding.kind.device)
                 finding = finding._replace(kind=kind, size=tuple(step.size.tolist()), sd=sd)
-                mean[slots] = -estimator.xi[slots]
-                spread[slots, slots] += estimator.model.noise[2, slots]
+                correction.mean[slots] = -estimator.xi[slots]
+                correction.spread[slots, slots] += estimator.model.noise[2, slots]
         others = [f for f in self.findings if f.kind.text != finding.kind.text]
         self.findings = (*others, finding)
         if not finding.kind.corrected:
-            self._leave_out(finding, bank, fits.max())
-        return Correction(mean, spread)
+            self._leave_out(finding, bank, best_fit)
+        return correction
 
     def _finding(self, t_ns: int, told: Estimated) -> Finding:
         kind = self._kinds[told.kind]
@@ -389,18 +370,3 @@ class Diagnosis:
             **self._agreement,
             measurement.device: known.with_measurement(measurement),
         }
-
-
-def _somewhere_else(measurement: AidingMeasurement, estimator: Estimator) -> Correction:
-    """Open the filter's position covariance by the distance of a position from it."""
-    spread = np.zeros((estimator.model.size, estimator.model.size))
-    nav = estimator.nav
-    lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)
-    for candidate in measurement.candidates():
-        if isinstance(candidate, PositionCandidate):
-            north = (candidate.lat_rad - lat) * meridian_radius(lat)
-            east = (candidate.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)
-            down = 0.0 if candidate.height_m is None else height - candidate.height_m
-            for row, apart in enumerate((north, east, down)):
-                spread[PLACE_ROW + row, PLACE_ROW + row] = apart * apart
-    return Correction(np.zeros(len(spread)), spread)

@@ -54,7 +54,9 @@ to one; the most (chi-square) that one measurement tells of that; and the most (
 one series does, four such measurements."""
 REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
-# centimetre or finer, so that two alike are chance, three are not.
+# centimetre or finer, so that two alike are chance, three are not. Chance of that kind is the fix
+# before once more, of a receiver that says what it has oftener than it has something: no
+# measurement of its instant.
 REPEATED = 2
 # Speeds and velocities are printed coarser: so rare a run of equal ones is none, by the probability
 # that one repeats the one before, as this series has shown it (average of so many).
@@ -97,6 +99,7 @@ class Series:
     """Log likelihood ratio that the excluding fault is over rather than lasting."""
     value: object = None
     repeats: int = 0
+    """So many values in a row, of a vehicle that moves, were that before them, to the bit."""
     unchanged: bool = False
     """True if the last value repeated the one before it, to the bit."""
     noise: Array = field(default_factory=unlearned)
@@ -189,6 +192,11 @@ class Series:
         self.proven_ns = 2 * t_ns - self.out_ns
         self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
         self.failed = self.passed = 0
+
+    @property
+    def stale(self) -> bool:
+        """True if the last position was the one before it once more."""
+        return self.locates and self.repeats > 0
 
     def went_on(self, t_ns: int, value: object, moved: int) -> None:
         """Note several arrivals of a nominal series, the last at `t_ns`, without repeated values;

@@ -90,7 +90,7 @@ class CalibrationKeeper:
     def _of(self, navigator: Navigator) -> SavedCalibration | None:
         # How a spare sits on the vehicle says nothing of the unit that the next run begins with.
         spare = published_of_spare(navigator.estimator, navigator.config.imu)
-        if navigator.started is None or navigator.on_trial or spare:
+        if navigator.started is None or navigator.trial.on_trial or spare:
             return None
         noise = navigator.shown_noise(self._utc_s())
         return saved_calibration(navigator.calibrating.parameters, self._digest, noise)

@@ -208,7 +208,7 @@ class Daemon:
         finally:
             self.service.stopping()
             await _cancel(*work, stopped)
-            await self._state.close(self.solution, confirmed=not self.navigator.unconfirmed)
+            await self._state.close(self.solution, confirmed=not self.navigator.trial.unconfirmed)
             await self._warm.close(self.solution, self.navigator)
             await self._calibration.close(self.navigator)
             await self._output_tasks.stop()
@@ -233,7 +233,7 @@ class Daemon:
             self._publishing.tick(t_ns, solution)
         if self._second.due(t_ns) or self._chain.changed:
             self._each_second(solution)
-        self._state.keep(t_ns, solution, confirmed=not self.navigator.unconfirmed)
+        self._state.keep(t_ns, solution, confirmed=not self.navigator.trial.unconfirmed)
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
         self._messages.keep(t_ns, self._chain.messaging)

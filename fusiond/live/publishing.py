@@ -198,6 +198,6 @@ def _totals(navigator: Navigator) -> tuple[int, int]:
     for outcomes in navigator.outcomes().values():
         fused += outcomes["fused"]
         rejected += outcomes.total() - outcomes["fused"]
-    for refused in navigator.refused.values():
+    for refused in navigator.outcome_watch.refused.values():
         rejected += refused.total()
     return fused, rejected

@@ -32,7 +32,7 @@ class RestoredState:
 
             chain.messaging.resume(KEPT_MESSAGES.validate_json(self.messages))
         if self.warm is not None:
-            chain.navigator.warm = WarmStart(self.warm.navigation, chain.navigator.model)
+            chain.navigator.trial.warm = WarmStart(self.warm.navigation, chain.navigator.model)
             chain.clock.resume(self.warm.utc)
 
 

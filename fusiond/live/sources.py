@@ -226,12 +226,12 @@ class Sources:
         outcomes = navigator.outcomes()
         diagnosed = self._diagnosed(now_ns)
         health: dict[str, SourceHealth] = {}
-        for name in dict.fromkeys((*self.all, *outcomes, *navigator.refused)):
+        for name in dict.fromkeys((*self.all, *outcomes, *navigator.outcome_watch.refused)):
             ended = outcomes.get(name, Counter())
             rejected = {n: c for n, c in ended.items() if n != "fused" and c > 0}
-            for reason, count in navigator.refused.get(name, Counter()).items():
+            for reason, count in navigator.outcome_watch.refused.get(name, Counter()).items():
                 rejected[reason] = rejected.get(reason, 0) + count
-            fused_ns = navigator.last_fused_ns.get(name)
+            fused_ns = navigator.outcome_watch.fused_ns.get(name)
             fused_age = None if fused_ns is None else round((now_ns - fused_ns) * 1e-9, 3)
             source = self.all.get(name)
             if source is None:

@@ -94,7 +94,7 @@ class WarmKeeper:
             if state is None:
                 return
             same_run(state.navigation, self._config, self._boot_id, _asleep_ns())
-            navigator.warm = WarmStart(state.navigation, navigator.model)
+            navigator.trial.warm = WarmStart(state.navigation, navigator.model)
             self._clock.resume(state.utc)
             self.restored = state
         except DamagedStateError as error:
@@ -123,7 +123,7 @@ class WarmKeeper:
         """Present state; None if not worth storing. Axes and biases of a spare do not fit the unit
         of the next run's start."""
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
-        if navigator.started is None or navigator.on_trial or not usable:
+        if navigator.started is None or navigator.trial.on_trial or not usable:
             return None
         if navigator.without_imu.active:
             return None
@@ -137,7 +137,7 @@ class WarmKeeper:
                 self._config,
                 self._boot_id,
                 _asleep_ns(),
-                confirmed=not navigator.unconfirmed,
+                confirmed=not navigator.trial.unconfirmed,
             )
             return KeptState(state, self._clock.known())
         except ValidationError as error:

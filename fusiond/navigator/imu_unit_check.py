@@ -159,11 +159,13 @@ class RateUnits:
         self._ways: dict[str, WayTurns] = {}
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
-    def unproven(self, estimator: Estimator) -> str | None:
+    def unproven(self, estimator: Estimator) -> tuple[str | None, float]:
         """Reason why a solution with biases outside the data sheet is unproven before the course
-        has turned; None for normal biases."""
+        has turned, and their size in sigmas of the sheet: the unit's noise and scale may be as many
+        times worse. None and 1 for normal biases."""
         if self.fits:
-            return None
+        if self.fits:
+            return None, 1.0
         model = estimator.model
         if self._first is None or self._first[0] is not model:
             columns = [*range(RATE_ERROR, RATE_ERROR + 3), *range(FORCE_ERROR, FORCE_ERROR + 3)]
@@ -178,7 +180,7 @@ class RateUnits:
                 size, unit = (math.degrees(bias), "deg/s") if gyro else (bias, "m/s^2")
                 sensor = "Gyro" if gyro else "Accelerometer"
                 found = reason("bias_size", sensor=sensor, size=size, unit=unit, sigmas=sigmas)
-        return found
+        return (None, 1.0) if found is None else (found, worst)
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
         """Take the samples from row `new` on."""

@@ -20,14 +20,14 @@ from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.finite_check import first_not_finite
 from fusiond.estimators.invariant import InvariantFilter
-from fusiond.integrity.catalogue import SENSOR, Kind
+from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.alignment.start_check import StartCheck
+from fusiond.navigator.alignment.start_check import StartTrial
 from fusiond.navigator.assembly import (
     estimator_of,
     imu_buffer_of,
@@ -52,14 +52,12 @@ from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.source_status import SourceService
-from fusiond.navigator.state_file import RefusedStateError
-from fusiond.navigator.status import NavigationStatus, StartedNavigation
-from fusiond.navigator.timeline import JUDGED, Entry, Timeline
+from fusiond.navigator.status import NavigationStatus, OutcomeWatch, StartedNavigation
+from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.navigator.without_imu import WithoutImu, counted_together
 
 if TYPE_CHECKING:
     from fusiond.navigator.saved_calibration import SavedCalibration
-    from fusiond.navigator.warm_start import WarmStart
 
 Array = NDArray[np.float64]
 
@@ -88,13 +86,14 @@ class Navigator:
         self._saved = saved
         self._event = on_event or (lambda code, text: None)
         e, imu = config.estimator, config.imu
-        self._noise = imu_noise(imu)
-        self._intake = Intake(config.aiding, config.plausibility, self._event)
-        self._manoeuvre = config.plausibility.manoeuvre
+        self._noise, self._options = imu_noise(imu), alignment_options(config)
+        self._limits, self._gap_ns = config.plausibility, round(imu.gap_s * 1e9)
+        self._intake = Intake(config.aiding, self._limits, self._event)
         self.raw = self._intake.receivers
-        of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         shared_blocks = self._intake.extra_blocks()
-        self.model = model_of(config, *of_vehicle, *shared_blocks)
+        self.model = model_of(
+            config, *vehicle_blocks(config.constraints.non_holonomic), *shared_blocks
+        )
         self.imu = imu_buffer_of(config, self.model)
         self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
@@ -102,44 +101,37 @@ class Navigator:
         self.estimator = estimator(config, self.model, kinds)
         publish_by_axes(self.estimator, imu)
         self.verdicts = verdicts_of(config, self.model, self._event)
+        self._failed = FailedMeasurements(self._event)
+        self._protection = ProtectionWatch(config, self.estimator, self._event)
+        self.trial = StartTrial(self._options, self._event)
+        self.outcome_watch = OutcomeWatch(
+            *(round(e.coast_after_s * 1e9), self.trial, self._protection, self._failed),
+            *(self.verdicts, on_outcome),
+        )
         self.timeline = Timeline(
-            *(self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome),
+            *(self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self.outcome_watch.receive),
             kinds if self.estimator.hypotheses is not None else (),
         )
-        self._on_outcome = on_outcome
         self._drifts = DriftLevels(self.model)
         self._intake.count_drifts(self._drifts)
         self._constraints = ConstraintMaker(config.constraints, self._noise, self._drifts)
-        names = e.federated.sources or tuple(config.aiding)
-        self._failed = FailedMeasurements(self._event)
         self._service_events = ServiceEvents(self.timeline, self._event)
-        self.service = SourceService(self.timeline, names)
-        self._protection = ProtectionWatch(config, self.estimator, self._event)
+        self.service = SourceService(self.timeline, e.federated.sources or tuple(config.aiding))
         self._imu_noise = ImuNoise(self.model, imu, self._drifts)
-        self.refused: dict[str, Counter[str]] = {}
-        self.last_fused_ns: dict[str, int] = {}
-        self.without_imu = WithoutImu(
-            config, shared_blocks, self._event, self.last_fused_ns, self._on_outcome
-        )
-        self._last_position_ns = self._verdicts_ns = 0
-        self._basis = ""
+        fused_ns = self.outcome_watch.fused_ns
+        self.without_imu = WithoutImu(config, shared_blocks, self._event, fused_ns, on_outcome)
+        self._verdicts_ns = 0
         self.started: Start | None = None
-        self._start_check: StartCheck | None = None
-        self.warm: WarmStart | None = None
-        """Warm start on trial, attempted before any alignment."""
         self._calibration: SavedCalibration | None = None
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
-        self._latency = LatencySearch(
-            alignment_options(config), self._noise, self.model, self._event
-        )
+        self._latency = LatencySearch(self._options, self._noise, self.model, self._event)
         self._status = NavigationStatus(
             config, self.estimator, self.imu, self._screening, self._units
         )
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        options = alignment_options(self.config)
-        return Aligner(options, self._noise, self.model, self._saved, self._event)
+        return Aligner(self._options, self._noise, self.model, self._saved, self._event)
 
     # ------------------------------------------------------------------ arrivals
 
@@ -165,6 +157,7 @@ class Navigator:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
         self._intake.set_gates(gates)
         self.verdicts = verdicts_of(self.config, self.model, self._event)
+        self.outcome_watch.verdicts = self.verdicts
 
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
         """Add IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; returns the
@@ -221,16 +214,16 @@ class Navigator:
     ) -> str:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
-            return self._refuse(m.source, "from_future")
+            return self.outcome_watch.refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
-            return self._refuse(m.source, "time_unknown")
+            return self.outcome_watch.refuse(m.source, "time_unknown")
         try:
             measurements = self._intake.measurements_of(m, t_ns, sd_time_s, seen_ns)
         except RAISED_BY_NUMBERS as error:
             self._failed.report(m.source, repr(error))
-            return self._refuse(m.source, "failed")
+            return self.outcome_watch.refuse(m.source, "failed")
         if isinstance(measurements, str):
-            return self._refuse(m.source, measurements)
+            return self.outcome_watch.refuse(m.source, measurements)
         self.without_imu.receive(measurements, seen_ns)
         if self.started is not None and m.source in self._latency.on_time:
             self._latency.waiting.append((m.source, measurements))
@@ -251,7 +244,7 @@ class Navigator:
         self.timeline.clear()
         self._protection.restart()
         self._imu_noise.restart()
-        self.started, self._saved, self.warm = None, saved, None
+        self.started, self._saved, self.trial.warm = None, saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 
@@ -282,15 +275,16 @@ class Navigator:
 
     def advance(self, record: bool = False) -> None:
         """Run up to the last IMU sample. `record` stores the solution at each sample in `imu`."""
+        if self._units.wrong is not None:  # nothing that was made of such rates is worth anything
+            if self.started is not None:
+                self.reset(self._units.wrong)
+            return
         if self.started is None:
-            start = self._warm_start() or self._aligner.attempt(self.imu)
-            if (
-                start is None
-                or self._start_is_too_old()
-                or self._aligner.waits(start, self._latency)
-            ):
+            start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
+            too_old = start is None or self._start_is_too_old()
+            if start is None or too_old or self._aligner.waits(start, self._latency):
                 return
-            if self.calibration is not None and not self.on_trial:
+            if self.calibration is not None and not self.trial.on_trial:
                 start = self.calibration.taken_up(start, self.model)
             self.calibrating.restart()
             first = self.imu.index_after(start.t_ns) + self.imu.start
@@ -301,10 +295,8 @@ class Navigator:
             self._imu_noise.started(start, self.estimator, self.imu)
             self.verdicts.reset()
             self.started = start
-            self._start_check = StartCheck(alignment_options(self.config), start)
-            self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._basis = reason("heading_from", how=start.how)
-            self._event("aligned", self._basis)
+            self.trial.begin(start)
+            self._event("aligned", self.outcome_watch.begin(start))
         self.timeline.advance(record)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
@@ -320,15 +312,18 @@ class Navigator:
             if self._service_events.report():
                 self.calibrating.corrected()
                 self._imu_noise.corrected(e)
-        if self._refuted():  # before it is a failure, of which it would be the reason
+        diagnosis, rest = self.timeline.diagnosis, self._constraints.rest_evidence
+        if (check := self.trial.check) is not None and (wrong := check.refuted(e, diagnosis, rest)):
+            self._event(*wrong)  # before it is a failure, of which it would be the reason
+            self.reset(wrong[1])
+            self._aligner.known.reported.add(wrong[0])
             return
-        failure = self._status.failure(self.timeline.diagnosis)
-        if failure is not None:
+        if (failure := self._status.failure(diagnosis)) is not None:
             self._event("diverged", f"{failure}: aligning again")
             self.reset(failure)
             return
-        if self.warm is not None and self.warm.refused_by is not None:
-            why = reason("warm_start_wrong", source=self.warm.refused_by)
+        if (warm := self.trial.warm) is not None and warm.refused_by is not None:
+            why = reason("warm_start_wrong", source=warm.refused_by)
             self._event("warm_start_refused", f"{why}: aligning again")
             self.reset(why)
             return
@@ -348,20 +343,6 @@ class Navigator:
             self.calibration = None
             self.reset(reason("calibration_wrong", what=wrong))
 
-    def _refuted(self) -> bool:
-        """True if the start has shown to be a wrong one; alignment then begins anew."""
-        e, start = self.estimator, self._start_check
-        if start is None:
-            return False
-        doubted = any(f.kind.of == SENSOR for f in self.timeline.diagnosis.findings)
-        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.rest_evidence, doubted)
-        if wrong is None:
-            return False
-        self._event(*wrong)
-        self.reset(wrong[1])
-        self._aligner.known.reported.add(wrong[0])
-        return True
-
     def _start_is_too_old(self) -> bool:
         """True if a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
@@ -372,29 +353,6 @@ class Navigator:
         self.reset(found.why)
         self._aligner.receive(self._latency.kept())
         return True
-
-    def _warm_start(self) -> Start | None:
-        """Start from the last run's state at the first sample, once."""
-        if self.warm is None or not self.imu.end:
-            return None
-        try:
-            return self.warm.start(self.imu.oldest_ns)
-        except RefusedStateError as error:
-            self._event("warm_state_refused", str(error))
-            self.warm = None
-            return None
-
-    @property
-    def on_trial(self) -> bool:
-        """True after a warm start that no position measurement has confirmed yet."""
-        return self.warm is not None and self.warm.on_trial
-
-    @property
-    def unconfirmed(self) -> str:
-        """Unproven condition of the heading, as text; empty without one."""
-        if self.warm is not None and self.warm.on_trial:
-            return reason("not_confirmed_by_fix")
-        return self._start_check.unconfirmed if self._start_check else ""
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.
@@ -417,17 +375,19 @@ class Navigator:
         mode, reason = self.mode(t_ns)
         if self.started is None:
             return Solution(t_ns, mode, reason, bound=self._protection.unknown())
-        gap_ns = round(self.config.imu.gap_s * 1e9)
         bound = self._protection.bound() if self._protection.watches else NO_BOUND
+        worse = 1.0 if self._units.fits else self._units.unproven(self.estimator)[1]
+        unshown = None if (check := self.trial.check) is None else check.unshown
         return solution_of(
-            self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound, self._manoeuvre
+            *(self.estimator, self.imu, t_ns, self._gap_ns, mode, reason, bound),
+            *(self._limits, unshown, worse),
         )
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """Mode at `t_ns`, and why."""
-        started = None
+        known, started = self.outcome_watch, None
         if self.started is not None:
-            started = StartedNavigation(self._basis, self.unconfirmed, self._last_position_ns)
+            started = StartedNavigation(known.basis, self.trial.unconfirmed, known.position_ns)
         return self._status.of(t_ns, started, self._aligner.reason)
 
     @property
@@ -438,37 +398,3 @@ class Navigator:
     def outcomes(self) -> dict[str, Counter[str]]:
         """Outcomes of measurements, by source, with an inertial unit or without."""
         return counted_together(self.timeline.counters.outcomes, self.without_imu.counted())
-
-    # ------------------------------------------------------------------ inside
-
-    def _refuse(self, source: str, name: str) -> str:
-        self.refused.setdefault(source, Counter())[name] += 1
-        return name
-
-    def _outcome(self, entry: Entry) -> None:
-        outcome, measurement = entry.outcome, entry.measurement
-        if outcome is None:
-            return
-        name, source = outcome.name, measurement.source
-        if self.warm is not None and measurement.locates:
-            self.warm.judge(source, name)
-        if name == "fused":
-            if not entry.judged and outcome.whitened:
-                entry.judged = True
-                self.verdicts.waiting.append((measurement, outcome))
-            t_ns = entry.key[0]
-            if t_ns > self.last_fused_ns.get(source, -1):
-                self.last_fused_ns[source] = t_ns
-            if measurement.locates and t_ns > self._last_position_ns:
-                unaided_s = (t_ns - self._last_position_ns) * 1e-9
-                if unaided_s > self.config.estimator.coast_after_s:
-                    self._basis = reason("fixes_back", source=source)
-                self._last_position_ns = t_ns
-        if measurement.screened:
-            measurement.judged(outcome.rows, outcome.whitened)
-            if name in JUDGED:
-                self._protection.look(measurement)
-        if entry.error:
-            self._failed.report(source, entry.error)
-        if self._on_outcome is not None:
-            self._on_outcome(entry)

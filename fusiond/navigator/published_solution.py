@@ -2,11 +2,18 @@
 
 Once the inertial unit is silent for longer than a solution is carried ahead by its last sample
 nobody knows what the vehicle does. For each second of that, one sigma is that what it did last goes
-on or ends, and that it drives as vehicles of its class do (`[plausibility]`, manoeuvre a):
+on or ends, and that it brakes or turns by a, of which five are the hardest that vehicles of its
+class do (fusiond.configuration.plausibility):
 
     velocity  |a_last| + a      position  |v| + velocity t / 2      yaw  |w_last| + a / |v|
 
 and a road is banked for its bends, by (|a_last| + a) / g at most, as soon as one lasts.
+
+A heading that was claimed and that nothing has shown yet may be the other way round: half a turn is
+five sigma. What it has done to the velocity since the start is as much of the speed, and to the
+position of the way. Of an inertial unit whose bias is n sigma of its data sheet, which its rates
+have not shown to be the unit's own yet (fusiond.navigator.imu_unit_check), an attitude is known n
+times as poorly.
 """
 
 from __future__ import annotations
@@ -16,16 +23,24 @@ import math
 import numpy as np
 
 from fusiond.aiding.base import Vector3
+from fusiond.configuration.plausibility import Plausibility
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import published_ahead
-from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.earth import (
+    STANDARD_GRAVITY_M_S2,
+    meridian_radius,
+    transverse_radius,
+)
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M, Bound, Mode, Solution
-from fusiond.navigation.strapdown import NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
+from fusiond.navigation.strapdown import LAT, LON, NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
+from fusiond.navigator.alignment.start import Start
 
 _SIZE = NAV_SIZE + 3
 SLOW_M_S = 5.0
-"""Speed below which a car's turn rate is limited by its steering: 0.75 m/s^2 are 9 deg/s."""
+"""Speed below which a car's turn rate is limited by its steering: 1.6 m/s^2 are 18 deg/s."""
+MOST_SIGMAS = 5.0
+"""Sigmas of the hardest manoeuvre: an error beyond them is a lie."""
 
 
 def solution_of(
@@ -36,11 +51,14 @@ def solution_of(
     mode: Mode,
     reason: str,
     bound: Bound,
-    drives: Vector3,
+    limits: Plausibility,
+    unshown: Start | None = None,
+    worse: float = 1.0,
 ) -> Solution:
     """The solution at `t_ns`; where that is later than the estimator's instant, carried ahead by
-    holding the rates of the newest sample, for `most_ns` at most. `drives`: as the
-    `manoeuvre` of fusiond.configuration.plausibility."""
+    holding the rates of the newest sample, for `most_ns` at most. `limits` of the vehicle's class;
+    `unshown`: the start, while nothing has shown the heading that it was claimed to have; `worse`:
+    how many times worse than its data sheet the inertial unit shows to be."""
     ahead_ns = min(t_ns - estimator.t_ns, most_ns)
     ahead_s = ahead_ns * 1e-9 if ahead_ns > 0 and imu.end else 0.0
     e, model, errors, out = estimator, estimator.model, estimator.sensor_errors, np.empty(_SIZE)
@@ -53,7 +71,11 @@ def solution_of(
     sd, bias = e.sigmas().tolist(), errors.tolist()
     silent_s = (t_ns - e.t_ns) * 1e-9 - ahead_s
     if silent_s > 0.0:
-        _widen_by_silence(sd, (v_n, v_e, v_d), e, silent_s, drives)
+        _widen_by_silence(sd, (v_n, v_e, v_d), e, silent_s, limits)
+    if worse > 1.0:
+        sd[6:9] = [min(worse * each, math.pi) for each in sd[6:9]]
+    if unshown is not None:
+        _widen_by_claim(sd, (lat, lon), (v_n, v_e), unshown)
     for k in model.unstated:
         sd[k] = math.nan
     if sd[2] > HEIGHT_KNOWN_SD_M or (model.hold_height and abs(height) < HELD_UNKNOWN_M):
@@ -76,9 +98,12 @@ def solution_of(
     )
 
 
-def _widen_by_silence(sd: list[float], v: Vector3, e: Estimator, s: float, drives: Vector3) -> None:
+def _widen_by_silence(
+    sd: list[float], v: Vector3, e: Estimator, s: float, limits: Plausibility
+) -> None:
     """Add the possible motion of `s` seconds to sigma (9,)."""
-    step, (north, east, down), (level, vertical, lasts_s) = e.step, v, drives
+    step, (north, east, down), (_, vertical, lasts_s) = e.step, v, limits.manoeuvre
+    level = limits.hardest_m_s2 / MOST_SIGMAS
     pull = math.hypot(step.item(STEP_SMOOTH_N), step.item(STEP_SMOOTH_N + 1)) + level
     banked = min(s / lasts_s, 1.0) * pull / STANDARD_GRAVITY_M_S2
     turned = abs(step.item(STEP_SMOOTH_RATE_B + 2)) + level / max(math.hypot(north, east), SLOW_M_S)
@@ -87,6 +112,22 @@ def _widen_by_silence(sd: list[float], v: Vector3, e: Estimator, s: float, drive
         sd[3 + row] = math.hypot(sd[3 + row], a * s)
     for row, angle in enumerate((banked, banked, turned * s)):
         sd[6 + row] = min(math.hypot(sd[6 + row], angle), math.pi)
+
+
+def _widen_by_claim(
+    sd: list[float], place: tuple[float, float], v: tuple[float, float], start: Start
+) -> None:
+    """Add to sigma (9,) what a claimed heading leaves open, of a vehicle at `place` (rad) with
+    velocity `v`, north and east."""
+    doubt, lat = math.pi / MOST_SIGMAS, start.nav.item(LAT)
+    east = math.remainder(place[1] - start.nav.item(LON), 2.0 * math.pi)
+    way_m = math.hypot(
+        (place[0] - lat) * meridian_radius(lat), east * transverse_radius(lat) * math.cos(lat)
+    )
+    for row, more in enumerate((way_m, math.hypot(*v))):
+        for axis in (3 * row, 3 * row + 1):
+            sd[axis] = math.hypot(sd[axis], doubt * more)
+    sd[8] = math.hypot(sd[8], doubt)
 
 
 def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:

@@ -1,4 +1,5 @@
-"""Navigation status: the mode of a running solution, from what is published of it.
+"""Navigation status: the mode of a running solution, from what is published of it, and what has
+become of the measurements.
 
 The first reason that holds is given; the order is that of their weight. What each mode means to who
 reads it: `fusiond.navigation.solution`.
@@ -7,17 +8,25 @@ reads it: `fusiond.navigation.solution`.
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Callable
 from typing import NamedTuple
 
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import VE, VN
+from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.alignment.start_check import StartTrial
+from fusiond.navigator.health_check import FailedMeasurements
 from fusiond.navigator.imu_screening import ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
+from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.reasons import joined, reason
+from fusiond.navigator.timeline import JUDGED, Entry
 
 
 class StartedNavigation(NamedTuple):
@@ -72,7 +81,7 @@ class NavigationStatus:
             return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
         if started.unconfirmed:
             return Mode.COASTING, joined((started.basis, started.unconfirmed))
-        if not self._units.fits and (why := self._units.unproven(self._estimator)) is not None:
+        if not self._units.fits and (why := self._units.unproven(self._estimator)[0]) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - started.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:
@@ -93,3 +102,68 @@ class NavigationStatus:
         if not math.hypot(sd.item(0), sd.item(1)) <= self._limits.invalid_sd_m:
             return reason("nothing_in_service")
         return None
+
+
+class OutcomeWatch:
+    """Hears of each entry of a timeline that has been applied, again after a rewind.
+
+    `coast_after_ns`: without a position for longer the next one is the `basis` of navigation."""
+
+    def __init__(
+        self,
+        coast_after_ns: int,
+        trial: StartTrial,
+        protection: ProtectionWatch,
+        failed: FailedMeasurements,
+        verdicts: Verdicts,
+        on_outcome: Callable[[Entry], None] | None,
+    ) -> None:
+        self._coast_after_ns, self._trial, self._protection = coast_after_ns, trial, protection
+        self._failed, self.verdicts, self._on_outcome = failed, verdicts, on_outcome
+        self.refused: dict[str, Counter[str]] = {}
+        """Refusals at the door by source and name."""
+        self.fused_ns: dict[str, int] = {}
+        """By source the last instant that was fused."""
+        self.position_ns = 0
+        self.basis = ""
+        """Why it navigates, in words: how its heading came about, or which fixes ended the last
+        coasting."""
+
+    def refuse(self, source: str, name: str) -> str:
+        """Count a refusal; its name."""
+        self.refused.setdefault(source, Counter())[name] += 1
+        return name
+
+    def begin(self, start: Start) -> str:
+        """A filter has been started so; why it navigates."""
+        self.position_ns = max(start.t_ns, self.position_ns)
+        self.basis = reason("heading_from", how=start.how)
+        return self.basis
+
+    def receive(self, entry: Entry) -> None:
+        """An entry has been applied."""
+        outcome, measurement = entry.outcome, entry.measurement
+        if outcome is None:
+            return
+        name, source = outcome.name, measurement.source
+        if self._trial.warm is not None and measurement.locates:
+            self._trial.warm.judge(source, name)
+        if name == "fused":
+            if not entry.judged and outcome.whitened:
+                entry.judged = True
+                self.verdicts.waiting.append((measurement, outcome))
+            t_ns = entry.key[0]
+            if t_ns > self.fused_ns.get(source, -1):
+                self.fused_ns[source] = t_ns
+            if measurement.locates and t_ns > self.position_ns:
+                if t_ns - self.position_ns > self._coast_after_ns:
+                    self.basis = reason("fixes_back", source=source)
+                self.position_ns = t_ns
+        if measurement.screened:
+            measurement.judged(outcome.rows, outcome.whitened)
+            if name in JUDGED:
+                self._protection.look(measurement)
+        if entry.error:
+            self._failed.report(source, entry.error)
+        if self._on_outcome is not None:
+            self._on_outcome(entry)

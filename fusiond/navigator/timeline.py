@@ -285,6 +285,8 @@ class Timeline:
             if self._isolates:
                 return estimator.update(measurement)
             one = diagnosis.comes(measurement, estimator)
+            if one.stale and not one.out:
+                return Outcome("repeated")
             if one.out:
                 outcome = estimator.look(
                     measurement, diagnosis.lasting(measurement, one, estimator)

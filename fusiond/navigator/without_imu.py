@@ -195,8 +195,8 @@ class WithoutImu:
         e = self.estimator
         assert e is not None
         mode, reason = self._mode(t_ns, e, why)
-        gap_ns, drives = round(GAP_S * 1e9), self._config.plausibility.manoeuvre
-        s = solution_of(e, self._imu, t_ns, gap_ns, mode, reason, bound, drives)
+        gap_ns, limits = round(GAP_S * 1e9), self._config.plausibility
+        s = solution_of(e, self._imu, t_ns, gap_ns, mode, reason, bound, limits)
         north, east, down = s.sd_ned_m
         # The position is that of the antennas, as far as nobody knows where they point.
         arm = self._arm_m

@@ -165,7 +165,9 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
 
 def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
     """Rejections by source and name, including satellites of raw epochs."""
-    found = {source: Counter(refused) for source, refused in navigator.refused.items()}
+    found = {
+        source: Counter(refused) for source, refused in navigator.outcome_watch.refused.items()
+    }
     for source, receiver in navigator.raw.items():
         if receiver.refused:
             found.setdefault(source, Counter()).update(receiver.refused)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome
-from fusiond.integrity.diagnosis import Correction, Diagnosis
+from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.integrity.fault_correction import Correction
 from fusiond.integrity.service import Series
 
 

@@ -82,7 +82,7 @@ def test_a_measurement_that_raises_at_the_door_is_refused(monkeypatch: pytest.Mo
     now = navigator.imu.latest_ns
     for _ in range(2):
         assert navigator.add(Height("baro", now, MonotonicStamp(now), 40.0), now) == "failed"
-    assert navigator.refused == {"baro": {"failed": 2}}
+    assert navigator.outcome_watch.refused == {"baro": {"failed": 2}}
     assert [code for code, _ in told] == ["aligned", "measurement_failed"]
 
 

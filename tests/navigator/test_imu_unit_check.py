@@ -73,17 +73,17 @@ def test_a_bias_of_no_data_sheet_is_not_vouched_for_until_a_bend_shows_the_unit(
     """Rates in deg/s have such a bias; so has a gyro that is worse than its sheet."""
     d, navigator = drive(), started()[0]
     estimator, units = navigator.estimator, RateUnits(SHEET_RAD_S, lambda code, text: None)
-    assert units.unproven(estimator) is None
+    assert units.unproven(estimator)[0] is None
     estimator.xi[navigator.model.slots_of(block)[axis]] = bias
-    assert str(units.unproven(estimator)).startswith(said)
+    assert str(units.unproven(estimator)[0]).startswith(said)
     navigator.imu.append(d.times[navigator.imu.end :], d.samples[navigator.imu.end :])
     fixes = [m for m in d.measurements if isinstance(m, PositionFix)]
     for m in fixes:
         units.fix(m, m.t_seen_ns, navigator.imu, ())
         turning = m.t_seen_ns > START_NS + 19_000_000_000  # 30 deg of the first bend
-        assert (units.unproven(estimator) is None) == turning
+        assert (units.unproven(estimator)[0] is None) == turning
     units.change()  # of the spare's unit nothing is known
-    assert str(units.unproven(estimator)).startswith(said)
+    assert str(units.unproven(estimator)[0]).startswith(said)
 
 
 def test_good_rates_are_not_spoken_of() -> None:

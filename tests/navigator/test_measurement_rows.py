@@ -70,6 +70,7 @@ def test_rows_are_what_measurements_are_one_by_one(
     assert diagnosis.findings == reference.findings
     names = {entry.outcome.name for entry in entries if entry.outcome is not None}
     assert ("isolated" in names) == (alter is not sound)
+    assert ("repeated" in names) == (alter is repeated)
     for name, series in reference.series.items():
         assert np.array_equal(diagnosis.series[name].noise, series.noise)
         assert diagnosis.series[name].repeating == series.repeating

@@ -114,7 +114,7 @@ def test_refusals_are_named_and_counted() -> None:
         expected.setdefault(m.source, Counter())[name] += 1
     assert navigator.add(fix, now, sd_time_s=1.0, seen_ns=now) == "time_unknown"
     expected["gnss"]["time_unknown"] += 1
-    assert navigator.refused == expected
+    assert navigator.outcome_watch.refused == expected
     before = state_bytes(navigator)
     navigator.advance()
     assert state_bytes(navigator) == before

@@ -284,7 +284,7 @@ def test_fixes_or_ranges_of_a_receiver_never_both() -> None:
         navigator = Navigator(Config.model_validate({"aiding": {"gnss": {"kind": kind}}}))
         navigator.add(fix, 0)
         navigator.add(epoch, 0)
-        assert navigator.refused["gnss"][refused] == 1
+        assert navigator.outcome_watch.refused["gnss"][refused] == 1
 
 
 # --------------------------------------------------------------------------- through `process`

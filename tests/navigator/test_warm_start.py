@@ -68,7 +68,7 @@ def _states() -> dict[float, WarmState]:
 def _restarted(state: WarmState, at_s: float, **callbacks: Any) -> tuple[Navigator, int]:
     """A navigator that gets the state and its first sample at `at_s`; the row that comes next."""
     navigator = Navigator(Config.model_validate(COLD), **callbacks)
-    navigator.warm = WarmStart(state, navigator.model)
+    navigator.trial.warm = WarmStart(state, navigator.model)
     d = drive()
     row = int(np.searchsorted(d.times, START_NS + round(at_s * 1e9)))
     navigator.add_imu(d.times[row : row + 1], d.samples[row : row + 1])
@@ -138,10 +138,10 @@ def test_it_navigates_once_a_fix_agrees_and_finds_back_to_the_filter_that_never_
     told: list[str] = []
     state = _states()[14.0]
     navigator, row = _restarted(state, 16.5, on_event=lambda code, text: told.append(code))
-    assert navigator.on_trial
+    assert navigator.trial.on_trial
     navigator.add(_fix(navigator), navigator.imu.latest_ns)
     navigator.advance()
-    assert not navigator.on_trial
+    assert not navigator.trial.on_trial
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
     for _ in _driven_on(navigator, row):
         assert np.abs(_ratios(navigator)).max() < 4.0
@@ -160,7 +160,7 @@ def test_a_heading_that_nothing_has_shown_is_not_shown_by_a_restart() -> None:
     assert reason.endswith("; not confirmed by motion yet")
     for _ in _driven_on(navigator, row):
         pass
-    assert not navigator.unconfirmed  # the course has
+    assert not navigator.trial.unconfirmed  # the course has
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 

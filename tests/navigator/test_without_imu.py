@@ -98,7 +98,7 @@ def test_it_navigates_by_fixes_and_says_that_nothing_tells_the_attitude() -> Non
     assert counts["gnss"]["fused"] > 25
     assert counts["gnss_velocity"]["fused"] > 25
     assert counts["gnss"]["no_alignment"] + counts["gnss"]["no_imu"] == 0
-    assert d.navigator.last_fused_ns["gnss"] > START_NS + 40 * runs.SECOND
+    assert d.navigator.outcome_watch.fused_ns["gnss"] > START_NS + 40 * runs.SECOND
 
 
 def test_the_unit_is_taken_in_when_it_comes() -> None:

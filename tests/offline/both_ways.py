@@ -47,7 +47,7 @@ def told(navigator: Navigator) -> Told:
     e = navigator.estimator
     outcomes = navigator.timeline.counters.outcomes
     ended = {source: dict(+counts) for source, counts in outcomes.items() if +counts}
-    refused = {source: dict(counts) for source, counts in navigator.refused.items()}
+    refused = {source: dict(counts) for source, counts in navigator.outcome_watch.refused.items()}
     reports = navigator.verdicts.reports()
     verdicts = {name: (r.verdict, r.window_verdict, r.k, r.alpha) for name, r in reports.items()}
     solution = navigator.solution(navigator.imu.latest_ns)

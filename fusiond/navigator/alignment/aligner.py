@@ -106,7 +106,7 @@ class Aligner:
             sources = (HEADING_SOURCES[name] for name in self._basis.options.heading)
             found = (source(self._basis, imu, place) for source in sources)
             start = next((s for s in found if s is not None), None)
-            if start is not None and self.known.contradicted_ns is not None:
+            if start is not None and self.known.contradicted_ns:
                 start = replace(start, contradicted=True)
         if start is None:
             upside_down = self.known.upside_down

@@ -35,7 +35,7 @@ from fusiond.navigation.rotation import (
 )
 from fusiond.navigator.alignment import motion_fit, sensed_motion
 from fusiond.navigator.alignment.basis import Basis
-from fusiond.navigator.alignment.evidence import Fix, Standstill
+from fusiond.navigator.alignment.evidence import TOGETHER_NS, Fix, Standstill
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.rest import rest_bias
 from fusiond.navigator.alignment.start import (
@@ -91,8 +91,8 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """Heading from the course over ground, forward or backward as sensed by the IMU."""
     known = by.known
     # A fix of before the first sample is one of a gap: nothing was felt since.
-    sensed = (f for f in reversed(known.fixes) if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns)
-    latest = next(sensed, None)
+    sensed = [f for f in known.fixes if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns]
+    latest = sensed[-1] if sensed else None
     if latest is None or latest.velocity.t_ns == known.tried_ns:
         return None  # the same data say the same
     speed = math.hypot(*latest.velocity.v_ned[:2])
@@ -100,10 +100,12 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         known.why = reason("no_heading_course", speed=by.options.course_speed_m_s)
         return None
     known.tried_ns = latest.velocity.t_ns
-    if not known.position_confirms(latest):
+    last = {f.source: f for f in sensed if latest.velocity.t_ns - f.velocity.t_ns <= TOGETHER_NS}
+    confirmed = [fix for fix in last.values() if known.position_confirms(fix)]
+    if not confirmed:
         known.why = reason("confirming_course")
         return None
-    s = known.standstill
+    latest, s = confirmed[-1], known.standstill
     here = known.place_of(latest.position, latest.velocity)
     if (
         s is not None
@@ -115,11 +117,12 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         if found is not None:
             return found if isinstance(found, Start) else None
     found = _on_the_move(by, imu, latest, here, imu.oldest_ns)
-    if found is None or known.contradicted_ns is None:
+    contradicted_ns = known.contradicted_ns.get(latest.source)
+    if found is None or contradicted_ns is None:
         return found
     # They fit, on the whole. But of those that the positions contradicted some were wrong, and a
     # jump of the velocity by 6 m/s among twenty is a force bias of 1 m/s^2 and a tilt of 5 deg.
-    return _on_the_move(by, imu, latest, here, known.contradicted_ns + 1)
+    return _on_the_move(by, imu, latest, here, contradicted_ns + 1)
 
 
 def _moved_off(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, insort
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -59,15 +60,22 @@ WAY_SCALE = 0.05
 LAG_SD_S = 0.1
 # One sigma of gravity by the ellipsoid: anomalies, and heights that nobody knows.
 GRAVITY_SD = 5e-4
+# Velocities that positions have contradicted so often have to agree with them for so long before
+# they tell a course: who is off by a metre a second then shows it by four sigma of fixes of a
+# metre. One or two are a fix that strays.
+CONTRADICTED, CONFIRMED_AGAIN_NS = 3, 5_000_000_000
+# Positions of two devices within so long are of one instant, but for the way between.
+TOGETHER_NS = 1_500_000_000
 # After so long positions that are too coarse to confirm a velocity need not.
 CONFIRMED_S = 15.0
 
 
 class Fix(NamedTuple):
-    """A measurement that offered both."""
+    """A measurement that offered both, and its source."""
 
     velocity: VelocityCandidate
     position: PositionCandidate
+    source: str = ""
 
 
 def _instant(fix: Fix) -> int:
@@ -134,14 +142,18 @@ class AlignmentEvidence:
         self.compass: HeadingCandidate | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
-        self.contradicted_ns: int | None = None
-        """Last fix at which positions contradicted their receiver's velocities beyond chance; which
-        earlier ones were wrong is unknown."""
+        self.contradicted_ns: dict[str, int] = {}
+        """By source the last fix at which positions had moved otherwise than the velocities of
+        their receiver, and not by chance: which of those before it were wrong nobody knows."""
+        self._contradictions: Counter[str] = Counter()
+        """How many such fixes, by source."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
         self._position: PositionCandidate | None = None
         self._positions: list[PositionCandidate] = []
+        self._by_source: dict[str, PositionCandidate] = {}
+        """The last position of each source."""
 
     def window(self, latest: Window) -> None:
         """A window of the standstill detector has ended.
@@ -204,6 +216,7 @@ class AlignmentEvidence:
                 case HeadingCandidate():
                     self.heading = candidate
         if position is not None:
+            self._by_source[measurements[0].source] = position
             insort(self._positions, position, key=lambda p: p.t_ns)
             del self._positions[:-MOST_POSITIONS]
         if position is not None and (
@@ -213,7 +226,7 @@ class AlignmentEvidence:
         if velocity is not None:
             self._speed = math.hypot(*velocity.v_ned[:2])
             if position is not None:
-                self._keep(Fix(velocity, position))
+                self._keep(Fix(velocity, position, measurements[0].source))
 
     @property
     def resting(self) -> bool:
@@ -275,13 +288,15 @@ class AlignmentEvidence:
     def position_confirms(self, latest: Fix) -> bool:
         """True if the positions confirm the direction of the velocities, over a distance that would
         expose the opposite, without divergence."""
-        way, before, trend = np.zeros(2), self.fixes[0], NO_TREND
-        first = before.position
-        if before is latest:
+        source = latest.source
+        fixes = [fix for fix in self.fixes if fix.source == source]
+        if fixes[0] is latest:
             return False
+        way, before, trend = np.zeros(2), fixes[0], NO_TREND
+        first = before.position
         metres = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
         moved, count = np.zeros(2), 0
-        for fix in self.fixes:
+        for fix in fixes:
             position = fix.position
             if position.t_ns > latest.position.t_ns:
                 break
@@ -302,8 +317,11 @@ class AlignmentEvidence:
         sd_slope = math.hypot(sd_slope, max(sd_v / math.sqrt(count), LEAST_SD_M_S), lag)
         sigmas = max(math.hypot(*(moved - way)) / sd, slope / sd_slope)
         if sigmas > SUSPECT_SIGMAS:
-            self.contradicted_ns = latest.velocity.t_ns
-        if sigmas > CONTRADICTION_SIGMAS:
+            self.contradicted_ns[source] = latest.velocity.t_ns
+            self._contradictions[source] += 1
+        agreed_ns = latest.velocity.t_ns - self.contradicted_ns.get(source, -ANY_TIME_NS)
+        again = self._contradictions[source] >= CONTRADICTED and agreed_ns < CONFIRMED_AGAIN_NS
+        if sigmas > CONTRADICTION_SIGMAS or again:
             return False
         return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 
@@ -404,7 +422,24 @@ class AlignmentEvidence:
         if velocity is not None:
             moved = velocity_of(velocity)[0] * ((velocity.t_ns - p.t_ns) * 1e-9)
             where += as_geodetic(moved, p.lat_rad)
-        return Place(p, where, max(p.sd[:2]), sd_height)
+        return Place(p, where, math.hypot(max(p.sd[:2]), self._contradicts(p)), sd_height)
+
+    def _contradicts(self, p: PositionCandidate) -> float:
+        """How far (m) a position is from another source's of that time, beyond what both may be
+        off: which of them is, nobody knows."""
+        largest = 0.0
+        for source, other in self._by_source.items():
+            apart_s = abs(other.t_ns - p.t_ns) * 1e-9
+            suspect = other.t_ns - self.contradicted_ns.get(source, -ANY_TIME_NS) < FIXES_NS
+            if other is p or suspect or apart_s > TOGETHER_NS * 1e-9:
+                continue
+            moved = np.array([other.lat_rad - p.lat_rad, other.lon_rad - p.lon_rad])
+            moved[1] = math.remainder(float(moved[1]), 2.0 * math.pi)
+            away = math.hypot(*(moved / as_geodetic(np.ones(3), p.lat_rad)[:2]).tolist())
+            sd = math.hypot(max(p.sd[:2]), max(other.sd[:2]))
+            if away - self._speed * apart_s > CONTRADICTION_SIGMAS * sd:
+                largest = max(largest, away)
+        return largest
 
     def _reported(self) -> tuple[tuple[float, float, float | None], float] | None:
         """Position (rad, rad, m) by the configuration or the saved state, and one sigma (m)."""

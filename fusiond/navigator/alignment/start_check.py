@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.rest_evidence import RestEvidence
+from fusiond.estimators.base import Estimator
+from fusiond.integrity.catalogue import SENSOR
+from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_elements, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
 from fusiond.navigator.alignment.headings import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.reasons import reason
+from fusiond.navigator.state_file import RefusedStateError
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from fusiond.navigator.warm_start import WarmStart
 
 # Sigmas of heading and course beyond which a claimed heading is contradicted, and for how long: an
 # obstacle that the vehicle slides at takes less.
@@ -31,7 +38,7 @@ class StartCheck:
     """Check of a start; `refuted` is the reason why it was wrong."""
 
     def __init__(self, options: AlignmentOptions, start: Start) -> None:
-        self._options = options
+        self._options, self._start = options, start
         self._claim = start.origin if start.origin in CLAIMS else ""
         self._sd_yaw = math.sqrt(start.covariance[2, 2])
         on_wheels = options.no_slip_m is not None and math.isfinite(options.max_reverse_m_s)
@@ -43,19 +50,22 @@ class StartCheck:
         hypothesis until the first motion, as is one saved without motion; another saved heading was
         measured before the vehicle was parked. Apparent driving backward is driving forward with a
         reversed IMU until the vehicle drives forward, too."""
+        self.unshown: Start | None = None
+        """The start, until something has shown the heading that it claims."""
         self._say()
 
     def _say(self) -> None:
+        self.unshown = self._start if self._unproven else None
         if self._backward:
             self.unconfirmed = reason("backward_or_mounted")
         else:
             self.unconfirmed = reason("not_confirmed_by_motion") if self._unproven else ""
 
     def refuted(
-        self, t_ns: int, nav: Array, covariance: Array, measured: RestEvidence, doubted: bool
+        self, e: Estimator, diagnosis: Diagnosis, measured: RestEvidence
     ) -> tuple[str, str] | None:
-        """Code and text of the event if the solution nav (10,) with P (n, n) at `t_ns` refutes the
-        start. `doubted`: it has not fitted the measurements since."""
+        """Code and text of the event, if the solution refutes the start."""
+        t_ns, nav, covariance = e.t_ns, e.nav, e.covariance
         axes = dcm_elements(nav[Q0:])
         v_n, v_e, v_d = nav[VN : VN + 3].tolist()
         backward = -(axes[0] * v_n + axes[3] * v_e + axes[6] * v_d)
@@ -69,13 +79,29 @@ class StartCheck:
             self._say()
         if not self._claim:
             return None
-        if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw and not doubted:
+        # It has not fitted the measurements since; or some are out of service, which may be right.
+        doubted = any(f.kind.of == SENSOR for f in diagnosis.findings)
+        left_out = bool(diagnosis.excluded)
+        velocity, yaw = measured.velocity(t_ns - COURSE_NS, t_ns), math.atan2(axes[3], axes[0])
+        sd_yaw = math.sqrt(covariance[2, 2])
+        if (
+            self._unproven
+            and sd_yaw < DETERMINED * self._sd_yaw
+            and not (doubted or left_out)
+            and (velocity is None or self._along(velocity, yaw, sd_yaw))
+        ):
             self._unproven = False
             self._say()
-        velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
-        return velocity and self._heading(
-            t_ns, velocity, math.atan2(axes[3], axes[0]), math.sqrt(covariance[2, 2]), doubted
-        )
+        return velocity and self._heading(t_ns, velocity, yaw, sd_yaw, doubted)
+
+    def _along(self, velocity: tuple[float, float, float], yaw: float, sd_yaw: float) -> bool:
+        """True if a measured velocity is one along the heading, forward or backward, as far as it
+        tells."""
+        north, east, sd_speed = velocity
+        speed = math.hypot(north, east)
+        residual = abs(wrap_angle(math.atan2(east, north) - yaw))
+        sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / max(speed, 1e-9))
+        return min(residual, math.pi - residual) <= HEADING_SIGMAS * sd
 
     def _heading(
         self,
@@ -93,13 +119,11 @@ class StartCheck:
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
             self._since_ns = None
             return None
-        residual = abs(wrap_angle(math.atan2(east, north) - yaw))
-        sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
         if doubted:
             return "heading_contradicted", (
                 f"The first motion disagrees with the {self._claim}: aligning again by the course"
             )
-        if min(residual, math.pi - residual) <= HEADING_SIGMAS * sd:
+        if self._along(velocity, yaw, sd_yaw):
             self._claim, self._unproven = "", False
             self._say()
             return None
@@ -107,6 +131,46 @@ class StartCheck:
             self._since_ns = t_ns
         if t_ns - self._since_ns < CONTRADICTED_NS:
             return None
+        residual = abs(wrap_angle(math.atan2(east, north) - yaw))
         return "heading_contradicted", (
             f"The {self._claim} is {math.degrees(residual):.0f} deg from the course: aligning again"
         )
+
+
+class StartTrial:
+    """Trial of each start of a navigator; `on_event(code, text)` hears of a state that is
+    refused."""
+
+    def __init__(self, options: AlignmentOptions, on_event: Callable[[str, str], None]) -> None:
+        self._options, self._event = options, on_event
+        self.check: StartCheck | None = None
+        self.warm: WarmStart | None = None
+        """A start to be tried before any alignment, and its trial."""
+
+    def first(self, imu: ImuBuffer) -> Start | None:
+        """The start from the state of the last run, at the first sample; there is one attempt."""
+        if self.warm is None or not imu.end:
+            return None
+        try:
+            return self.warm.start(imu.oldest_ns)
+        except RefusedStateError as error:
+            self._event("warm_state_refused", str(error))
+            self.warm = None
+            return None
+
+    def begin(self, start: Start) -> None:
+        """A filter has been started so."""
+        self.check = StartCheck(self._options, start)
+
+    @property
+    def on_trial(self) -> bool:
+        """Started from the state of the last run, and no position measurement has confirmed it
+        yet."""
+        return self.warm is not None and self.warm.on_trial
+
+    @property
+    def unconfirmed(self) -> str:
+        """Condition of the heading that nothing has shown, in words; empty where it does not."""
+        if self.warm is not None and self.warm.on_trial:
+            return reason("not_confirmed_by_fix")
+        return self.check.unconfirmed if self.check else ""

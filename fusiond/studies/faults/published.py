@@ -59,7 +59,8 @@ class Published:
     @property
     def there(self) -> Bools:
         """Mask of epochs with a solution."""
-        found: Bools = (self.modes != "") & ~np.isin(self.modes, SILENT)
+        nothing = (self.modes == str(Mode.INVALID)) & np.isnan(self.errors).all(axis=1)
+        found: Bools = (self.modes != "") & ~np.isin(self.modes, SILENT) & ~nothing
         return found
 
     @property

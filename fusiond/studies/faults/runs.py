@@ -241,7 +241,8 @@ def compared(
 ) -> Sample:
     """Compare a solution with that row of true states, known to `true_sd` (m, m/s, rad)."""
     t_s = solution.t_ns * 1e-9
-    if solution.mode in (Mode.WAITING, Mode.ALIGNING):
+    nothing = solution.mode is Mode.INVALID and math.isnan(solution.lat_rad)
+    if nothing or solution.mode in (Mode.WAITING, Mode.ALIGNING):
         return Sample(t_s, str(solution.mode))
     v_ned, rpy = true.v_ned[row].tolist(), true.rpy[row].tolist()
     place = _position_error_m(solution, true.position[row])
