@@ -31,12 +31,12 @@ added to B and C once, when they are cloned,
 
     (B, C) += G n(a),   G = (H^T W H + I)^-1 H^T W,   H = [-u_a, -1],   W = diag(1 / s_i^2)
 
-(I, (1 m)^-2, lets a direction that too few satellites measure have none.) With it goes what orbits
-and clocks have drifted by since the anchor before, (d^2 age): coherent for minutes, it makes no
-velocity, but a place that three or four satellites have held for long is off by many times that.
-What is left of n(a) is a
-constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its leverage, which least squares
-do not see. It shows in their residuals v of z, and is taken off,
+(I, (1 m)^-2, lets a direction that too few satellites measure have none.) Beside it B and C walk by
+what of the satellites' own drift looks like one, G cov(d) G^T a second, d of `DRIFT_M_SQRT_S` each
+(fusiond.aiding.carrier_anchor_noise): orbits and clocks drift for minutes, three or four satellites
+make many times as much of a place, and what is added at the anchor alone the inertial unit bridges.
+What is left of n(a) is a constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its
+leverage, which least squares do not see. It shows in their residuals v of z, and is taken off,
 
     z <- z - b,   V <- V + (q thin)^2 dt,   K = V / (f V + s^2),   b <- b + K v,   V <- (1 - K f) V
 
@@ -84,8 +84,8 @@ SLOTS, COLUMNS = 3 * 64, 9
 """Shape of an epoch's output: one row for each satellite, by its slot."""
 _ALIVE, _CARRIER, _X, _ISSUE, _OFFSET, _V, _LAST = 0, 1, 2, 5, 6, 7, 8
 # Slot 0 is no satellite's: 1 if there is an anchor; when it was (s); sums of d^2 / 2 s^2 and of
-# their degrees of freedom.
-_THERE, _T, _SUM, _COUNT = range(4)
+# their degrees of freedom; until when it has walked (s).
+_THERE, _T, _SUM, _COUNT, _WALKED = range(5)
 
 LONGEST_S = 30.0
 """Longest age (s): a line of sight turns by 4 mrad within it, 2 mm for a position error of 0.5 m.
@@ -95,12 +95,6 @@ ENOUGH = 4
 """Fewest carriers that determine position and clock."""
 ON_EARTH_M = 1e6
 """Least distance (m) of a position from the earth's centre; without a clone the state is 0."""
-FLOOR_M = 1e-3
-"""Least sigma of a clock: a covariance in which one part equals another to the last digit becomes
-indefinite after some updates."""
-DRIFT_M_SQRT_S = 0.011
-"""Random walk of orbits and clocks over minutes, from 2 mm/s that last for 30 s: 0.16 m in 200 s,
-and errors of 0.5 m that last for half an hour change by 0.24 m."""
 PRIOR_COUNT, MOST_COUNT = 20.0, 1000.0
 """Weight of the modelled phase noise in independent phases, and the number after which old ones are
 forgotten by halves: a minute of a sky at 1 Hz."""
@@ -115,11 +109,6 @@ def phase_scale(before: Array) -> float:
     """Factor on the model's variances of phases."""
     found: float = (PRIOR_COUNT + before[0, _SUM]) / (PRIOR_COUNT + before[0, _COUNT])
     return min(max(found, SCALE[0]), SCALE[1])
-
-
-def anchor_s(before: Array) -> float:
-    """Instant (s) of the anchor; infinity without one."""
-    return before.item(_T) if before.item(_THERE) > 0.0 else math.inf
 
 
 @compiled("b1(f8[:, ::1], i8, f8[:, ::1])", forceinline=True)
@@ -150,7 +139,7 @@ def since_anchor(
 
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8)")
-def _inverse(a: Array, out: Array, more: float) -> None:
+def invert(a: Array, out: Array, more: float) -> None:
     """Write the inverse of A + `more` I (4, 4), which is positive definite, by Gauss-Jordan
     elimination."""
     for i in range(4):
@@ -202,7 +191,7 @@ def antenna(nav: Array, l0: float, l1: float, l2: float, place: Array, of_error:
 
 
 @compiled("f8(f8[:, ::1], i8, f8[::1], f8[::1])", forceinline=True)
-def _sight(values: Array, k: int, place: Array, row: Array) -> float:
+def sight(values: Array, k: int, place: Array, row: Array) -> float:
     """Write H of a satellite from a place (4,); its distance."""
     x, y, z = values[X, k] - place[0], values[X + 1, k] - place[1], values[X + 2, k] - place[2]
     distance = math.sqrt(x * x + y * y + z * z)
@@ -232,7 +221,7 @@ def _fit(
         if state[_ALIVE] == 0.0:
             continue
         count += 1
-        distance = _sight(values, k, place, sights[k])
+        distance = sight(values, k, place, sights[k])
         x, y, w = state[_X] - anchor[0], state[_X + 1] - anchor[1], state[_X + 2] - anchor[2]
         there = math.sqrt(x * x + y * y + w * w)
         whole = distance - there - (values[CARRIER, k] - state[_CARRIER])
@@ -245,7 +234,7 @@ def _fit(
             of_z[1, i] += weighted * z[1, k]
             for j in range(4):
                 information[i, j] += weighted * sights[k, j]
-    _inverse(information, inverse, 1.0)
+    invert(information, inverse, 1.0)
     for kind in range(2):
         for i in range(4):
             solved[i] = 0.0
@@ -342,7 +331,7 @@ def go_on(
     holds = waiting == 0 or (age < WAITS_S and alive >= ENOUGH)
     if known and holds and 0.0 <= age < LONGEST_S:
         return False
-    left[0, _THERE], left[0, _T] = 1.0, t_s
+    left[0, _THERE], left[0, _T], left[0, _WALKED] = 1.0, t_s, t_s
     for k in range(values.shape[1]):
         if math.isfinite(values[CARRIER, k]):
             state = left[int(values[SLOT, k])]
@@ -352,40 +341,3 @@ def go_on(
             for i in range(3):
                 state[_X + i] = values[X + i, k]
     return True
-
-
-@compiled("void(f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True)
-def phase_noise(values: Array, place: Array, age: float, left: Array, noise: Array) -> None:
-    """Write the covariance (4, 4) that an anchor's phases add to B and C.
-
-    That with what has changed over the `age` (s) of the one before it. To `left` goes the variance
-    of each satellite's constant.
-    """
-    information, inverse, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
-    scale, spread = phase_scale(left), np.zeros((4, 4))
-    changed = DRIFT_M_SQRT_S * DRIFT_M_SQRT_S * age
-    for k in range(values.shape[1]):
-        if math.isfinite(values[CARRIER, k]):
-            _sight(values, k, place, row)
-            for i in range(4):
-                for j in range(4):
-                    part = row[i] * row[j] / (scale * values[CARRIER_VARIANCE, k])
-                    information[i, j] += part
-                    spread[i, j] += part * (1.0 + changed / (scale * values[CARRIER_VARIANCE, k]))
-    _inverse(information, inverse, 1.0)
-    for k in range(values.shape[1]):
-        if math.isfinite(values[CARRIER, k]):
-            _sight(values, k, place, row)
-            variance = scale * values[CARRIER_VARIANCE, k]
-            for i in range(4):
-                for j in range(4):
-                    variance -= row[i] * inverse[i, j] * row[j]
-            left[int(values[SLOT, k]), _V] = max(variance, 0.0)
-    for i in range(4):
-        for j in range(i + 1):
-            total = 0.0
-            for p in range(4):
-                for q in range(4):
-                    total += inverse[i, p] * spread[p, q] * inverse[j, q]
-            noise[i, j] = noise[j, i] = total
-        noise[i, i] += FLOOR_M * FLOOR_M

@@ -77,12 +77,11 @@ from fusiond.aiding.carrier_anchor import (
     VALUES,
     VX,
     X,
-    anchor_s,
     anchored,
     antenna,
     go_on,
-    phase_noise,
 )
+from fusiond.aiding.carrier_anchor_noise import phase_noise, walk_noise
 from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
@@ -100,7 +99,7 @@ _BLOCKS = (
     *((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS, RANGE_SHARED),
     *((CARRIER_ANCHOR,), (CARRIER_CLOCK,)),
 )
-_NOTHING_KEPT = np.zeros((4, 4))
+_NOTHING_KEPT, _ALL_KEPT = np.zeros((4, 4)), np.eye(4)
 NO_CLOCK = -1
 """Index of a range without a receiver clock offset."""
 
@@ -330,8 +329,10 @@ class PseudorangeMeasurement(AidingMeasurement):
         place[3] = 0.0
         of_rows, t_s = np.array(codes, np.int64), self.t_ns * 1e-9
         of = self._ranges, t_s, cloned, place, anchor, self.before, self.left
-        if not go_on(self.values, of_rows, *of):
-            return None
-        noise, last_s = np.empty((4, 4)), anchor_s(self.before)
-        phase_noise(self.values, place, max(t_s - last_s, 0.0), self.left, noise)
-        return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
+        noise = np.empty((4, 4))
+        if go_on(self.values, of_rows, *of):
+            phase_noise(self.values, place, self.left, noise)
+            return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
+        if cloned and walk_noise(self.values, place, t_s, self.left, noise):
+            return Renewal(_CLONED, _ALL_KEPT, noise)
+        return None

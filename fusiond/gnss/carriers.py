@@ -29,7 +29,19 @@ been followed since the satellite's epoch before: ways from an anchor epoch are 
 (fusiond.aiding.carrier_anchor). s_L by a model of C/N0 and a scale, learned in the same way from
 d(L_a - L_b) of variance 2 (s_La^2 + s_Lb^2).
 
-Refused, of each satellite: `lock_lost` (the receiver says so), `cycle_slip` (the carriers part by
+The carrier tells of a reflection, too: what a code is longer than its carrier, d = P_a - L_a,
+changes by 2 dI in itself, millimetres a second. With D its mean over the last `MEANS_S` while the
+carrier is followed, m seconds long at first, and s^2 (1 + 1 / m) the variance of d - D, s^2 that of
+a code by the model and a scale that the receiver's own d show (over a slip, which changes D, too,
+by the Dopplers),
+
+    d - D > 4 s    `multipath`, until d - D < 2 s, two minutes at most
+    d - D < -4 s   D was too long
+
+A code that comes by a wall is longer, never shorter: what falls back shows that it was.
+
+Refused, of each satellite: `multipath`, all of it; of its carrier alone: `lock_lost` (the receiver
+says so), `cycle_slip` (the carriers part by
 more than the ionosphere can, or the rate is not that of the Dopplers); of all at once:
 `clock_jump`.
 
@@ -58,15 +70,18 @@ FIRST_COLUMNS, SECOND_COLUMNS = 7, 5
 P_A, RATE, CNO, SD_A, SD_RATE, CARRIER_A, LOCK_A = range(FIRST_COLUMNS)
 P_B, CNO_B, SD_B, CARRIER_B, LOCK_B = range(SECOND_COLUMNS)
 # What is kept of a satellite: of its first signal, of its pair; times and numbers of 0: nothing.
-SLOTS, KEPT_COLUMNS = 3 * 64, 9
-_T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V = range(KEPT_COLUMNS)
-# Slot 0 is no satellite's: sum of w nu^2 / (A + V) and of w; the same of changes of two carriers.
-_SUM, _COUNT, _PHASES, _PHASE_COUNT = range(4)
+SLOTS, KEPT_COLUMNS = 3 * 64, 12
+(
+    _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V, _BESIDE, _MANY, _APART,
+) = range(KEPT_COLUMNS)  # fmt: skip
+# Slot 0 is no satellite's: sum of w nu^2 / (A + V) and of w; the same of changes of two carriers,
+# and of codes beside their carriers.
+_SUM, _COUNT, _PHASES, _PHASE_COUNT, _CODES, _CODE_COUNT = range(6)
 # What comes out; NaN: nothing known.
 OUT_COLUMNS = 6
 SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_COLUMNS)
-# Refusals of a satellite's carrier, by what `follow` writes.
-FOLLOWED, LOCK_LOST, CYCLE_SLIP = 0, 1, 2
+# Refusals of a satellite's carrier, or of all of it, by what `follow` writes.
+FOLLOWED, LOCK_LOST, CYCLE_SLIP, MULTIPATH = 0, 1, 2, 3
 
 CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
 """Constants of `fusiond.gnss.ranges.RangeNoise`. The first is a mean over a uniform sky above 10
@@ -87,6 +102,11 @@ CLIPPED = 9.0
 """No change of two carriers counts as more than three sigma: a slip is no noise."""
 MULTIPATH_S = 60.0
 """Duration of code multipath: minutes at rest, seconds in motion."""
+MEANS_S, LEAST_S = 20.0, 5.0
+"""Of a code beside its carrier: long against the noise of codes, short against the multipath that
+comes and goes with the sky; and what must be known of it."""
+APART_SIGMAS, BACK_SIGMAS = 4.0, 2.0
+"""One in 30,000 sound codes is beyond the first, were codes' noise white."""
 LONGEST_S = 2.0
 """Longest interval over which Dopplers detect a slip."""
 FORGOTTEN_S = 120.0
@@ -170,6 +190,55 @@ def _delay(
     state[_V] *= 1.0 - gain
 
 
+@compiled("b1(f8[::1], f8[::1], f8, f8, f8, f8, f8, f8[::1])")
+def _apart(
+    state: Array,
+    first: Array,
+    length: float,
+    now: float,
+    span: float,
+    slipped: float,
+    scale: float,
+    seen: Array,
+) -> bool:
+    """True if the code has gone from its carrier of that `length` (m), which has `slipped` by so
+    much (m; NaN: nobody knows). Adds to the sums of what has been `seen` of codes beside their
+    carriers."""
+    beside, model = first[P_A] - length, _code_variance(first[CNO], first[SD_A], 1.0)
+    state[_BESIDE] -= slipped
+    if state[_MANY] == 0.0 or math.isnan(beside) or math.isnan(state[_BESIDE]):
+        state[_BESIDE], state[_APART] = beside, 0.0
+        state[_MANY] = 0.0 if math.isnan(beside) else min(span, 1.0)
+        return False
+    e, wider = beside - state[_BESIDE], 1.0 + 1.0 / max(state[_MANY], 1.0)
+    sigma = math.sqrt(scale * model * wider)
+    if state[_APART] > 0.0 and e < BACK_SIGMAS * sigma:
+        state[_APART] = 0.0
+    if state[_APART] == 0.0 and e > APART_SIGMAS * sigma and state[_MANY] >= LEAST_S:
+        state[_APART] = now
+    if state[_APART] > 0.0 and now - state[_APART] < FORGOTTEN_S:
+        return True
+    if state[_APART] > 0.0 or (e < -APART_SIGMAS * sigma and state[_MANY] >= LEAST_S):
+        state[_BESIDE], state[_MANY], state[_APART] = beside, min(span, 1.0), 0.0
+        return False
+    w = min(span, 1.0)
+    seen[_CODES] += w * min(e * e / (model * wider), CLIPPED * scale)
+    seen[_CODE_COUNT] += w
+    state[_MANY] = min(state[_MANY] + w, MEANS_S)
+    state[_BESIDE] += w / state[_MANY] * e
+    return False
+
+
+@compiled("f8(f8[:, ::1], i8)", forceinline=True)
+def _shown(kept: Array, of: int) -> float:
+    """Factor that sums in slot 0 show, whose first is `of`; they are halved when they grow old."""
+    if kept[0, of + 1] > MOST_COUNT:
+        kept[0, of] *= 0.5
+        kept[0, of + 1] *= 0.5
+    found: float = (PRIOR_COUNT + kept[0, of]) / (PRIOR_COUNT + kept[0, of + 1])
+    return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
+
+
 @compiled("void(f8[::1], f8[::1], f8[::1], f8, f8[::1])")
 def _write_rates(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
     """Write the slant delay, its variance, and twice its covariance with the code."""
@@ -196,16 +265,10 @@ def follow(
     out: Array,
     refused: npt.NDArray[np.int64],
 ) -> int:
-    """Take in an epoch at `now` (s); whether the clock jumped. `kept` (SLOTS, 7) is changed; `plan`
-    (n, 7), `first` (n, 7), `second` (n, 5); writes `out` (n, 6) and `refused` (n,)."""
+    """Take in an epoch at `now` (s); whether the clock jumped. `kept` (SLOTS, 12) is changed;
+    `plan` (n, 8), `first` (n, 7), `second` (n, 5); writes `out` (n, 6) and `refused` (n,)."""
     n = plan.shape[0]
-    scale = scale_squared(kept)
-    phases = (PRIOR_COUNT + kept[0, _PHASES]) / (PRIOR_COUNT + kept[0, _PHASE_COUNT])
-    phases = min(max(phases, SCALE_SQUARED[0]), SCALE_SQUARED[1])
-    for j in (_COUNT, _PHASE_COUNT):
-        if kept[0, j] > MOST_COUNT:
-            kept[0, j] *= 0.5
-            kept[0, j - 1] *= 0.5
+    scale, phases, codes = _shown(kept, _SUM), _shown(kept, _PHASES), _shown(kept, _CODES)
     residuals, moved = np.empty(n), np.empty(n)
     many = 0
     for i in range(n):
@@ -239,6 +302,8 @@ def follow(
         state = kept[int(plan[i, SLOT])]
         span = now - state[_T]
         if span <= 0.0:  # seen already
+            if state[_APART] > 0.0:
+                refused[i] = MULTIPATH
             _write_rates(state, plan[i], first[i], scale, out[i])
             continue
         l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
@@ -261,6 +326,14 @@ def follow(
             d = moved[i] - 0.5 * (first[i, RATE] + state[_RATE]) - common
             if slipped or abs(d) > max(SLIP_RATE_M_S, plan[i, LENGTH_A] / span):
                 refused[i] = CYCLE_SLIP
+        lost = 0.0
+        if jumped or span > LONGEST_S or state[_SIGNAL] != plan[i, SIGNAL]:
+            lost = math.nan
+        elif out[i, SPAN] == 0.0 or refused[i] != FOLLOWED:
+            rate = 0.5 * (first[i, RATE] + state[_RATE]) + common
+            lost = l_a - state[_L_A] - rate * span
+        if _apart(state, first[i], l_a, now, span, lost, codes, kept[0]):
+            refused[i] = MULTIPATH
         if jumped or refused[i] != FOLLOWED:
             out[i, SPAN] = 0.0
         if pair:

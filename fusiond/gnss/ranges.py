@@ -21,8 +21,9 @@ this receiver's are (`fusiond.gnss.carriers`).
 
 Which signals of a satellite serve: `fusiond.gnss.plan`.
 
-Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`; of carriers, which
-then wait for a new anchor, `lock_lost`, `cycle_slip`, and of all at once `clock_jump`.
+Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`, `multipath` (the
+code has gone from its carrier); of carriers, which then wait for a new anchor, `lock_lost`,
+`cycle_slip`, and of all at once `clock_jump`.
 """
 
 from __future__ import annotations
@@ -159,12 +160,14 @@ class Followed(NamedTuple):
     """Picked signals with the results of their carriers (n, 6).
 
     Everything that needs no receiver: those results after the epochs before, the factors on the
-    model's sigmas of codes, and the carriers without a result, with the reason."""
+    model's sigmas of codes, the carriers without a result, with the reason, and which codes (n,)
+    have gone from their carriers; None: none."""
 
     picked: Picked
     carriers: Array
     code_scale: float
     slips: tuple[tuple[str, str], ...]
+    apart: npt.NDArray[np.bool_] | None = None
 
 
 def nothing_kept() -> Array:
@@ -227,14 +230,16 @@ class RangeModel:
         jumped = ca.follow(kept, *args)
         scale = math.sqrt(ca.scale_squared(kept))
         slips: tuple[tuple[str, str], ...] = ()
+        apart = None
         if refused.any():
             slips = tuple(
                 (plan.satellites[k], "lock_lost" if refused[k] == ca.LOCK_LOST else "cycle_slip")
-                for k in np.flatnonzero(refused)
+                for k in np.flatnonzero((refused == ca.LOCK_LOST) | (refused == ca.CYCLE_SLIP))
             )
+            apart = refused == ca.MULTIPATH
         if jumped:
             slips += (("", "clock_jump"),)
-        return Followed(picked, carriers, scale, slips)
+        return Followed(picked, carriers, scale, slips, apart)
 
     def evaluate(self, followed: Followed, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
@@ -260,12 +265,18 @@ class RangeModel:
         out[rk.SLOT], out[rk.ISSUE] = plan.followed[:, ca.SLOT], plan.issues
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
-        if not lost:
+        if not lost and followed.apart is None:
             return rows
         weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
-        drop = weak | (out[rk.ELEVATION] < options.elevation_mask_rad)
+        low = out[rk.ELEVATION] < options.elevation_mask_rad
+        drop = weak | low
+        if followed.apart is not None:
+            drop |= followed.apart
         rows.refused += tuple(
-            (satellites[k], "weak_signal" if weak[k] else "low_elevation")
+            (
+                satellites[k],
+                "weak_signal" if weak[k] else "low_elevation" if low[k] else "multipath",
+            )
             for k in np.flatnonzero(drop)
         )
         return rows.only(~drop)

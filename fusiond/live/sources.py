@@ -31,7 +31,7 @@ from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.raw_gnss import Seen
+from fusiond.navigator.raw_sky import Seen
 from fusiond.navigator.source_status import worst
 from fusiond.outputs.messages.fault import FaultReport, fault_report
 from fusiond.outputs.messages.health import BeamHealth, SatelliteHealth, SkyHealth, SourceHealth

@@ -164,7 +164,6 @@ class RateUnits:
         has turned, and their size in sigmas of the sheet: the unit's noise and scale may be as many
         times worse. None and 1 for normal biases."""
         if self.fits:
-        if self.fits:
             return None, 1.0
         model = estimator.model
         if self._first is None or self._first[0] is not model:

@@ -24,7 +24,7 @@ from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCand
 from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeMeasurement, nothing_left
 from fusiond.configuration.aiding import RawAiding
-from fusiond.estimators.screening import KEPT, RESIDUAL
+from fusiond.estimators.screening import KEPT
 from fusiond.gnss.displacement import Displacement
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.levels import Levels, take_off
@@ -44,41 +44,17 @@ from fusiond.gnss.ranges import (
     nothing_kept,
 )
 from fusiond.gnss.selection import best_four
-from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
+from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
+from fusiond.navigator.raw_sky import REASONS, Sky, sky_of
 
 Array = NDArray[np.float64]
 
 REMEMBERED_NS = 12_000_000_000
 """Age beyond which epochs are too old for the timeline, which rewinds by ten seconds."""
-REASONS = {KEPT: "used", RESIDUAL: "residual"}
-"""Names of screened rows in `health`; everything else is `gated`."""
-
-
 NOTHING = np.zeros((3, 3))
 NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING)
 """Rows of an epoch without satellites."""
-
-
-class Seen(NamedTuple):
-    """Direction of a satellite (rad; None for one that was refused before that was looked at) and
-    its strongest signal (dB-Hz; None where the receiver does not say)."""
-
-    azimuth_rad: float | None
-    elevation_rad: float | None
-    cno_db_hz: float | None
-
-
-@immutable()
-class Sky:
-    """The last epoch: satellites used, refused ones by reason, DOPs, RMS of the normalised
-    innovations of the ranges that were used; where all of them stand."""
-
-    used: tuple[str, ...] = ()
-    refused: dict[str, str] = field(default_factory=dict)
-    dops: Dops | None = None
-    innovation_rms: float | None = None
-    seen: dict[str, Seen] = field(default_factory=dict)
 
 
 class _Corrected(NamedTuple):
@@ -383,28 +359,9 @@ class RawGnss:
         """Result of the last epoch."""
         if self._judged is None:
             return Sky(refused=dict(self._left_out))
-        epoch_measurement, corrected, codes, whitened = self._judged
-        used, refused, squares = [], dict(corrected.rows.refused), []
-        measurement = corrected.measurement
-        whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
-        for (satellite, what), code, innovation in zip(
-            measurement.labels, codes, whitened, strict=False
-        ):
-            if what == "range":
-                if code == KEPT:
-                    used.append(satellite)
-                    squares.append(innovation**2)
-                else:
-                    refused[satellite] = REASONS.get(code, "gated")
-        here = [k for k, name in enumerate(measurement.satellites) if name in used]
-        sight = measurement.position[here] - corrected.guess
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        return Sky(
-            tuple(used),
-            refused,
-            dops(sight, measurement.clock[here], corrected.guess) if used else None,
-            math.sqrt(float(np.mean(squares))) if squares else None,
-            _seen(epoch_measurement.epoch, corrected.rows),
+        judged, corrected, codes, whitened = self._judged
+        return sky_of(
+            judged.epoch, corrected.rows, corrected.measurement, corrected.guess, codes, whitened
         )
 
     def _fix(self, found: SinglePoint, t_ns: int) -> list[Candidate]:
@@ -428,17 +385,3 @@ class RawGnss:
 
 def _instant(measurement: RawEpochMeasurement) -> int:
     return measurement.t_ns
-
-
-def _seen(epoch: RawGnssEpoch, rows: Rows) -> dict[str, Seen]:
-    """Every satellite of an epoch; rows have the direction of those that could serve."""
-    angles = zip(rows.azimuth_rad.tolist(), rows.elevation_rad.tolist(), strict=True)
-    directions = dict(zip(rows.satellites, angles, strict=True))
-    strongest: dict[str, float | None] = {}
-    for signal in epoch.signals:
-        levels = (strongest.get(signal.satellite), signal.cno_db_hz)
-        strongest[signal.satellite] = max((x for x in levels if x is not None), default=None)
-    return {
-        name: Seen(*directions.get(name, (None, None)), cno_db_hz=cno)
-        for name, cno in strongest.items()
-    }

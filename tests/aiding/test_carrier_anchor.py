@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding import carrier_anchor as an
+from fusiond.aiding import carrier_anchor_noise as noise
 from fusiond.aiding.base import Innovation, Renewal, State
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values, nothing_left
 from fusiond.configuration.schema import Imu
@@ -132,13 +133,36 @@ def test_what_phases_add_is_what_least_squares_make_of_them() -> None:
     found = first.leaves(state(of, nav), ())
     assert isinstance(found, Renewal)
     h = sights(nav, satellites)
-    expected = SIGMA_M**2 * np.linalg.inv(h.T @ h) + an.FLOOR_M**2 * np.eye(4)
+    expected = SIGMA_M**2 * np.linalg.inv(h.T @ h) + noise.FLOOR_M**2 * np.eye(4)
     assert found.new == pytest.approx(expected, rel=1e-3)
     # of two satellites not more than the phases' own
     two = measurement(1.0, satellites[:2], carriers(nav, satellites, 0.0)[:2], nothing_left())
     few = two.leaves(state(of, nav), ())
     assert few is not None
-    assert np.linalg.eigvalsh(few.new)[-1] < 2.0 * SIGMA_M**2 + an.FLOOR_M**2
+    assert np.linalg.eigvalsh(few.new)[-1] < 2.0 * SIGMA_M**2 + noise.FLOOR_M**2
+
+
+def test_a_clone_walks_by_what_satellites_drift() -> None:
+    """As least squares by the phases' weights make a place of it: once a second, in between not."""
+    of, (nav, _) = model(), places()
+    satellites, _ = _satellites(nav)
+    length = carriers(nav, satellites, 5.0)
+    xi, before = begun(of, nav, satellites)
+    weights, h = np.array([1.0, 0.5, 1.0, 2.0, 1.0]) / SIGMA_M**2, sights(nav, satellites)
+    normal = h.T @ (weights[:, None] * h)
+    gain = np.linalg.solve(normal + np.eye(4), h.T * weights)
+    for t_s, walked_s in ((1.5, None), (2.0, 1.0), (2.5, None), (4.0, 2.0)):
+        now = measurement(t_s, satellites, length, before)
+        now.values[an.CARRIER_VARIANCE] = 1.0 / weights
+        found = now.leaves(state(of, nav, xi), ())
+        assert (found is None) == (walked_s is None), t_s
+        if found is not None and walked_s is not None:
+            walked = noise.DRIFT_M_SQRT_S**2 * walked_s * gain @ gain.T
+            assert found.new == pytest.approx(walked, rel=1e-6)
+            assert (found.kept == np.eye(4)).all()
+            assert found.of_navigation is None
+            assert found.estimate is None
+        before = now.left
 
 
 def test_carriers_are_the_way_since_the_anchor() -> None:
@@ -251,10 +275,10 @@ def test_noise_and_constants_are_learned(sigma_m: float) -> None:
             part = np.eye(12) - left_out @ np.linalg.pinv(left_out)
             squares.append(float((part @ z) ** 2 @ (1.0 / (r * np.diag(part)))) / 12.0)
         found = now.leaves(state(of, nav, np.zeros(of.size) if epoch % 40 == 0 else xi), ())
-        assert (found is not None) == (epoch % 40 == 0)
-        if found is not None:
+        anchor = found is not None and found.estimate is not None
+        assert anchor == (epoch % 40 == 0)
+        if found is not None and found.estimate is not None:
             xi = np.zeros(of.size)
-            assert found.estimate is not None
             xi[of.slots_of_all(found.blocks)] = found.estimate
         before = now.left
     assert an.phase_scale(before) == pytest.approx((sigma_m / SIGMA_M) ** 2, rel=0.15)

@@ -40,6 +40,8 @@ class Receiver:
         self.t = NOON
         self.clock_m = 0.0
         self.cycles = np.zeros((n, 2))
+        self.longer_m = np.zeros(n)
+        """By a wall, both codes."""
 
     def delays(self) -> Array:
         """They grow by 2 mm/s."""
@@ -55,13 +57,13 @@ class Receiver:
         noise = self.code_m * self.rng.standard_normal((2, self.n))
         i = self.delays()
         first = np.full((self.n, ca.FIRST_COLUMNS), np.nan)
-        first[:, ca.P_A] = rho + i + noise[0]
+        first[:, ca.P_A] = rho + i + noise[0] + self.longer_m
         first[:, ca.RATE] = self.rates() if doppler else np.nan
         first[:, ca.CNO] = 45.0
         first[:, ca.CARRIER_A] = (rho - i) / L1 + 3e5 + self.cycles[:, 0]
         first[:, ca.LOCK_A] = lock_s
         second = np.full((self.n, ca.SECOND_COLUMNS), np.nan)
-        second[:, ca.P_B] = rho + GAMMA * i + DELAY_M + noise[1]
+        second[:, ca.P_B] = rho + GAMMA * i + DELAY_M + noise[1] + self.longer_m
         second[:, ca.CNO_B] = 45.0
         second[:, ca.CARRIER_B] = (rho - GAMMA * i) / L2 - 2e5 + self.cycles[:, 1]
         second[:, ca.LOCK_B] = lock_s
@@ -199,3 +201,47 @@ def test_the_same_epoch_again_changes_nothing() -> None:
     told = receiver.epoch()
     assert np.array_equal(receiver.kept, kept)
     assert (told.out[:, ca.SPAN] == 0.0).all()
+
+
+@pytest.mark.parametrize("breaks", [False, True])
+def test_a_code_that_goes_from_its_carrier_is_found(breaks: bool) -> None:
+    """By 4 m beside a noise of 0.3 m, until it comes back, whether the carrier breaks off then or
+    not: Dopplers bridge that."""
+    receiver = Receiver(12, code_m=0.3)
+    receiver.epoch()
+    for _ in range(60):
+        assert ca.MULTIPATH not in receiver.after(1.0).refused
+    for longer_m, found in ((4.0, [ca.MULTIPATH] * 3), (0.0, [])):
+        receiver.longer_m[:3] = longer_m
+        receiver.cycles[:3] += 1e4 * breaks
+        for k in range(20):
+            told = receiver.after(1.0, lock_s=0.5 if breaks and k == 0 else math.inf)
+            away = [code for code in told.refused if code == ca.MULTIPATH]
+            assert away == found, (longer_m, k)
+
+
+def test_a_code_that_falls_back_was_too_long() -> None:
+    """One that was heard by a wall first is the better for it, and one that stays away for two
+    minutes is taken as it is."""
+    receiver = Receiver(12, code_m=0.3)
+    receiver.longer_m[:] = 10.0
+    receiver.epoch()
+    for _ in range(60):
+        receiver.after(1.0)
+    receiver.longer_m[:6] = 0.0
+    for _ in range(20):
+        assert ca.MULTIPATH not in receiver.after(1.0).refused
+    receiver.longer_m[:6] = 10.0
+    away = [receiver.after(1.0).refused.count(ca.MULTIPATH) for _ in range(int(ca.FORGOTTEN_S) + 2)]
+    assert away[:100] == [6] * 100
+    assert away[-1] == 0
+
+
+def test_a_clock_that_is_set_is_no_reflection() -> None:
+    receiver = Receiver(12, code_m=0.3)
+    receiver.epoch()
+    for _ in range(30):
+        receiver.after(1.0)
+    receiver.clock_m = 299_792.458
+    for _ in range(20):
+        assert ca.MULTIPATH not in receiver.after(1.0).refused

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, RawGnssEpoch
 from fusiond.aiding.base import Linearised
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.si_units import DEG, imu_noise
@@ -41,15 +42,30 @@ class Told(KalmanEstimator):
 class Scored(NamedTuple):
     """Ranges by whether they came straight and whether they were left out (2, 2), by how much the
     believed ones of those that did not were too long (m), horizontal errors (n,) m, NEES of three
-    in the mean."""
+    in the mean, and whom skies name with `multipath`."""
 
     counts: NDArray[np.int64]
     believed_m: list[float]
     off_m: Any
     nees: float
+    named: set[str]
 
 
-def scored(per_hour: float, number: int) -> Scored:
+def broken(epoch: RawGnssEpoch, more: dict[str, float], last: dict[str, float]) -> RawGnssEpoch:
+    """The epoch of a receiver whose carriers come by the wall, too, and break off where the way
+    changes: by how much each is longer, now and at the last epoch."""
+    signals = []
+    for s in epoch.signals:
+        way_m, name = more[s.satellite], s.satellite
+        cycles = s.carrier_cycles
+        assert cycles is not None
+        cycles += way_m * CARRIER_HZ[s.system, s.signal[0]] / SPEED_OF_LIGHT_M_S
+        lock_s = 0.0 if way_m != last.get(name, 0.0) else s.lock_s
+        signals.append(replace(s, carrier_cycles=cycles, lock_s=lock_s))
+    return replace(epoch, signals=tuple(signals))
+
+
+def scored(per_hour: float, number: int, breaks: bool = False) -> Scored:
     rng = np.random.default_rng([7, number])
     samples, unit = drive_samples(runs.IMU, rng), rng.standard_normal(9)
     options = replace(
@@ -73,9 +89,14 @@ def scored(per_hour: float, number: int) -> Scored:
         raw.learn(message)
     column = {name: k for k, name in enumerate(sim.satellites)}
     counts, believed, off, nees = np.zeros((2, 2), np.int64), [], [], []
+    last: dict[str, float] = {}
+    named: set[str] = set()
     for k, t in enumerate(t_s):
         live.advance(t)
-        measurement = raw.measurement(sim.epoch(k), round(t * 1e9))
+        epoch, more = sim.epoch(k), {n: float(sim.reflected_m[k, c]) for n, c in column.items()}
+        if breaks:
+            epoch, last = broken(epoch, more, last), more
+        measurement = raw.measurement(epoch, round(t * 1e9))
         live.advance(t, [measurement])
         if k < FROM or measurement.memory.corrected is None:
             continue
@@ -86,25 +107,31 @@ def scored(per_hour: float, number: int) -> Scored:
         for (name, what), code in zip(labels, estimator.rows, strict=True):
             if what != "range":
                 continue
-            more = float(sim.reflected_m[k, column[name]])
-            counts[int(more > 0.0), int(code != KEPT)] += 1
-            if more > 0.0 and code == KEPT:
-                believed.append(more)
-    return Scored(counts, believed, np.array(off), float(np.mean(nees)))
+            counts[int(more[name] > 0.0), int(code != KEPT)] += 1
+            if more[name] > 0.0 and code == KEPT:
+                believed.append(more[name])
+        for name, reason in measurement.memory.corrected.rows.refused:
+            counts[int(more[name] > 0.0), 1] += reason == "multipath"
+        measurement.judged(estimator.rows, ())
+        named |= {name for name, reason in raw.sky().refused.items() if reason == "multipath"}
+    return Scored(counts, believed, np.array(off), float(np.mean(nees)), named)
 
 
-@pytest.mark.parametrize(("per_hour", "most_m"), [(0.0, 3.0), (60.0, 4.0)])
-def test_who_is_left_out_and_who_is_believed(per_hour: float, most_m: float) -> None:
-    """Sixty reflections an hour and satellite, 3 to 60 m longer for 20 s: a quarter of all ranges.
-    Two runs of 500 s (of 30 an hour) had 0 of 16,129 sound ranges left out, and 22 % of 3,182 that
-    were too long believed: half of these by less than 4.8 m, none by more than 11.3."""
-    found = [scored(per_hour, number) for number in (0, 1)]
-    counts = sum((f.counts for f in found), np.zeros((2, 2), np.int64))
-    believed = [m for f in found for m in f.believed_m]
-    assert counts[0, 1] <= 0.01 * counts[0].sum()
-    if per_hour:
-        assert counts[1].sum() > 500
-        assert counts[1, 0] < 0.45 * counts[1].sum()
-        assert max(believed) < 20.0
-    assert max(f.off_m.max() for f in found) < most_m
-    assert np.mean([f.nees for f in found]) < (4.2 if per_hour == 0.0 else 12.0)
+@pytest.mark.parametrize(
+    ("per_hour", "breaks", "number"), [(0.0, False, 0), (60.0, False, 1), (120.0, True, 0)]
+)
+def test_who_is_left_out_and_who_is_believed(per_hour: float, breaks: bool, number: int) -> None:
+    """Reflections an hour and satellite, 3 to 60 m longer for 20 s: at 60 a quarter of all ranges.
+    Two runs of 500 s each had, of 30 and 120 an hour, 4 of 15,023 and 8 of 10,284 sound ranges left
+    out, 1 of 2,357 and 31 of 7,096 too long ones believed, and a NEES of 2.8 and 0.8; before codes
+    were held against their carriers 44 and 38 % were believed, at a NEES of 6.9 and 22. `breaks`:
+    the carrier comes by the wall, too, and breaks off as it begins and ends."""
+    found = scored(per_hour, number, breaks)
+    counts = found.counts
+    assert counts[0, 1] <= 0.003 * counts[0].sum()
+    assert (counts[1].sum() > 250) == (per_hour > 0.0)
+    assert counts[1, 0] <= 0.03 * counts[1].sum()
+    assert max(found.believed_m, default=0.0) < 6.0
+    assert found.off_m.max() < 3.0
+    assert found.nees < 7.8
+    assert bool(found.named) == (per_hour > 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
@@ -32,6 +33,20 @@ height. An epoch alone says little of them beyond their sigma. What lasts is in 
 (fusiond.gnss.displacement)."""
 
 
+CLOCK_RAMP = "clock_ramp"
+RAMP_M_S2, RAMP_S = 0.2, 1000.0
+"""One sigma and correlation time of how a clock's drift runs on while its crystal warms or cools: a
+temperature-compensated one is held to 0.5 ppm over 70 K, and by so steep a curve in places that a
+tenth of a kelvin a second is half a ppb a second. A receiver on a walk had 0.17 m/s^2 for two
+minutes; what is left beside it is the drift's walk."""
+
+
+def ramp() -> Block:
+    """The rate of a clock's drift."""
+    sd = RAMP_M_S2
+    return Block(CLOCK_RAMP, "m/s^2", ("ramp",), (-1,), initial=sd, tau_s=RAMP_S, steady=sd)
+
+
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     """Blocks of raw ranges: a clock offset for each system, drift, shared errors of ranges, and the
     carrier anchor."""
@@ -41,7 +56,10 @@ def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     )
 
     clock = clock_noise(section)
-    found = clock_blocks(section.systems, clock)
+    offsets, drift = clock_blocks(section.systems, clock)
+    found = [offsets, drift]
+    if section.clock_drift_tau_s is None:
+        found = [offsets, replace(drift, rate=CLOCK_RAMP), ramp()]
     if section.bias_sd_m > 0.0:
         tau_s = section.bias_correlation_s
         level, down = RANGE_BIAS

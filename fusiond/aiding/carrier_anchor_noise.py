@@ -1,0 +1,107 @@
+r"""Noise of a carriers' anchor: what its phases add to the clone, and how the clone walks.
+
+With H of the satellites (fusiond.aiding.carrier_anchor), W = diag(1 / s_i^2) of their phases,
+
+    G = (H^T W H + I)^-1 H^T W        cov = G diag(v_i) G^T
+
+v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is a
+satellite's orbit, clock and atmosphere beside what is broadcast: smooth over minutes, so that what
+it does to a place in 200 s is as from a walk, and in a second far less. Were it added to the clone
+at the anchor only, the inertial unit, which knows the place across that instant to millimetres,
+would take the velocity of the carriers for true: with four satellites of a DOP of 40 orbits that
+drift by 0.7 mm/s carry the place along by 30 mm/s.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.carrier_anchor import (
+    _ALIVE,
+    _V,
+    _WALKED,
+    CARRIER,
+    CARRIER_VARIANCE,
+    SLOT,
+    invert,
+    phase_scale,
+    sight,
+)
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+
+FLOOR_M = 1e-3
+"""One sigma of a clock at least: a covariance of which a part is another's to the last digit is
+none any more after some updates."""
+DRIFT_M_SQRT_S = 0.005
+"""Walk of orbits and clocks over minutes, by 2 mm/s that last for 30 s: 0.16 m in 200 s, and errors
+of 0.5 m that last for half an hour change by 0.24 m."""
+WALKS_S = 0.9
+"""Between two steps of the walk: those of each second."""
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", forceinline=True)
+def _spread(inverted: Array, spread: Array, noise: Array) -> None:
+    """Write A S A^T (4, 4)."""
+    for i in range(4):
+        for j in range(i + 1):
+            total = 0.0
+            for p in range(4):
+                for q in range(4):
+                    total += inverted[i, p] * spread[p, q] * inverted[j, q]
+            noise[i, j] = noise[j, i] = total
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])", allocates=True)
+def phase_noise(values: Array, place: Array, left: Array, noise: Array) -> None:
+    """Write the covariance (4, 4) of what an anchor's phases add to B and C.
+
+    To `left` goes the variance of each satellite's constant."""
+    information, inverted, row = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
+    scale = phase_scale(left)
+    for k in range(values.shape[1]):
+        if math.isfinite(values[CARRIER, k]):
+            sight(values, k, place, row)
+            for i in range(4):
+                for j in range(4):
+                    information[i, j] += row[i] * row[j] / (scale * values[CARRIER_VARIANCE, k])
+    invert(information, inverted, 1.0)
+    for k in range(values.shape[1]):
+        if math.isfinite(values[CARRIER, k]):
+            sight(values, k, place, row)
+            variance = scale * values[CARRIER_VARIANCE, k]
+            for i in range(4):
+                for j in range(4):
+                    variance -= row[i] * inverted[i, j] * row[j]
+            left[int(values[SLOT, k]), _V] = max(variance, 0.0)
+    _spread(inverted, information, noise)
+    for i in range(4):
+        noise[i, i] += FLOOR_M * FLOOR_M
+
+
+@compiled("b1(f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True)
+def walk_noise(values: Array, place: Array, t_s: float, left: Array, noise: Array) -> bool:
+    """Write the covariance (4, 4) of what B and C have walked by until `t_s` since they last did;
+    False where that is not long ago."""
+    age = t_s - left[0, _WALKED]
+    if not age >= WALKS_S:
+        return False
+    left[0, _WALKED] = t_s
+    information, inverted = np.zeros((4, 4)), np.empty((4, 4))
+    spread, row = np.zeros((4, 4)), np.empty(4)
+    walked = DRIFT_M_SQRT_S * DRIFT_M_SQRT_S * age
+    for k in range(values.shape[1]):
+        if left[int(values[SLOT, k]), _ALIVE] > 0.0:
+            sight(values, k, place, row)
+            w = 1.0 / values[CARRIER_VARIANCE, k]
+            for i in range(4):
+                for j in range(4):
+                    information[i, j] += w * row[i] * row[j]
+                    spread[i, j] += walked * w * w * row[i] * row[j]
+    invert(information, inverted, 1.0)
+    _spread(inverted, spread, noise)
+    return True
