@@ -26,6 +26,7 @@ from drivers.nmea.fields import BadFieldError
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.judge import EpochJudge
 from drivers.nmea.reasons import (
+    ATTITUDES,
     FULLER,
     OWN_SENTENCES,
     POSITIONS,
@@ -153,7 +154,7 @@ class NmeaDecoder:
             self.received.datum = sentence.fields[0] if sentence.fields else ""
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
-            own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
+            own = sentence.talker == "P" or sentence.address in (*OWN_SENTENCES, *ATTITUDES)
             name = own_name(sentence.address, sentence.fields) if own else sentence.formatter
             note(self.received.unused, name)
             if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ

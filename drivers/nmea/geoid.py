@@ -2,8 +2,10 @@
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
-N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. A receiver
-that has printed it once is remembered: on the way since it has changed by the slope of the geoid.
+N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. 0 to the
+last digit says that a receiver has no model of the geoid: the places where that is N are one in a
+thousand, those whose altitude is one above the ellipsoid cannot be told from the others. A receiver
+that has printed N once is remembered: on the way since it has changed by the slope of the geoid.
 Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
 """
 
@@ -32,7 +34,7 @@ class Geoid:
     ) -> tuple[float, float]:
         """Height above the ellipsoid (m), and one sigma (m) of the geoid height in it, 0 where
         printed; the height above the sea where the geoid is unknown."""
-        if separation_m is not None:
+        if separation_m:
             if abs(separation_m) <= BOUND_M:
                 self._known = separation_m, lat_deg, lon_deg
             return altitude_m + separation_m, 0.0

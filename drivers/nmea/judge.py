@@ -176,7 +176,7 @@ class EpochJudge:
             self.counters["height_not_measured"] += 1
         else:
             height, geoid_sd_m = self._geoid.height(altitude, separation, lat_deg, lon_deg)
-            if separation is None:
+            if not separation:
                 self.counters["height_above_sea"] += 1
         sd_ned_m = epoch.sd_ned_m
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:

@@ -56,7 +56,17 @@ OWN_SENTENCES = {
     "GTIMU": "inertial systems",
 }
 """Owners of proprietary sentences, by prefix, with position or attitude."""
-ATTITUDES = ("PASHR", "PTNL,AVR", "PSAT,HPR", "PSSN,HRP", "PSTI,036", "PQTMTAR", "GPHPR", "GNHPR")
+ATTITUDES = (
+    "PASHR",
+    "PTNL,AVR",
+    "PSAT,HPR",
+    "PSSN,HRP",
+    "PSTI,036",
+    "PQTMTAR",
+    "GPHPR",
+    "GNHPR",
+    "KSXT",
+)
 """Prefixes of sentences of two-antenna receivers with heading, roll or pitch."""
 MOST_NAMES = 8
 """Most talkers and formatters to remember; the first are enough to name."""
@@ -215,7 +225,7 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
     if counters["height_above_sea"] > counters["fixes"] // 2:
         found["height_above_sea"] = (
             "the receiver does not say how high the geoid is: its altitude above the sea is used, "
-            "with one sigma of 62 m (GGA's separation is empty)"
+            "with one sigma of 62 m (GGA's separation is empty, or 0)"
         )
     if counters["height_not_measured"] > max(counters["fixes"] // 2, FIRST_FIXES):
         found["height_not_measured"] = (

@@ -218,8 +218,8 @@ def _binary(
     containers = Containers(stream, lambda text: lost.add(0, "unreadable", text))
     try:
         reader = can.BLFReader(cast(BinaryIO, containers))
-    except Exception as error:  # whatever it raises for a file that is none
-        lost.add(0, "unreadable", f"its header: {error}")
+    except Exception:  # whatever it raises for a file that is none
+        lost.add(0, "unreadable", "its header is cut, or none of BLF")
         return
     containers.body()
     _report_zone(log, reader.start_timestamp, on_zone)

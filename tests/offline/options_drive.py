@@ -102,7 +102,7 @@ def write_files(folder: Path) -> Path:
         speed, course = math.hypot(*v[:2]) + 0.05, math.degrees(math.atan2(v[1], v[0])) % 360.0
         place = f"{dm(lat, 2)},N,{dm(lon, 3)},E"
         lines += [
-            f"GNGGA,{hms},{place},1,14,0.9,{p[2] if t_s < LIFTED_S else 5e3:.2f},M,0.0,M,,",
+            f"GNGGA,{hms},{place},1,14,0.9,{(p[2] if t_s < LIFTED_S else 5e3) - 40:.2f},M,40.0,M,,",
             f"GNRMC,{hms},A,{place},{speed / 0.514444:.3f},{course:.2f},240326,,,A,V",
             f"GNTHS,{math.degrees(rpy[2]) % 360.0:.2f},A",
             *(5 * [f"HCHDM,{(math.degrees(rpy[2]) - 2.0) % 360.0:.1f},M"]),

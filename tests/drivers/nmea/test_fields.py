@@ -71,6 +71,13 @@ def test_hemispheres_and_absent_separation() -> None:
     assert (fix.v_ned_m_s, fix.sd_ned_m, fix.vdop) == (None, None, None)
 
 
+@pytest.mark.parametrize("printed", ["0.0", "0", "0.000", "-0.0"])
+def test_a_separation_of_zero_says_that_the_receiver_has_no_geoid(printed: str) -> None:
+    """What it prints for an altitude above the sea as for one above the ellipsoid."""
+    fix = fix_of(changed(GGA, "-9.100", printed))
+    assert (fix.height_m, fix.geoid_sd_m) == (45.3, GEOID_SD_M)
+
+
 @pytest.mark.parametrize(
     "talker", ["GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ", "II", "IN"]
 )
