@@ -118,6 +118,8 @@ class Navigator:
         self._imu_noise = ImuNoise(self.model, imu, self._drifts)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
+        self.keeps_solutions = False
+        """All of them at each sample in `imu`, as by `advance(record=True)`."""
         self.without_imu = WithoutImu(
             config, shared_blocks, self._event, self.last_fused_ns, self._on_outcome
         )
@@ -304,7 +306,7 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._basis = reason("heading_from", how=start.how)
             self._event("aligned", self._basis)
-        self.timeline.advance(record)
+        self.timeline.advance(record or self.keeps_solutions)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
             self._verdicts_ns = e.t_ns
