@@ -118,6 +118,8 @@ class Navigator:
         self._service_events = ServiceEvents(self.timeline, self._event)
         self.service = SourceService(self.timeline, e.federated.sources or tuple(config.aiding))
         self._imu_noise = ImuNoise(self.model, imu, self._drifts)
+        self.keeps_solutions = False
+        """True if `imu` keeps the solution at each sample, as by `advance(record=True)`."""
         fused_ns = self.outcome_watch.fused_ns
         self.without_imu = WithoutImu(config, shared_blocks, self._event, fused_ns, on_outcome)
         self._verdicts_ns = 0
@@ -297,7 +299,7 @@ class Navigator:
             self.started = start
             self.trial.begin(start)
             self._event("aligned", self.outcome_watch.begin(start))
-        self.timeline.advance(record)
+        self.timeline.advance(record or self.keeps_solutions)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
             self._verdicts_ns = e.t_ns

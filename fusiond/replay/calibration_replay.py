@@ -24,6 +24,7 @@ def watched(recording: Log, config: Config, look: Callable[[Navigator], None]) -
     second = Every(SECOND_NS)
     for tick in replay.ticks():
         assert replay.chain is not None
+        replay.chain.navigator.keeps_solutions = True
         navigated = tick.solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         rows, why = rows + navigated, tick.solution.reason
         if second.due(tick.solution.t_ns):

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
@@ -72,6 +73,9 @@ def test_saved_calibration_of_the_daemon_is_ignored(tmp_path: Path) -> None:
 
     def look(navigator: Navigator) -> None:
         started.append(navigator.started is not None)
+        if started[-1]:  # what roll, noise and the time driven are taken from
+            passed = navigator.estimator.sample - navigator.imu.start
+            assert np.isfinite(navigator.imu.nav[passed - 1]).all()
 
     watched(recording, config, look)
     assert (started[0], started[-1]) == (False, True)
