@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.sensor_class import CLASSES
-from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.models.blocks import ImuNoise
 
 Array = NDArray[np.float64]

@@ -79,8 +79,9 @@ def graded_at_rest(rates: Values, force: Values) -> Array:
 
 
 def _weights(log_likelihood: Array) -> Array:
-    weight: Array = np.exp(log_likelihood - log_likelihood.max())
-    return weight / weight.sum()
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    normalised: Array = weight / weight.sum()
+    return normalised
 
 
 def _expected(log_likelihood: Array, prior: Array) -> float:

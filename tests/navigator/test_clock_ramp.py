@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fusiond.configuration.settings import DEG, imu_noise
 from numpy.typing import NDArray
 
+from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.navigator.intake import Intake

@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from fusiond.configuration.settings import DEG
 from scipy.stats import chi2
 
 from fusiond.configuration.schema import Config
+from fusiond.configuration.si_units import DEG
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.trajectories import Leg

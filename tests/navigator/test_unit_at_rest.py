@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fusiond.configuration.settings import imu_noise
 
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
+from fusiond.configuration.si_units import imu_noise
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
 from fusiond.navigator.unit_grade import AS_ITS_CLASS, GRID, Values, graded_at_rest
