@@ -25,7 +25,7 @@ class RateSearch:
         self._bytes_in = 0
 
     def understood(self) -> None:
-        """What arrives verifies."""
+        """Stay at this rate: something has verified."""
         self._since_ns, self._untried = None, []
 
     def next(self, t_ns: int, bytes_in: int) -> int | None:

@@ -140,7 +140,7 @@ class Epoch:
 
     @property
     def phase_ns(self) -> int | None:
-        """Where in the second it is."""
+        """Phase in the second, ns; None where no sentence has a time."""
         return None if self.time_of_day_ns is None else self.time_of_day_ns % 1_000_000_000
 
     def position(self) -> tuple[float, float, int] | None:

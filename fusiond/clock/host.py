@@ -47,7 +47,7 @@ _KNOWN = (
     *("last_step_ns", "_queued_ns", "_stepped_ns"),
 )
 """The attributes that are a `SystemClock`'s state."""
-_KNOWN_OF_SLEWS = ("_slewed_ns", "_apart_ns", "_rate_ppb", "_rated_ns", "_rated_offset_ns")
+_KNOWN_OF_SLEWS = ("_slewed_ns", "_unslewed_ns", "_rate_ppb", "_rated_ns", "_rated_offset_ns")
 """Those that logs of before 2026-11-28 do not hold: instants are of CLOCK_MONOTONIC there."""
 
 
@@ -131,7 +131,7 @@ class SystemClock:
         self._counters = counters
         self._sampled_ns, self.offset_ns = readings.realtime()
         self._slewed_ns = readings.slewed()[1]
-        self._apart_ns = self.offset_ns - self._slewed_ns
+        self._unslewed_ns = self.offset_ns - self._slewed_ns
         self._boot_ns = readings.boottime()[1] - self._slewed_ns
         self._rate_ppb = 0
         self._rated_ns, self._rated_offset_ns = self._sampled_ns, self.offset_ns
@@ -151,7 +151,7 @@ class SystemClock:
         now, offset = self._readings.realtime()
         slack = _STEP_NS + max(0, now - self._sampled_ns) // _SLEW_PER_NS
         change = offset - self.offset_ns
-        slewed, change = (change, 0) if abs(change) <= slack else self._parted(offset)
+        slewed, change = (change, 0) if abs(change) <= slack else self._split(offset)
         self.held_ns += slewed
         if self.before_step_ns is not None:
             self.before_step_ns += slewed
@@ -182,11 +182,11 @@ class SystemClock:
             self._rated_ns, self._rated_offset_ns = now, offset
         return offset
 
-    def _parted(self, offset_ns: int) -> tuple[int, int]:
+    def _split(self, offset_ns: int) -> tuple[int, int]:
         """Change of the offset since the last sample: what was slewed, and the rest (ns)."""
         self._slewed_ns = self._readings.slewed()[1]
-        before_ns, self._apart_ns = self._apart_ns, offset_ns - self._slewed_ns
-        rest_ns = self._apart_ns - before_ns
+        before_ns, self._unslewed_ns = self._unslewed_ns, offset_ns - self._slewed_ns
+        rest_ns = self._unslewed_ns - before_ns
         return offset_ns - self.offset_ns - rest_ns, rest_ns
 
     def monotonic_of(self, realtime_ns: int, t_seen_ns: int) -> int:
@@ -225,7 +225,7 @@ class SystemClock:
             setattr(self, name, state[name])
         self._slewed_ns = self._rate_ppb = 0
         self._rated_ns, self._rated_offset_ns = self._sampled_ns, self.offset_ns
-        self._apart_ns = self.offset_ns
+        self._unslewed_ns = self.offset_ns
         for name in _KNOWN_OF_SLEWS:
             if name in state:
                 setattr(self, name, state[name])

@@ -179,7 +179,7 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
 
 
 def _said(doubt: warnings.WarningMessage) -> str:
-    """What the unpacking program has left out, in its words, on one line."""
+    """Words of the unpacking program on what it has left out, on one line."""
     return f"the unpacking says: {' '.join(str(doubt.message).split())}"
 
 

@@ -79,7 +79,7 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
     """A start on the way: what was known of the host's clocks there."""
     t_ns = t_log_ns - recording.about.epoch_ns
     ahead = [recording.about.epoch_ns, 0, 0]
-    apart_ns = ahead[0]
+    unslewed_ns = ahead[0]
     read_ns, sequence = t_ns, 0
     for message in recording.messages(INPUT):
         if message.t_log_ns >= t_log_ns:
@@ -90,19 +90,19 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
                 start = json.loads(record.payload)["system_clock"]
                 slewed_ns = start.get("_slewed_ns", 0)
                 ahead = [start["offset_ns"], start["_boot_ns"] + slewed_ns, slewed_ns]
-                apart_ns = start.get("_apart_ns", start["offset_ns"])
+                unslewed_ns = start.get("_unslewed_ns", start["offset_ns"])
             for clock, at_ns, ahead_ns in record.readings:
                 ahead[clock] = ahead_ns
                 read_ns = at_ns
                 if clock == SLEWED:
-                    apart_ns = ahead[0] - ahead_ns
+                    unslewed_ns = ahead[0] - ahead_ns
     clock_state = {
         **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), read_ns),
         **dict.fromkeys(("offset_ns", "held_ns"), ahead[0]),
         **dict.fromkeys(("slept_ns", "changes", "last_step_ns"), 0),
         "_boot_ns": ahead[1] - ahead[2],
         "_slewed_ns": ahead[2],
-        "_apart_ns": apart_ns,
+        "_unslewed_ns": unslewed_ns,
         "before_step_ns": None,
     }
     payload = json.dumps({"from_start": False, "system_clock": clock_state}).encode()

@@ -55,7 +55,7 @@ class _Inputs:
         self._counts = [[0] * len(Kind) for _ in self._about.sources]
         self._bytes = [0] * len(self._counts)
         self._ahead_ns: int | None = None
-        self._apart_ns: int | None = None
+        self._unslewed_ns: int | None = None
         """The system clock less CLOCK_MONOTONIC, which is slewed with it, at the last look."""
         self._tick_ns: int | None = None
         self.from_start = False
@@ -83,7 +83,7 @@ class _Inputs:
             case Kind.START:
                 start = json.loads(record.payload)
                 self.from_start = bool(start.get("from_start"))
-                self._apart_ns = start.get("system_clock", {}).get("_apart_ns")
+                self._unslewed_ns = start.get("system_clock", {}).get("_unslewed_ns")
             case Kind.TICK:
                 self._tick(record)
             case Kind.COMMAND:
@@ -95,15 +95,15 @@ class _Inputs:
             step_s = (ahead_ns - before) / SECOND_NS
             self.steps.append({"t_utc": self.utc(t_ns), "step_s": round(step_s, 6)})
 
-    def _look_at_slews(self, apart_ns: int) -> None:
+    def _look_at_slews(self, unslewed_ns: int) -> None:
         """A reading of CLOCK_MONOTONIC follows one that leapt: to tell a step from a slew."""
-        before, self._apart_ns = self._apart_ns, apart_ns
+        before, self._unslewed_ns = self._unslewed_ns, unslewed_ns
         if before is None or not self.steps:
             return
-        if abs(apart_ns - before) <= _STEP_NS:
+        if abs(unslewed_ns - before) <= _STEP_NS:
             self.steps.pop()
         else:
-            self.steps[-1]["step_s"] = round((apart_ns - before) / SECOND_NS, 6)
+            self.steps[-1]["step_s"] = round((unslewed_ns - before) / SECOND_NS, 6)
 
     def _tick(self, record: Record) -> None:
         tick = tick_of(record)

@@ -251,7 +251,7 @@ def test_a_state_of_a_log_whose_instants_are_of_the_slewed_clock() -> None:
     """Before 2026-11-28: nothing was slewed against them."""
     host = Host()
     clock = Clock(ClockOptions(), host)
-    new = {"_slewed_ns", "_apart_ns", "_rate_ppb", "_rated_ns", "_rated_offset_ns"}
+    new = {"_slewed_ns", "_unslewed_ns", "_rate_ppb", "_rated_ns", "_rated_offset_ns"}
     known = {name: of for name, of in clock.system_state().items() if name not in new}
     host.mono += S
     clock.restore_system(known)
