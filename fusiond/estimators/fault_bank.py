@@ -96,11 +96,11 @@ LOG_PRIOR = 7
 # 1 if one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the
 # row width of the transition, by how much the unit has been found to have turned on the vehicle in
 # pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
-# back of the velocity in all (m/s), and behind how many eights of groups with three numbers, and of
-# those with one, no V is other than zero.
+# back of the velocity in all (m/s), behind how many eights of groups with three numbers, and of those
+# with one, no V is other than zero, and when (s) something measured was in service last.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEAD = 21, 22, 25, 26, 32
+UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEARD, HEAD = 21, 22, 25, 26, 27, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -127,6 +127,9 @@ LEAST_WEIGHT = 1e-7
 """Probability below which a hypothesis counts for nothing: a third of a metre of a kilometre."""
 LASTS_S = 1.0
 """For so long it must have been: a receiver's errors of a second are one error."""
+ALONE_S = 2.0 * LASTS_S
+"""After so long without anything measured a constraint is judged by: beside a receiver of one fix a
+second it never is."""
 
 
 class FaultTable(NamedTuple):
@@ -230,6 +233,16 @@ def column_of(bank: Array, number: int, component: int) -> int:
         ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
         column = ones * LANES + (number - threes) % LANES
     return column
+
+
+@compiled("b1(f8[::1], i8, f8, b1)", forceinline=True)
+def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
+    """True if hypotheses are judged at rows of such kinds: they are `measured`, or known of the
+    vehicle while nothing is. Whoever is alone is the only witness, if a coloured one."""
+    if measured:
+        bank[HEARD] = t_s
+    alone: bool = measured or (measures != NOTHING and t_s - bank[HEARD] > ALONE_S)
+    return alone
 
 
 @compiled("void(f8[::1], i8)", forceinline=True)

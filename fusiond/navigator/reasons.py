@@ -32,6 +32,11 @@ IMU: Mapping[str, Reason] = {
     "imu_stamps_back": Reason(
         "warning", "IMU stamps went back: aligning again", "Check the clock of the IMU."
     ),
+    "imu_stamps_ahead": Reason(
+        "warning",
+        "IMU stamps lie ahead of what arrives: aligning again",
+        "Check the clock of the IMU.",
+    ),
     "imu_was_silent": Reason(
         "warning", "IMU was silent too long: aligning again", "Check power and bus of the IMU."
     ),
