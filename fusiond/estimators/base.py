@@ -164,6 +164,11 @@ class Estimator:
         return False
 
     @property
+    def lost_heading_rad(self) -> float:
+        """One sigma of a heading that was known once; 0 of one that never was."""
+        return 0.0
+
+    @property
     def runs(self) -> MeasurementRun | None:
         """Measurements in one call; None while it takes them one by one."""
         return None

@@ -32,6 +32,11 @@ IMU: Mapping[str, Reason] = {
     "imu_stamps_back": Reason(
         "warning", "IMU stamps went back: aligning again", "Check the clock of the IMU."
     ),
+    "heading_lost": Reason(
+        "warning",
+        "Heading known to {sd:.0f} deg only: aligning again",
+        "Drive on where there are fixes.",
+    ),
     "imu_stamps_ahead": Reason(
         "warning",
         "IMU stamps lie ahead of what arrives: aligning again",
