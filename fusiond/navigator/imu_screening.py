@@ -79,8 +79,11 @@ class ImuScreening:
         self._most_s = min(BEARABLE_GAP_S, keep_s)
         self._latest_ns: int | None = None
         self._newest: Stamps = np.zeros(1, dtype=np.int64)
-        self._heard_ns, self._ahead_ns = 0, 0
-        """Newest arrival of anything else, and since which one stamps lie ahead, or 0."""
+        self._ahead_ns = 0
+        """Arrival of anything else since which stamps lie ahead, or 0."""
+        self.lags = False
+        """True if the newest sample was too old to navigate by when something else arrived last,
+        and so to start by: a stream whose stamps have gone back."""
         self._troubles: dict[str, _Trouble] = {}
 
     def silence(self, silent_s: float | None) -> str:
@@ -106,7 +109,8 @@ class ImuScreening:
     def heard(self, seen_ns: int, imu: ImuBuffer) -> bool:
         """Something else has arrived at `seen_ns`; True if stamps lie ahead of that for long: no
         sample can be of an instant that has not come."""
-        self._heard_ns = max(self._heard_ns, seen_ns)
+        if imu.end:
+            self.lags = seen_ns - imu.latest_ns > self._config.gap_s * 1e9
         if not imu.end or imu.latest_ns <= seen_ns + AHEAD_NS:
             self._ahead_ns = 0 if imu.end else self._ahead_ns
             return False
@@ -121,11 +125,6 @@ class ImuScreening:
         self._check.restart()
         self._latest_ns = None
         return True
-
-    def lags(self, imu: ImuBuffer) -> bool:
-        """True if the newest sample is too old to navigate by when something else arrives, and so
-        to start by: a stream whose stamps have gone back."""
-        return self._heard_ns - imu.latest_ns > self._config.gap_s * 1e9
 
     def change(self) -> None:
         """Reset for another unit: what was seen of the first says nothing of it."""

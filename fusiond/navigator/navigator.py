@@ -283,7 +283,7 @@ class Navigator:
     def advance(self, record: bool = False) -> None:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
-            if self._screening.lags(self.imu):
+            if self._screening.lags:
                 return
             start = self._warm_start() or self._aligner.attempt(self.imu)
             if (
