@@ -48,7 +48,7 @@ class _Told:
             navigator.add_imu(times[rows[kept[rows]]], samples[rows[kept[rows]]])
             for m in d.measurements:
                 if d.times[first] - 20_000_000 < m.t_seen_ns <= now:
-                    navigator.add(m, m.t_seen_ns)
+                    navigator.add(m, m.t_seen_ns, 0.0, m.t_seen_ns)
             navigator.advance()
             self.modes.append(navigator.mode(now)[0])
             self.texts.append(navigator.mode(now)[1])
