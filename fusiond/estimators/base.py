@@ -307,13 +307,13 @@ class Estimator:
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
         n = self.model.size
-        self._take_out(mean)
+        self._correct(mean)
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
         if self.hypotheses is not None:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
-    def _take_out(self, mean: Array) -> None:
+    def _correct(self, mean: Array) -> None:
         """Take a fault's effect (n,) out of the state, as an update does."""
         self._feed_back(mean)
 

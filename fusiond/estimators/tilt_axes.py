@@ -129,10 +129,10 @@ class TiltAxesFilter(KalmanEstimator):
         self.undoubted = False
         super().adopt(mean, spread)
 
-    def _take_out(self, mean: Array) -> None:
+    def _correct(self, mean: Array) -> None:
         """Take a fault's effect (n,) out of the state, as an update does: it turns the axes."""
         before = self._estimate()
-        super()._take_out(mean)
+        super()._correct(mean)
         self._carry_over(before)
 
     @property

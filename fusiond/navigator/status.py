@@ -19,7 +19,6 @@ from fusiond.navigator.imu_screening import BEARABLE_YAW_RAD, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.reasons import joined, reason
 
-
 COURSE_M_S = 3.0
 """A vehicle shows its heading by driving above that, by default of its alignment."""
 
