@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Linearised
-from fusiond.estimators.constraint_odds import UNMEASURED_S, judge_by_constraints
 from fusiond.estimators.fault_bank import (
     ALL,
     EXPLAINED,
+    HEARD,
     LOG_ODDS,
-    MEASURED_S,
     MOVES,
     NOTHING,
     ONSET,
@@ -37,6 +36,7 @@ from fusiond.estimators.fault_bank import (
     column_of,
     columns_of,
     group_at,
+    is_evidence,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
@@ -112,6 +112,12 @@ class Hypotheses:
             known = self.of_source[measurement.source] = _measures(measurement, device >= 0), device
         return known
 
+    def is_evidence(self, measurement: Linearised, used: bool) -> bool:
+        """True if hypotheses are judged at a measurement that is `used`, or is not."""
+        measures = self.of(measurement)[0] if used else NOTHING
+        measured = used and not measurement.constraint
+        return bool(is_evidence(self.bank, measures, measurement.t_ns * 1e-9, measured))
+
     @property
     def waits(self) -> bool:
         """True if V is still that of the last measurement, as after a propagation in passing."""
@@ -126,7 +132,7 @@ class Hypotheses:
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
-        self.bank[MEASURED_S] = t_ns * 1e-9
+        self.bank[HEARD] = t_ns * 1e-9
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, measurement: Linearised, nav: Array, step: Array) -> None:
@@ -157,13 +163,9 @@ class Hypotheses:
         """Update after rows of a measurement: the result `found` if they were `measured` and
         `used`; unless a hypothesis is identified, the covariance that the weighted hypotheses add
         is written to `wider`. None if `fused` rows allow deferring all to `conclude`."""
-        if measured:
-            self.bank[MEASURED_S] = t_ns * 1e-9
         if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
             self.bank[UNJUDGED] = t_ns * 1e-9
             return None
-        if not measured and used and t_ns * 1e-9 - self.bank.item(MEASURED_S) > UNMEASURED_S:
-            judge_by_constraints(self.bank, *self.table[:3], t_ns * 1e-9, self.found)
         judge_and_widen(*self._judged, t_ns * 1e-9, measured, used, *self._widened)
         return self.found
 

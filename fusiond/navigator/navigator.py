@@ -40,7 +40,7 @@ from fusiond.navigator.drift_levels import DriftLevels
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_noise import ImuNoise
-from fusiond.navigator.imu_screening import ImuScreening
+from fusiond.navigator.imu_screening import AHEAD_NS, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import operator_position
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
-AHEAD_NS = 200_000_000
 # Verdicts on a sigma, of windows of minutes, are made of all that has come within this.
 VERDICTS_NS = 1_000_000_000
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
@@ -219,6 +217,8 @@ class Navigator:
             return self.outcome_watch.refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
             return self.outcome_watch.refuse(m.source, "time_unknown")
+        if seen_ns and self._screening.heard(seen_ns, self.imu):
+            self._restart(reason("imu_stamps_ahead"))
         try:
             measurements = self._intake.measurements_of(m, t_ns, sd_time_s, seen_ns)
         except RAISED_BY_NUMBERS as error:
@@ -282,6 +282,8 @@ class Navigator:
                 self.reset(self._units.wrong)
             return
         if self.started is None:
+            if self._screening.lags:
+                return
             start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
             too_old = start is None or self._start_is_too_old()
             if start is None or too_old or self._aligner.waits(start, self._latency):
