@@ -164,6 +164,11 @@ class Estimator:
         return False
 
     @property
+    def lost_heading_rad(self) -> float:
+        """One sigma of a heading that was known once; 0 of one that never was."""
+        return 0.0
+
+    @property
     def runs(self) -> MeasurementRun | None:
         """Measurements in one call; None while it takes them one by one."""
         return None
@@ -302,11 +307,15 @@ class Estimator:
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
         n = self.model.size
-        self._feed_back(mean)
+        self._correct(mean)
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
         if self.hypotheses is not None:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
+
+    def _correct(self, mean: Array) -> None:
+        """Take a fault's effect (n,) out of the state, as an update does."""
+        self._feed_back(mean)
 
     def _renew(self, renewal: Renewal) -> None:
         """Errors that measurements share become what they are from a measurement's instant on."""

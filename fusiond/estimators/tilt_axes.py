@@ -126,8 +126,14 @@ class TiltAxesFilter(KalmanEstimator):
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
-        super().adopt(mean, spread)
         self.undoubted = False
+        super().adopt(mean, spread)
+
+    def _correct(self, mean: Array) -> None:
+        """Take a fault's effect (n,) out of the state, as an update does: it turns the axes."""
+        before = self._estimate()
+        super()._correct(mean)
+        self._carry_over(before)
 
     @property
     def undoubted(self) -> bool:
