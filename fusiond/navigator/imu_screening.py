@@ -33,6 +33,10 @@ Stamps = NDArray[np.int64]
 # in a bend left errors of 7.7 sigma. That makes 2.2 s.
 BEARABLE_YAW_RAD = math.radians(25.0)
 BEARABLE_GAP_S = BEARABLE_YAW_RAD / CORNER_RAD_S
+# A stamp may lie this far ahead of what arrives with it (clock mapping, jitter).
+AHEAD_NS = 200_000_000
+# So long must stamps lie ahead: a program that was held up takes in what has arrived meanwhile.
+SURE_NS = 500_000_000
 # Good samples that end a trouble: twice what it takes to see that an axis is dead.
 SOUND_NS = 2_000_000_000
 
@@ -75,6 +79,11 @@ class ImuScreening:
         self._most_s = min(BEARABLE_GAP_S, keep_s)
         self._latest_ns: int | None = None
         self._newest: Stamps = np.zeros(1, dtype=np.int64)
+        self._ahead_ns = 0
+        """Arrival of anything else since which stamps lie ahead, or 0."""
+        self.lags = False
+        """True if the newest sample was too old to navigate by when something else arrived last,
+        and so to start by: a stream whose stamps have gone back."""
         self._troubles: dict[str, _Trouble] = {}
 
     def silence(self, silent_s: float | None) -> str:
@@ -93,6 +102,26 @@ class ImuScreening:
         # A clock set back: nothing would be taken until it is made up.
         text = f"IMU stamps went back {stuck_s:.1f} s ago: aligning again"
         self._trouble("time", self._newest, imu.backward_in_a_row, text)
+        self._check.restart()
+        self._latest_ns = None
+        return True
+
+    def arrived(self, seen_ns: int, imu: ImuBuffer) -> bool:
+        """Something else has arrived at `seen_ns`; True if stamps lie ahead of that for long: no
+        sample can be of an instant that has not come."""
+        if imu.end:
+            self.lags = seen_ns - imu.latest_ns > self._config.gap_s * 1e9
+        if not imu.end or imu.latest_ns <= seen_ns + AHEAD_NS:
+            self._ahead_ns = 0 if imu.end else self._ahead_ns
+            return False
+        if self._ahead_ns == 0:
+            self._ahead_ns = seen_ns
+            return False
+        if seen_ns - self._ahead_ns < SURE_NS:
+            return False
+        ahead_s = (imu.latest_ns - seen_ns) * 1e-9
+        text = f"IMU stamps lie {ahead_s:.1f} s ahead of what arrives: aligning again"
+        self._trouble("time", self._newest, 1, text)
         self._check.restart()
         self._latest_ns = None
         return True

@@ -40,7 +40,7 @@ from fusiond.navigator.drift_levels import DriftLevels
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_noise import ImuNoise
-from fusiond.navigator.imu_screening import ImuScreening
+from fusiond.navigator.imu_screening import AHEAD_NS, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import operator_position
@@ -63,8 +63,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
-AHEAD_NS = 200_000_000
 # Verdicts on a sigma, of windows of minutes, are made of all that has come within this.
 VERDICTS_NS = 1_000_000_000
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
@@ -223,6 +221,8 @@ class Navigator:
             return self._refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
             return self._refuse(m.source, "time_unknown")
+        if seen_ns and self._screening.arrived(seen_ns, self.imu):
+            self._restart(reason("imu_stamps_ahead"))
         try:
             measurements = self._intake.measurements_of(m, t_ns, sd_time_s, seen_ns)
         except RAISED_BY_NUMBERS as error:
@@ -283,6 +283,8 @@ class Navigator:
     def advance(self, record: bool = False) -> None:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
+            if self._screening.lags:
+                return
             start = self._warm_start() or self._aligner.attempt(self.imu)
             if (
                 start is None

@@ -32,6 +32,16 @@ IMU: Mapping[str, Reason] = {
     "imu_stamps_back": Reason(
         "warning", "IMU stamps went back: aligning again", "Check the clock of the IMU."
     ),
+    "heading_lost": Reason(
+        "warning",
+        "Heading known to {sd:.0f} deg only: aligning again",
+        "Drive on where there are fixes.",
+    ),
+    "imu_stamps_ahead": Reason(
+        "warning",
+        "IMU stamps lie ahead of what arrives: aligning again",
+        "Check the clock of the IMU.",
+    ),
     "imu_was_silent": Reason(
         "warning", "IMU was silent too long: aligning again", "Check power and bus of the IMU."
     ),

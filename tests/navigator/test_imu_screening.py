@@ -48,7 +48,7 @@ class _Told:
             navigator.add_imu(times[rows[kept[rows]]], samples[rows[kept[rows]]])
             for m in d.measurements:
                 if d.times[first] - 20_000_000 < m.t_seen_ns <= now:
-                    navigator.add(m, m.t_seen_ns)
+                    navigator.add(m, m.t_seen_ns, 0.0, m.t_seen_ns)
             navigator.advance()
             self.modes.append(navigator.mode(now)[0])
             self.texts.append(navigator.mode(now)[1])
@@ -181,3 +181,31 @@ def test_before_the_start_any_gap_begins_anew() -> None:
     assert events == ["imu_gap"]
     assert navigator.imu.oldest_ns == late[0]
     assert navigator.mode(int(late[-1]))[0] is Mode.ALIGNING
+
+
+def _stamped(off_s: float) -> tuple[list[str], list[Mode]]:
+    """Events and modes of a drive whose samples are stamped by so much too late, from a bend on for
+    eight seconds."""
+
+    def off(times: NDArray[np.int64], samples: Array) -> None:
+        times[_row(TURN_S) : _row(TURN_S + 8.0)] += round(off_s * runs.SECOND)
+
+    alignment = {**CONFIG["alignment"], "heading": ["config", "gnss_course"]}
+    told = _Told(off, settings={**CONFIG, "alignment": alignment})
+    return told.events, told.modes[_row(TURN_S + 2.5 - 8.0) // 5 : _row(TURN_S + 8.0 - 8.0) // 5]
+
+
+def test_no_sample_is_of_an_instant_that_has_not_come() -> None:
+    """Stamps ahead of what arrives with them: what is made of these is of no use until it ends."""
+    events, modes = _stamped(0.5)
+    assert events[:2] == ["aligned", "imu_time"]
+    assert events.count("aligned") == 2
+    assert not {Mode.NAVIGATING, Mode.COASTING} & {*modes}
+
+
+def test_nothing_starts_by_samples_that_are_too_old_to_navigate_by() -> None:
+    """Stamps that have gone back, while they are older than a silent unit's."""
+    events, modes = _stamped(-0.9)
+    assert events[:2] == ["aligned", "imu_time"]
+    assert events.count("aligned") == 2
+    assert set(modes) <= {Mode.WAITING, Mode.ALIGNING}

@@ -294,7 +294,9 @@ IMU: Mapping[str, Entry] = {
         "IMU samples jump more than a vehicle can.", "Check the line and the unit."
     ),
     "imu_stamp_ahead": warning("IMU stamps are ahead of later ones.", "Check the unit's clock."),
-    "imu_time": warning("IMU stamps went back; alignment restarts.", "Check the unit's clock."),
+    "imu_time": warning(
+        "IMU stamps went back or lie ahead; alignment restarts.", "Check the unit's clock."
+    ),
     "imu_axis_dead": warning("One IMU axis stands still.", "Check the DBC; replace the unit."),
     "imu_sound": info("IMU samples are accepted again."),
     "imu_units": warning("IMU data are in another unit.", "Correct `gyro_unit` or `accel_unit`."),
