@@ -15,9 +15,12 @@ from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import VE, VN
-from fusiond.navigator.imu_screening import ImuScreening
+from fusiond.navigator.imu_screening import BEARABLE_YAW_RAD, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.reasons import joined, reason
+
+COURSE_M_S = 3.0
+"""A vehicle shows its heading by driving above that, by default of its alignment."""
 
 
 class StartedNavigation(NamedTuple):
@@ -85,6 +88,10 @@ class NavigationStatus:
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:
             return reason("too_fast", speed=speed)
+        # Two sigma of what an error state bears: what was felt meanwhile lies on an arc.
+        lost = 2.0 * e.lost_heading_rad > BEARABLE_YAW_RAD and speed > COURSE_M_S
+        if lost:
+            return reason("heading_lost", sd=math.degrees(e.lost_heading_rad))
         if not diagnosis.positions_out:
             return None
         if (device := diagnosis.contradicts) is not None:
