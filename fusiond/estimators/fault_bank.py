@@ -10,6 +10,7 @@ variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt
 
     between updates     V <- Phi V                       fusiond.estimators.fault_carried
     each row            s = (H V + D) / sqrt(W)          L += s^T s   e += s^T y   J += y^2   N += 1
+                        J += 1 - min(c, 1) more of a row that shows c, not 1, in the mean
     if it was fused     V <- V - g s
 
     size of the fault   b = M (e + S^-1 m),  M = (L + S^-1)^-1      prior b ~ N(m, S)
@@ -96,11 +97,11 @@ LOG_PRIOR = 7
 # 1 if one was likely then, the epoch (s) of rows that are taken in and not judged, or infinity, the
 # row width of the transition, by how much the unit has been found to have turned on the vehicle in
 # pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
-# back of the velocity in all (m/s), and behind how many eights of groups with three numbers, and of
-# those with one, no V is other than zero.
+# back of the velocity in all (m/s), when (s) something measured was in service last, and the mean
+# of y^2 that rows of neither positions nor velocities nor speeds have shown.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, THREES_AWAKE, ONES_AWAKE, HEAD = 21, 22, 25, 26, 32
+UNWEIGHED, FED_BACK, LAST_MEASURED, SHOWN, HEAD = 21, 22, 25, 26, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -127,6 +128,12 @@ LEAST_WEIGHT = 1e-7
 """Probability below which a hypothesis counts for nothing: a third of a metre of a kilometre."""
 LASTS_S = 1.0
 """For so long it must have been: a receiver's errors of a second are one error."""
+SHOWN_KEPT = 1000.0
+"""Rows of the mean of what constraints show: a minute of no slip. They are known to a sigma that is
+a bound, and quiet for hours: a source's fault that ended long ago would fit by their silence."""
+ALONE_S = 2.0 * LASTS_S
+"""After so long without anything measured a constraint is judged by: beside a receiver of one fix a
+second it never is."""
 
 
 class FaultTable(NamedTuple):
@@ -207,6 +214,7 @@ def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
         bank[ALL], bank[THREES], bank[LENGTH] = table.groups, table.threes, LANES
         bank[WIDTH] = width
         bank[UNJUDGED] = bank[UNWEIGHED] = np.inf
+        bank[SHOWN] = 1.0
 
 
 @compiled("i8(f8[::1], i8)", forceinline=True)
@@ -232,24 +240,14 @@ def column_of(bank: Array, number: int, component: int) -> int:
     return column
 
 
-@compiled("void(f8[::1], i8)", forceinline=True)
-def wake(bank: Array, kind: int) -> None:
-    """A kind's V may be other than zero from now on."""
-    threes, last = int(bank[THREES]), RESTARTS * (kind + 1) - 1
-    if last < threes:
-        bank[THREES_AWAKE] = max(bank[THREES_AWAKE], last // LANES + 1)
-    else:
-        bank[ONES_AWAKE] = max(bank[ONES_AWAKE], (last - threes) // LANES + 1)
-
-
-@compiled("UniTuple(i8, 2)(f8[::1], b1)", forceinline=True)
-def awake(bank: Array, three: bool) -> tuple[int, int]:
-    """First column of groups with three numbers, or of those with one, and behind the last of which
-    V may be other than zero."""
-    if three:
-        return 0, 3 * LANES * int(bank[THREES_AWAKE])
-    first = 3 * LANES * ((int(bank[THREES]) + LANES - 1) // LANES)
-    return first, first + LANES * int(bank[ONES_AWAKE])
+@compiled("b1(f8[::1], i8, f8, b1)", forceinline=True)
+def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
+    """True if hypotheses are judged at rows of such kinds: they are `measured`, or known of the
+    vehicle while nothing is. Whoever is alone is the only witness, if a coloured one."""
+    if measured:
+        bank[LAST_MEASURED] = t_s
+    alone: bool = measured or (measures != NOTHING and t_s - bank[LAST_MEASURED] > ALONE_S)
+    return alone
 
 
 @compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)

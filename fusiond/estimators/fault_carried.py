@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.block_covariance import DENSITIES, STEPS
 from fusiond.estimators.covariance import transition_for
-from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH, awake
+from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH
 from fusiond.estimators.fault_rows import add_rows, walk_path
 from fusiond.estimators.turned_axes import rest_rows
 from fusiond.navigation.compiled import compiled
@@ -94,29 +94,27 @@ def _multiply(bank: Array, n: int, rows: Indices) -> None:
         begins[k + 1] = end
         alone[k] = end == begins[k] + 1 and of[begins[k]] == rows[k]
     new = np.empty(count * CHUNK, dtype=np.float32)
-    for three in (True, False):
-        begin, behind = awake(bank, three)
-        for first in range(begin, behind, CHUNK):
-            length = min(CHUNK, behind - first)
-            for k in range(count):
-                if alone[k]:
-                    continue
-                out = new[k * CHUNK : k * CHUNK + length]
-                for j in range(out.shape[0]):
-                    out[j] = 0.0
-                those = of[begins[k] : begins[k + 1]]
-                row = phi[rows[k] * width : (rows[k] + 1) * width]
-                add_rows(v, columns, first, those, those.shape[0], row, out)
-            for k in range(count):
-                at = rows[k] * columns + first
-                out, to = new[k * CHUNK : k * CHUNK + length], v[at : at + length]
-                if alone[k]:
-                    keep = np.float32(phi[rows[k] * width + rows[k]])
-                    for j in range(to.shape[0]):
-                        to[j] *= keep
-                else:
-                    for j in range(to.shape[0]):
-                        to[j] = out[j]
+    for first in range(0, columns, CHUNK):
+        length = min(CHUNK, columns - first)
+        for k in range(count):
+            if alone[k]:
+                continue
+            out = new[k * CHUNK : k * CHUNK + length]
+            for j in range(out.shape[0]):
+                out[j] = 0.0
+            those = of[begins[k] : begins[k + 1]]
+            row = phi[rows[k] * width : (rows[k] + 1) * width]
+            add_rows(v, columns, first, those, those.shape[0], row, out)
+        for k in range(count):
+            at = rows[k] * columns + first
+            out, to = new[k * CHUNK : k * CHUNK + length], v[at : at + length]
+            if alone[k]:
+                keep = np.float32(phi[rows[k] * width + rows[k]])
+                for j in range(to.shape[0]):
+                    to[j] *= keep
+            else:
+                for j in range(to.shape[0]):
+                    to[j] = out[j]
     for i in rows:
         for j in range(width):
             phi[i * width + j] = 1.0 if i == j else 0.0

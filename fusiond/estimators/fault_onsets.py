@@ -25,7 +25,6 @@ from fusiond.estimators.fault_bank import (
     LOG_ODDS,
     OF_ONE,
     OF_THREE,
-    ONES_AWAKE,
     ONSET,
     PERIODS_NS,
     PROMOTED,
@@ -40,15 +39,12 @@ from fusiond.estimators.fault_bank import (
     STATES,
     SUSPECTS,
     THREES,
-    THREES_AWAKE,
     TURNED,
     UNJUDGED,
     UNWEIGHED,
     WEIGHT,
-    awake,
     column_of,
     group_at,
-    wake,
 )
 from fusiond.estimators.fault_carried import begin_transition
 from fusiond.estimators.fault_odds import solve
@@ -65,23 +61,6 @@ UNLIKELY = 1e-12
 """Of what is followed by no fault that counts."""
 COUNTS = 1e-3
 """Weight of a fault below which what it has done is not looked at."""
-
-
-@compiled("void(f8[::1], i8)")
-def _fall_asleep(bank: Array, n: int) -> None:
-    """Leave the last eights of groups out whose V is zero."""
-    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
-    columns = v.shape[0] // n
-    for three in (True, False):
-        step, begin = 3 * LANES if three else LANES, awake(bank, three)[0]
-        nothing = True
-        while nothing and awake(bank, three)[1] > begin:
-            end = awake(bank, three)[1]
-            for i in range(n):
-                for j in range(end - step, end):
-                    nothing = nothing and v[i * columns + j] == 0.0
-            if nothing:
-                bank[THREES_AWAKE if three else ONES_AWAKE] -= 1.0
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
@@ -133,8 +112,6 @@ def _begin_group(
         bank[at + COUNTS_BY] = math.log(max(followed[n], UNLIKELY))
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
-    if ints[kind, SIGNATURE] < FOLLOWED + (followed[n] > 0.0):
-        wake(bank, kind)
     for c in range(size):
         first = column_of(bank, number, c)
         for i in range(n):
@@ -172,7 +149,6 @@ def begin_all(
     """Begin all hypotheses anew; what the path was remains."""
     begin_transition(bank, n, width)
     bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED], bank[UNWEIGHED] = 0.0, 0.0, np.inf, np.inf
-    bank[THREES_AWAKE], bank[ONES_AWAKE] = 0.0, 0.0
     followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
@@ -198,7 +174,6 @@ def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> Non
             least, found = above, slot
     if found < 0 or not odds > least + PROMOTED:
         return
-    wake(bank, kind)
     to = RESTARTS * kind + found
     there = group_at(bank, to)
     for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
@@ -251,5 +226,3 @@ def restart_due(
                     continue
                 _promote(bank, ints, n, kind, slot)
                 _begin_group(bank, ints, n, kind, slot, t_ns * 1e-9, nav, step, followed)
-    if followed.shape[0]:
-        _fall_asleep(bank, n)

@@ -41,7 +41,6 @@ from fusiond.estimators.fault_bank import (
     N_AT,
     OF_ONE,
     OF_THREE,
-    ONES_AWAKE,
     ONSET,
     OTHER,
     PATH,
@@ -56,17 +55,16 @@ from fusiond.estimators.fault_bank import (
     ROLLS,
     ROWS,
     SENSITIVITIES,
+    SHOWN,
+    SHOWN_KEPT,
     SIGNATURE,
     SIZE,
     SPEED,
     THREES,
-    THREES_AWAKE,
     VELOCITY,
     VELOCITY_RAMP,
-    awake,
     column_of,
     group_at,
-    wake,
 )
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DV
@@ -213,7 +211,6 @@ def _sign(
         offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
         if offset == 0.0 and slope == 0.0:
             continue
-        wake(bank, kind)
         number, behind = RESTARTS * kind, RESTARTS * (kind + 1)
         while number < behind:  # those of eight at once
             at = group_at(bank, number)
@@ -334,21 +331,21 @@ def sensitivity_rows(
     return columns
 
 
-@compiled("void(f4[::1], i8, f8[:, ::1], i8, i8, i8, f4[::1])")
-def _fold_in(v: Single, n: int, g: Array, columns: int, first: int, end: int, work: Single) -> None:
-    """V <- V - g^T s of columns from `first` to `end`, three rows in one pass, or one."""
+@compiled("void(f4[::1], i8, f8[:, ::1], i8, f4[::1])")
+def _fold_in(v: Single, n: int, g: Array, columns: int, work: Single) -> None:
+    """V <- V - g^T s, three rows in one pass, or one."""
     at, m = 0, g.shape[0]
     while at < m:
-        s_0 = work[at * columns + first : at * columns + end]
+        s_0 = work[at * columns : (at + 1) * columns]
         if at + 3 <= m:
-            s_1 = work[(at + 1) * columns + first : (at + 1) * columns + end]
-            s_2 = work[(at + 2) * columns + first : (at + 2) * columns + end]
+            s_1 = work[(at + 1) * columns : (at + 2) * columns]
+            s_2 = work[(at + 2) * columns : (at + 3) * columns]
             for i in range(n):
                 c_0, c_1 = np.float32(g[at, i]), np.float32(g[at + 1, i])
                 c_2 = np.float32(g[at + 2, i])
                 if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
                     continue
-                row = v[i * columns + first : i * columns + end]
+                row = v[i * columns : (i + 1) * columns]
                 for j in range(row.shape[0]):
                     row[j] -= c_0 * s_0[j] + c_1 * s_1[j] + c_2 * s_2[j]
             at += 3
@@ -356,14 +353,16 @@ def _fold_in(v: Single, n: int, g: Array, columns: int, first: int, end: int, wo
             for i in range(n):
                 c_0 = np.float32(g[at, i])
                 if c_0 != 0.0:
-                    row = v[i * columns + first : i * columns + end]
+                    row = v[i * columns : (i + 1) * columns]
                     for j in range(row.shape[0]):
                         row[j] -= c_0 * s_0[j]
             at += 1
 
 
-@compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f4[::1])")
-def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) -> None:
+@compiled("void(f8[::1], i8, i8, f8[::1], f8[:, ::1], b1, f4[::1])")
+def account(
+    bank: Array, n: int, measures: int, y: Array, g: Array, fused: bool, work: Single
+) -> None:
     """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
     `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
     m = y.shape[0]
@@ -372,6 +371,11 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) 
     square = 0.0
     for a in range(m):
         square += y[a] * y[a]
+    left = square
+    if measures > ROLLS:
+        left += m * (1.0 - min(bank[SHOWN], 1.0))
+        if fused:
+            bank[SHOWN] += (square - m * bank[SHOWN]) / SHOWN_KEPT
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     eights = threes + (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
@@ -383,10 +387,8 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) 
         own = unsigned(at)
         for k in range(length):
             j = own + unsigned(k)
-            bank[j + unsigned(J_AT)] += square
+            bank[j + unsigned(J_AT)] += left
             bank[j + unsigned(N_AT)] += m
-        if row - (0 if three else threes) >= bank[THREES_AWAKE if three else ONES_AWAKE]:
-            continue
         for a in range(m):
             y_a = y[a]
             at_0 = unsigned(a * columns + first * LANES)
@@ -408,6 +410,4 @@ def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Single) 
                     bank[j + unsigned(E1)] += s_1 * y_a
                     bank[j + unsigned(E2)] += s_2 * y_a
     if fused:
-        for three in (True, False):
-            begin, end = awake(bank, three)
-            _fold_in(v, n, g, columns, begin, end, work)
+        _fold_in(v, n, g, columns, work)

@@ -121,7 +121,7 @@ def fold_and_account(
         columns = sensitivity_rows(*rows)
         if fails:
             nis = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-        account(bank, n, y, g, nis <= threshold, work)
+        account(bank, n, measures, y, g, nis <= threshold, work)
     if nis <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -162,4 +162,4 @@ def account_for(
     bank[UNWEIGHED] = np.inf
     restart_due(bank, ints, numbers, n, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
-    account(bank, n, y, g, fused, work)
+    account(bank, n, measures, y, g, fused, work)

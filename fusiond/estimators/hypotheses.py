@@ -34,6 +34,7 @@ from fusiond.estimators.fault_bank import (
     column_of,
     columns_of,
     group_at,
+    is_evidence,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
@@ -108,6 +109,12 @@ class Hypotheses:
             device = devices.index(measurement.device) if measurement.device in devices else -1
             known = self.of_source[measurement.source] = _measures(measurement, device >= 0), device
         return known
+
+    def is_evidence(self, measurement: Linearised, used: bool) -> bool:
+        """True if hypotheses are judged at a measurement that is `used`, or is not."""
+        measures = self.of(measurement)[0] if used else NOTHING
+        measured = used and not measurement.constraint
+        return bool(is_evidence(self.bank, measures, measurement.t_ns * 1e-9, measured))
 
     @property
     def waits(self) -> bool:

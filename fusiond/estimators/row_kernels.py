@@ -37,7 +37,7 @@ from fusiond.aiding.packed import (
     T_NS,
     packed_rows,
 )
-from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED
+from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, is_evidence
 from fusiond.estimators.fault_odds import judge
 from fusiond.estimators.fault_opened import judge_and_widen
 from fusiond.estimators.fault_suspects import any_likely, judge_what_waits
@@ -172,12 +172,14 @@ def _judged(
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
     m, t_s = of[ROWS], of[T_NS] * 1e-9
-    if of[ASKED] & MEASURED:
+    measured = of[ASKED] & MEASURED != 0
+    if is_evidence(bank, of[MEASURES], t_s, measured):
         if bank[SUSPECTS] != 0.0:
             return JUDGE
         bank[UNJUDGED] = t_s
+    if measured:
         learn(noise, t_s, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0, m)
-    else:
+    elif bank[UNJUDGED] == np.inf:
         published, mounting, wider = opened
         judge_and_widen(
             *(bank, ints, numbers, lanes, dx.shape[0], t_s, False, True),

@@ -200,12 +200,14 @@ class Diagnosis:
     ) -> Correction | None:
         """Take in how a measurement ended; what to take out of the filter's state, if anything."""
         e, t_ns, correction, explained = estimator, measurement.t_ns, None, False
-        bank, measured, used = e.hypotheses, not measurement.constraint, not one.out
+        bank, used = e.hypotheses, not one.out
         if one.out or one.device in self._agreement:
             self._agrees(measurement, one)
         if bank is not None:
+            evidence = bank.is_evidence(measurement, used)
+            measured = evidence or not measurement.constraint
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
-            if found is not None and measured and used:
+            if found is not None and evidence:
                 if identified(found) and self._can_decide(measurement, found):
                     correction = self._decide(measurement, e, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
