@@ -101,7 +101,7 @@ LOG_PRIOR = 7
 # of y^2 that rows of neither positions nor velocities nor speeds have shown.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
-UNWEIGHED, FED_BACK, HEARD, SHOWN, HEAD = 21, 22, 25, 26, 32
+UNWEIGHED, FED_BACK, LAST_MEASURED, SHOWN, HEAD = 21, 22, 25, 26, 32
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -245,8 +245,8 @@ def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
     """True if hypotheses are judged at rows of such kinds: they are `measured`, or known of the
     vehicle while nothing is. Whoever is alone is the only witness, if a coloured one."""
     if measured:
-        bank[HEARD] = t_s
-    alone: bool = measured or (measures != NOTHING and t_s - bank[HEARD] > ALONE_S)
+        bank[LAST_MEASURED] = t_s
+    alone: bool = measured or (measures != NOTHING and t_s - bank[LAST_MEASURED] > ALONE_S)
     return alone
 
 

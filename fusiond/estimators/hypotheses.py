@@ -14,7 +14,7 @@ from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
     ALL,
     EXPLAINED,
-    HEARD,
+    LAST_MEASURED,
     LOG_ODDS,
     MOVES,
     NOTHING,
@@ -132,7 +132,7 @@ class Hypotheses:
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
             turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
             self.bank[TURNED_BY + k] = turned
-        self.bank[HEARD] = t_ns * 1e-9
+        self.bank[LAST_MEASURED] = t_ns * 1e-9
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, measurement: Linearised, nav: Array, step: Array) -> None:

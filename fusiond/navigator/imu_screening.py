@@ -106,7 +106,7 @@ class ImuScreening:
         self._latest_ns = None
         return True
 
-    def heard(self, seen_ns: int, imu: ImuBuffer) -> bool:
+    def arrived(self, seen_ns: int, imu: ImuBuffer) -> bool:
         """Something else has arrived at `seen_ns`; True if stamps lie ahead of that for long: no
         sample can be of an instant that has not come."""
         if imu.end:

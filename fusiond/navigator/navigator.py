@@ -217,7 +217,7 @@ class Navigator:
             return self.outcome_watch.refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
             return self.outcome_watch.refuse(m.source, "time_unknown")
-        if seen_ns and self._screening.heard(seen_ns, self.imu):
+        if seen_ns and self._screening.arrived(seen_ns, self.imu):
             self._restart(reason("imu_stamps_ahead"))
         try:
             measurements = self._intake.measurements_of(m, t_ns, sd_time_s, seen_ns)
