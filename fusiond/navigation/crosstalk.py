@@ -68,23 +68,23 @@ MEAN_S = 60.0
 """The mean force is gravity, the mean rate a bias: a vehicle speeds up and brakes in a minute."""
 
 
-@compiled("void(f8[:, ::1], f8, f8, f8, f8, f8, f8, f8, f8[::1], f8[:, ::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], UniTuple(f8, 2), UniTuple(f8, 5), f8[::1], f8[:, ::1], f8[:, ::1])")
 def _follow(
     samples: Array,
-    gain: float,
-    slow_gain: float,
-    of_rates: float,
-    along_up: float,
-    across_up: float,
-    rate_scale: float,
-    force_scale: float,
+    gains: tuple[float, float],
+    factors: tuple[float, float, float, float, float],
     mean: Array,
     out: Array,
     scaled: Array,
 ) -> None:
-    """Add to `out` (m, 6) the density after each of `samples` (m, 6) by axes out of square, to
-    `scaled` (m, 6) that by scale factors. `mean` (13,) persists from call to call: smoothed rates
-    and forces, their means, and the number of samples."""
+    """Add the densities after each of `samples` (m, 6).
+
+    To `out` (m, 6) those by axes out of square, to `scaled` (m, 6) those by scale factors; `gains`
+    are those of the smoothed samples and of their means, `factors` of rates, of forces along the
+    vertical and across, and of both scale factors. `mean` (13,) goes on from call to call: smoothed
+    rates and forces, their means, and of how many samples they are."""
+    gain, slow_gain = gains
+    of_rates, along_up, across_up, rate_scale, force_scale = factors
     for i in range(samples.shape[0]):
         mean[12] += 1.0
         fast, slow = max(gain, 1.0 / mean[12]), max(slow_gain, 1.0 / mean[12])
@@ -142,7 +142,7 @@ class Crosstalk:
         (m,) ns to `densities` (m, 6)."""
         found = np.zeros_like(densities)
         gains = self._gain, self._slow_gain
-        _follow(samples, *gains, *self._times, self._mean, found, densities)
+        _follow(samples, gains, self._times, self._mean, found, densities)
         for rows, square in self.squares.rows(times):
             found[rows] *= square
         densities += found

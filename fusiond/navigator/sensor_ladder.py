@@ -39,7 +39,7 @@ WRONG = 100.0
 WORSE: Final = 4.0 ** np.arange(0.25, 10.1, 0.25)
 """Grades beyond the class's: gyros of phones have 540 times the bias of tactical ones."""
 AS_SAID = "bias_correlation_s"
-"""What all classes have alike."""
+"""Figure that all classes have alike."""
 
 
 def worse_than_said(seen: Array, prior: float, noise: float) -> float:

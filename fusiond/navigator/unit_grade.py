@@ -14,9 +14,9 @@ E[g]. What a state has hardly shown (R above s^2) weighs by itself little.
 At rest, before there is a filter, the gyros show their biases, and the force along the vertical
 that of one accelerometer (`graded_at_rest`). That is four values, and what counts of them is the
 bias of the other two accelerometers, which nothing shows before the vehicle turns. So there gyros
-and accelerometers have a grade each, which lie apart by `APART`:
+and accelerometers have a grade each, which lie apart by `SPREAD`:
 
-    ln g_f = ln g_w + N(0, APART^2)
+    ln g_f = ln g_w + N(0, SPREAD^2)
 
 Of units of a fifth and a third of their class's sigmas the square of what is not seen is then 0.79
 and 0.89 of what it counts as in the mean, of those that are just as their class says 1.18 (tested):
@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 GRID: Final = 4.0 ** np.arange(-4.0, 1.1, 0.25)
 """Grades: a sixteenth of the sigmas of the class to twice those. The classes are six to ninety
 times apart from each other."""
-APART: Final = math.log(2.0)
+SPREAD: Final = math.log(2.0)
 """One sigma of the logarithm of what the grades of gyros and accelerometers of a unit are apart by:
 a factor of 1.4 of their sigmas. That of a class to the next is 2.5 and 10, in gyros 6 and 90."""
 AS_ITS_CLASS: Final = np.ones(COLUMN_END - RATE_ERROR + 1)
@@ -69,8 +69,7 @@ def graded_at_rest(rates: Values, force: Values) -> Array:
     """Grades (13,) as of `AS_ITS_CLASS`: by the rates of all gyros at rest, and by the force along
     the vertical. Axes are as good as what is worse of the two."""
     of_rates, of_force = rates.log_likelihood(), force.log_likelihood()
-    apart = np.log(GRID[:, None] / GRID) / APART
-    alike = np.exp(-0.5 * np.square(apart))
+    alike = np.exp(-0.5 * np.square(np.log(GRID[:, None] / GRID) / SPREAD))
     alike /= alike.sum(axis=0)
     gyros = _expected(of_rates, alike @ _weights(of_force))
     accelerometers = _expected(of_force, alike @ _weights(of_rates))

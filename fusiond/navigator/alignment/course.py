@@ -180,8 +180,8 @@ def _moved_off(
             Levelled(
                 at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)
             ),
+            by.known.grades(standstill, *bias, g),
         ),
-        grades=by.known.grades(standstill, *bias, g),
     )
 
 
@@ -359,12 +359,12 @@ def _build(
     sd_yaw: float,
     rate: Array,
     how: str,
-    rested: tuple[tuple[Array, float], Levelled] | None = None,
+    rested: tuple[tuple[Array, float], Levelled, Array] | None = None,
     fitted: Fitted | None = None,
-    grades: Array | None = None,
 ) -> Start:
-    """Start by the antenna's velocity in the body; `rested`: bias and level of a standstill."""
-    bias, levelled = (None, None) if rested is None else rested
+    """Start by the antenna's velocity in the body; `rested`: bias, level and grades of a
+    standstill."""
+    bias, levelled, grades = rested or (None, None, by.known.unrested_grades)
     velocity, sd = velocity_of(candidate)
     velocity = velocity - dcm @ np.cross(rate, candidate.lever)
     force = sensed_motion.samples_at(imu, candidate.t_ns)[3:]
@@ -387,5 +387,5 @@ def _build(
         fitted=fitted,
         unexplained=by.known.unexplained,
         moves=Moves(candidate, rate, acceleration),
-        grades=by.known.unrested_grades if grades is None else grades,
+        grades=grades,
     )
