@@ -76,6 +76,9 @@ class Navigator:
     """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know;
     `estimator` makes the filter of the configuration and its model."""
 
+    keeps_solutions = False
+    """At each sample in `imu`, as by `advance(record=True)`."""
+
     def __init__(
         self,
         config: Config,
@@ -118,8 +121,6 @@ class Navigator:
         self._imu_noise = ImuNoise(self.model, imu, self._drifts)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
-        self.keeps_solutions = False
-        """All of them at each sample in `imu`, as by `advance(record=True)`."""
         self.without_imu = WithoutImu(
             config, shared_blocks, self._event, self.last_fused_ns, self._on_outcome
         )
