@@ -25,11 +25,11 @@ def main(path: Path, record: Path | None = None) -> None:
     gc.set_threshold(COLLECT_AFTER_IMPORTS)
     from fusiond.configuration.load import EXIT_CONFIG, ConfigError, load_config  # noqa: PLC0415
 
-    def read() -> Config:
+    def configuration() -> Config:
         return recorded(load_config(path), record)
 
     try:
-        config = read()
+        config = configuration()
     except ConfigError as error:
         print(error, file=sys.stderr)
         sys.exit(EXIT_CONFIG)
@@ -48,7 +48,7 @@ def main(path: Path, record: Path | None = None) -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(COLLECT_AFTER)
-    run_daemon(config, path, read, needed(missing, widths))
+    run_daemon(config, path, configuration, needed(missing, widths))
 
 
 def recorded(config: Config, folder: Path | None) -> Config:

@@ -160,7 +160,7 @@ def gathered() -> Iterator[list[Missing]]:
 def needed(
     missing: Iterable[Missing], variants: Collection[int] | None = None
 ) -> list[Callable[[], None]]:
-    """What compiles them; of those that one piece of source makes, these `variants` alone. Half of
+    """Jobs that compile them; of those one piece of source makes, these `variants` alone. Half of
     the compiler's time is theirs, and a vehicle has one or two of four."""
     return [
         load

@@ -72,6 +72,9 @@ class Navigator:
     """Navigation of one vehicle. `on_event(code, text)` receives what an operator should know;
     `estimator` makes the filter of the configuration and its model."""
 
+    keeps_solutions = False
+    """True if `imu` keeps the solution at each sample, as by `advance(record=True)`."""
+
     def __init__(
         self,
         config: Config,
@@ -116,8 +119,6 @@ class Navigator:
         self._service_events = ServiceEvents(self.timeline, self._event)
         self.service = SourceService(self.timeline, e.federated.sources or tuple(config.aiding))
         self._imu_noise = ImuNoise(self.model, imu, self._drifts)
-        self.keeps_solutions = False
-        """True if `imu` keeps the solution at each sample, as by `advance(record=True)`."""
         fused_ns = self.outcome_watch.fused_ns
         self.without_imu = WithoutImu(config, shared_blocks, self._event, fused_ns, on_outcome)
         self._verdicts_ns = 0

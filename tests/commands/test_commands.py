@@ -94,7 +94,7 @@ def test_configuration_mistake_exits_78(tmp_path: Path, call: Call, command: str
 
 
 def test_missing_configuration_exits_78(tmp_path: Path) -> None:
-    done = in_this_process("run", tmp_path / "none.toml")
+    done = fusiond("run", tmp_path / "none.toml")
     assert done.returncode == 78
     assert "none.toml: No such file or directory" in done.stderr
 
