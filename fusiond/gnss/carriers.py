@@ -72,7 +72,7 @@ P_B, CNO_B, SD_B, CARRIER_B, LOCK_B = range(SECOND_COLUMNS)
 # What is kept of a satellite: of its first signal, of its pair; times and numbers of 0: nothing.
 SLOTS, KEPT_COLUMNS = 3 * 64, 12
 (
-    _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V, _BESIDE, _MANY, _APART,
+    _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V, _BESIDE, _MANY, _SINCE,
 ) = range(KEPT_COLUMNS)  # fmt: skip
 # Slot 0 is no satellite's: sum of w nu^2 / (A + V) and of w; the same of changes of two carriers,
 # and of codes beside their carriers.
@@ -105,7 +105,7 @@ MULTIPATH_S = 60.0
 MEANS_S, LEAST_S = 20.0, 5.0
 """Of a code beside its carrier: long against the noise of codes, short against the multipath that
 comes and goes with the sky; and what must be known of it."""
-APART_SIGMAS, BACK_SIGMAS = 4.0, 2.0
+MULTIPATH_SIGMAS, BACK_SIGMAS = 4.0, 2.0
 """One in 30,000 sound codes is beyond the first, were codes' noise white."""
 LONGEST_S = 2.0
 """Longest interval over which Dopplers detect a slip."""
@@ -191,7 +191,7 @@ def _delay(
 
 
 @compiled("b1(f8[::1], f8[::1], f8, f8, f8, f8, f8, f8[::1])")
-def _apart(
+def _has_multipath(
     state: Array,
     first: Array,
     length: float,
@@ -207,19 +207,19 @@ def _apart(
     beside, model = first[P_A] - length, _code_variance(first[CNO], first[SD_A], 1.0)
     state[_BESIDE] -= slipped
     if state[_MANY] == 0.0 or math.isnan(beside) or math.isnan(state[_BESIDE]):
-        state[_BESIDE], state[_APART] = beside, 0.0
+        state[_BESIDE], state[_SINCE] = beside, 0.0
         state[_MANY] = 0.0 if math.isnan(beside) else min(span, 1.0)
         return False
     e, wider = beside - state[_BESIDE], 1.0 + 1.0 / max(state[_MANY], 1.0)
     sigma = math.sqrt(scale * model * wider)
-    if state[_APART] > 0.0 and e < BACK_SIGMAS * sigma:
-        state[_APART] = 0.0
-    if state[_APART] == 0.0 and e > APART_SIGMAS * sigma and state[_MANY] >= LEAST_S:
-        state[_APART] = now
-    if state[_APART] > 0.0 and now - state[_APART] < FORGOTTEN_S:
+    if state[_SINCE] > 0.0 and e < BACK_SIGMAS * sigma:
+        state[_SINCE] = 0.0
+    if state[_SINCE] == 0.0 and e > MULTIPATH_SIGMAS * sigma and state[_MANY] >= LEAST_S:
+        state[_SINCE] = now
+    if state[_SINCE] > 0.0 and now - state[_SINCE] < FORGOTTEN_S:
         return True
-    if state[_APART] > 0.0 or (e < -APART_SIGMAS * sigma and state[_MANY] >= LEAST_S):
-        state[_BESIDE], state[_MANY], state[_APART] = beside, min(span, 1.0), 0.0
+    if state[_SINCE] > 0.0 or (e < -MULTIPATH_SIGMAS * sigma and state[_MANY] >= LEAST_S):
+        state[_BESIDE], state[_MANY], state[_SINCE] = beside, min(span, 1.0), 0.0
         return False
     w = min(span, 1.0)
     seen[_CODES] += w * min(e * e / (model * wider), CLIPPED * scale)
@@ -302,7 +302,7 @@ def follow(
         state = kept[int(plan[i, SLOT])]
         span = now - state[_T]
         if span <= 0.0:  # seen already
-            if state[_APART] > 0.0:
+            if state[_SINCE] > 0.0:
                 refused[i] = MULTIPATH
             _write_rates(state, plan[i], first[i], scale, out[i])
             continue
@@ -332,7 +332,7 @@ def follow(
         elif out[i, SPAN] == 0.0 or refused[i] != FOLLOWED:
             rate = 0.5 * (first[i, RATE] + state[_RATE]) + common
             lost = l_a - state[_L_A] - rate * span
-        if _apart(state, first[i], l_a, now, span, lost, codes, kept[0]):
+        if _has_multipath(state, first[i], l_a, now, span, lost, codes, kept[0]):
             refused[i] = MULTIPATH
         if jumped or refused[i] != FOLLOWED:
             out[i, SPAN] = 0.0

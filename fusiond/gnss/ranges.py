@@ -167,7 +167,7 @@ class Followed(NamedTuple):
     carriers: Array
     code_scale: float
     slips: tuple[tuple[str, str], ...]
-    apart: npt.NDArray[np.bool_] | None = None
+    multipath: npt.NDArray[np.bool_] | None = None
 
 
 def nothing_kept() -> Array:
@@ -230,16 +230,16 @@ class RangeModel:
         jumped = ca.follow(kept, *args)
         scale = math.sqrt(ca.scale_squared(kept))
         slips: tuple[tuple[str, str], ...] = ()
-        apart = None
+        multipath = None
         if refused.any():
             slips = tuple(
                 (plan.satellites[k], "lock_lost" if refused[k] == ca.LOCK_LOST else "cycle_slip")
                 for k in np.flatnonzero((refused == ca.LOCK_LOST) | (refused == ca.CYCLE_SLIP))
             )
-            apart = refused == ca.MULTIPATH
+            multipath = refused == ca.MULTIPATH
         if jumped:
             slips += (("", "clock_jump"),)
-        return Followed(picked, carriers, scale, slips, apart)
+        return Followed(picked, carriers, scale, slips, multipath)
 
     def evaluate(self, followed: Followed, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
@@ -265,13 +265,13 @@ class RangeModel:
         out[rk.SLOT], out[rk.ISSUE] = plan.followed[:, ca.SLOT], plan.issues
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
-        if not lost and followed.apart is None:
+        if not lost and followed.multipath is None:
             return rows
         weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
         low = out[rk.ELEVATION] < options.elevation_mask_rad
         drop = weak | low
-        if followed.apart is not None:
-            drop |= followed.apart
+        if followed.multipath is not None:
+            drop |= followed.multipath
         rows.refused += tuple(
             (
                 satellites[k],
