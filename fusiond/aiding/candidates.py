@@ -10,10 +10,11 @@ has what a unit of each state of `bias` displaces along axis i, `markov_m` is ho
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 Vector3 = tuple[float, float, float]
-Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix3 = Sequence[Sequence[float]]
 UNIT: Matrix3 = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 # Sigma (m/s) and time (s) of a speed that does not drift.
 STEADY = (0.0, 1.0)

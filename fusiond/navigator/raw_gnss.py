@@ -373,7 +373,7 @@ class RawGnss:
         lever = self._section.lever_arm_m
         # Its errors last: the ranges that follow have them, and are no proof of it.
         shape = Displacement.of(found.rows, 0.0, found.rows.lasting).shape.tolist()
-        share = tuple(tuple(row) for row in shape)
+        share = tuple(map(tuple, shape))
         of = (n, e, d), lever, RANGE_BIAS, "", "", share
         candidates: list[Candidate] = [PositionCandidate(t_ns, lat, lon, height, *of)]
         if found.velocity is not None:

@@ -195,7 +195,7 @@ def _row(
     return row
 
 
-def run(
+def run_study(
     runs: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,

@@ -14,7 +14,7 @@ import pytest
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
 from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
-from fusiond.aiding.pseudorange import epoch_values
+from fusiond.aiding.pseudorange import RANGE_BIAS, epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import imu_noise
@@ -102,6 +102,10 @@ def test_an_epoch_alone_starts_the_alignment() -> None:
     assert abs(position.lon_rad - lon) * 6.37e6 < 5.0 * position.sd[1]
     assert position.height_m is not None
     assert abs(position.height_m - height) < 5.0 * position.sd[2]
+    # Its errors last: the ranges that follow displace by the same.
+    ranges = raw.measurement(sim.epoch(0), 9).at(place(0))
+    assert position.bias == RANGE_BIAS
+    assert np.array(position.bias_share) == pytest.approx(ranges.shape, abs=0.05)
     few = replace(sim.epoch(1), signals=sim.epoch(1).signals[:3])
     assert raw.measurement(few, 8).candidates() == []
     assert raw.refused["too_few"] == 1

@@ -11,7 +11,16 @@ import pytest
 
 from fusiond.models.catalogue import MODELS
 from fusiond.simulation.papers import PAPERS
-from fusiond.studies.papers import CASES, GROUPS, HONEST, WITHOUT_IMU, flown, plot, run, tables
+from fusiond.studies.papers import (
+    CASES,
+    GROUPS,
+    HONEST,
+    WITHOUT_IMU,
+    flown,
+    plot,
+    run_study,
+    tables,
+)
 
 SHORT = ("001 planar10", WITHOUT_IMU)
 
@@ -36,7 +45,7 @@ def test_a_run_repeats_and_another_is_another() -> None:
 
 
 def test_its_result_its_tables_and_its_picture(tmp_path: Path) -> None:
-    result = run(2, cases=SHORT)
+    result = run_study(2, cases=SHORT)
     json.dumps(result, allow_nan=False)
     assert set(result["cases"]) == set(SHORT)
     for name, case in result["cases"].items():

@@ -269,7 +269,7 @@ def test_help_says_what_each_study_asks_and_how_many_runs_it_makes() -> None:
         source = importlib.util.find_spec(STUDIES[name])
         assert source is not None
         assert source.origin is not None
-        (runs,) = re.findall(
-            r"(?m)^(?:DEFAULT_RUNS|DRAWS) = ([\d_]+)$", Path(source.origin).read_text()
-        )
+        text = Path(source.origin).read_text()
+        assert re.search(r"(?m)^def run_study\(", text), name
+        (runs,) = re.findall(r"(?m)^(?:DEFAULT_RUNS|DRAWS) = ([\d_]+)$", text)
         assert int(runs) == about.runs

@@ -348,7 +348,8 @@ def _implied_tables(of: dict[str, Any]) -> list[tuple[str, list[str], list[list[
         f"{sensors['bearing_sd_arcsec']:.0f} and misaligned by "
         f"{sensors['misalignment_sd_arcsec']:.0f} arc seconds, ranges {sensors['range_sd_m']} m; "
         f"to 17 states gyro {of['gyro_noise_of_17_deg_sqrt_h']} deg/sqrt(h), biases "
-        f"{of['accelerometer_noise_of_17_m_s_sqrt_h']} m/s/sqrt(h); other: radar "
+        f"{of['accelerometer_noise_of_17_m_s_sqrt_h']} m/s/sqrt(h); other: gyro "
+        f"{of['other_gyro_noise_deg_sqrt_h']} deg/sqrt(h), radar "
         f"{other['bearing_sd_arcsec']:.0f} and {other['misalignment_sd_arcsec']:.0f}, ranges "
         f"{other['range_sd_m']} m, rates {other['rate_sd_m_s']} m/s"
     )
