@@ -75,7 +75,7 @@ prebuilt: $(RUNTIME) ## kernels for levels of processors, into the checkout, for
 kernels: $(RUNTIME)
 	@echo "compiling the kernels once, before the tests share them"
 	$(BIN)/python -c 'import gc; gc.set_threshold(50000); \
-	import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
+	import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.live_devices, \
 	fusiond.estimators.federated.no_reset, fusiond.estimators.multiscale.filter, \
 	fusiond.estimators.unscented.filter'
 

@@ -16,9 +16,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.broker import Broker, free_port
 from tests.hil.processes import SIM_IMU
 from tests.live.rig import bus_here

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.load import load_config
 from fusiond.configuration.si_units import sensor_to_body
-from fusiond.files.tables import (
+from fusiond.files.measurement_csv import (
     GnssTable,
     TrajectoryTable,
     read_gnss,

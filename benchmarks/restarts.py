@@ -25,14 +25,14 @@ from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.warm_start import LONGEST_GAP_S, WarmStart, warm_state
+from fusiond.navigator.restart_from_memory import LONGEST_GAP_S, WarmStart, warm_state
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import ANTENNA_M, SCENARIOS, random_streams
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.faults.judge import QUANTITIES
-from fusiond.studies.faults.recording import gnss_fixes
 from fusiond.studies.faults.runs import compared
+from fusiond.studies.faults.scoring import QUANTITIES
+from fusiond.studies.faults.sensor_data import gnss_fixes
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ Frames: *sensor* axes are the device's own; *body* is forward-right-down; *NED* 
 north-east-down at the point that the measurement speaks of. Angles are radians unless a name says
 otherwise. Latitude, longitude and height are geodetic on WGS 84 (CGCS2000 agrees to centimetres).
 
-`rounding_sd` is one sigma of what a device's resolution takes off (`drivers.rounding`), beside the
-sigma that it states or that is known of it. It is 0 where the resolution is fine or not known.
+`rounding_sd` is one sigma of what a device's resolution takes off (`drivers.quantization`), beside
+the sigma that it states or that is known of it. It is 0 where the resolution is fine or not known.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class WheelSpeed:
     """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given.
 
     Not `signed`: the device does not know forward from backward, and the speed is its amount.
-    `shared_step_m_s`: the step of a rounding whose manner is not known; `drivers.rounding` says
+    `shared_step_m_s`: the step of a rounding whose manner is not known; `drivers.quantization` says
     what part of `rounding_sd_m_s` all readings share.
     """
 

@@ -15,13 +15,13 @@ from typing import Annotated, Protocol, Self
 from pydantic import Field, PositiveFloat, model_validator
 
 from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
-from drivers.inputs import Inputs
+from drivers.input_queue import Inputs
 from drivers.measurements import DeviceEvent, Measurement, TimeReport
 from drivers.network_port import PortName, on_network, open_port
 from drivers.ntrip.client import NtripClient, NtripOptions
 from drivers.rate_search import ENOUGH_BYTES, RateSearch
 from drivers.raw.messages import NavigationMessage, RawEvent
-from drivers.serial_line import SerialLine
+from drivers.reconnecting_line import SerialLine
 
 SILENCE_S = 0.05
 """A pause that ends an epoch: receivers send an epoch's sentences in one burst."""

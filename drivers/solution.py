@@ -14,7 +14,7 @@ from datetime import UTC, date, datetime
 from functools import reduce
 from operator import xor
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,

@@ -11,7 +11,7 @@ from collections.abc import Hashable, Iterable
 from typing import Generic, TypeVar
 
 from drivers.cycle import Cycle, Name
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Measurement
 from drivers.nmea.reasons import implausible_date
 from drivers.solution import Solution, SolutionJudge

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
-from drivers.decoding import SolutionDecoding
-from drivers.nmea.framing import StreamSplitter
-from drivers.nmea.protocols import named
+from drivers.decoder_options import SolutionDecoding
+from drivers.nmea.foreign_protocols import named
+from drivers.nmea.mixed_framing import StreamSplitter
 from drivers.nmea.reasons import MANY
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 from drivers.solution import REFUSALS

@@ -25,16 +25,16 @@ if TYPE_CHECKING:  # the same names as in _HOMES, for whoever reads types
     from fusiond.configuration.si_units import imu_noise as imu_noise
     from fusiond.estimators.base import Estimator as Estimator
     from fusiond.files.csv_tables import TableError as TableError
-    from fusiond.files.tables import TrajectoryTable as TrajectoryTable
-    from fusiond.files.tables import read_attitude as read_attitude
-    from fusiond.files.tables import read_bearing as read_bearing
-    from fusiond.files.tables import read_gnss as read_gnss
-    from fusiond.files.tables import read_imu as read_imu
-    from fusiond.files.tables import read_rdss as read_rdss
-    from fusiond.files.tables import read_solution as read_solution
-    from fusiond.files.tables import read_truth as read_truth
-    from fusiond.files.tables import read_wheel as read_wheel
-    from fusiond.files.trajectory import trajectory_of as trajectory_of
+    from fusiond.files.measurement_csv import TrajectoryTable as TrajectoryTable
+    from fusiond.files.measurement_csv import read_attitude as read_attitude
+    from fusiond.files.measurement_csv import read_bearing as read_bearing
+    from fusiond.files.measurement_csv import read_gnss as read_gnss
+    from fusiond.files.measurement_csv import read_imu as read_imu
+    from fusiond.files.measurement_csv import read_rdss as read_rdss
+    from fusiond.files.measurement_csv import read_solution as read_solution
+    from fusiond.files.measurement_csv import read_truth as read_truth
+    from fusiond.files.measurement_csv import read_wheel as read_wheel
+    from fusiond.files.solution_table import trajectory_of as trajectory_of
     from fusiond.models.blocks import Block as Block
     from fusiond.models.catalogue import MODELS as MODELS
     from fusiond.models.catalogue import make_model as make_model
@@ -60,11 +60,11 @@ _HOMES = {
     "fusiond.configuration.si_units": ("imu_noise",),
     "fusiond.estimators.base": ("Estimator",),
     "fusiond.files.csv_tables": ("TableError",),
-    "fusiond.files.tables": (
+    "fusiond.files.measurement_csv": (
         *("TrajectoryTable", "read_attitude", "read_bearing", "read_gnss", "read_imu"),
         *("read_rdss", "read_solution", "read_truth", "read_wheel"),
     ),
-    "fusiond.files.trajectory": ("trajectory_of",),
+    "fusiond.files.solution_table": ("trajectory_of",),
     "fusiond.models.blocks": ("Block",),
     "fusiond.models.catalogue": ("MODELS", "make_model"),
     "fusiond.models.model": ("Model",),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-import drivers.can.python_can  # noqa: F401 - a test's `import can` would bring asammdf
+import drivers.can.python_can_import  # noqa: F401 - a test's `import can` would bring asammdf
 
 # A busy host is no counterexample: properties judge what comes out, not how long it took.
 

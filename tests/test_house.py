@@ -174,7 +174,7 @@ def test_files_that_are_named_exist() -> None:
 
 NOT_IN_THE_PROGRAM = {
     "fusiond.navigation.error_model.dense_transition": "what the kernels never form",
-    "fusiond.simulation.can.sensors.SIM_BAROMETER": "a device for who simulates one",
+    "fusiond.simulation.can.star_tracker_radar.SIM_BAROMETER": "a device for who simulates one",
     "fusiond.studies.observability.gramian_stable": "an equation of paper 002",
 }
 """Module-level names that tests alone use, and why they are there."""

@@ -26,7 +26,7 @@ from fusiond.navigation.kernel_cache import LEVELS
 MODULES = (
     "fusiond.live.daemon",
     "fusiond.offline.process",
-    "fusiond.simulation.vehicle",
+    "fusiond.simulation.live_devices",
     "fusiond.navigator.raw_gnss",
     "fusiond.navigator.protection_levels",
     "fusiond.estimators.federated.no_reset",

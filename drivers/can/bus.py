@@ -27,7 +27,7 @@ from typing import Literal, NamedTuple, TypedDict
 
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.can.errors import ControllerState, controller_state, error_names
-from drivers.can.python_can import can
+from drivers.can.python_can_import import can
 
 FRAMES_PER_WAKEUP = 64
 """Most frames handled in one turn of the loop: 2 ms of work, 15 ms of a full 500 kbit/s bus."""

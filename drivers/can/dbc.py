@@ -22,8 +22,8 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from drivers.base import PermanentDriverError
-from drivers.can.dbc_flaws import SoundPart, UnreadableError, read_whole, sound_part, unselected
-from drivers.can.layout import AbsentSignalError, Layout
+from drivers.can.dbc_salvage import SoundPart, UnreadableError, read_whole, sound_part, unselected
+from drivers.can.signal_bits import AbsentSignalError, Layout
 from drivers.shipped import shipped
 
 log = logging.getLogger(__name__)

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Generic, Protocol, TypeVar
 from cantools.database.can.signal import Signal
 from pydantic import Field, model_validator
 
+from drivers.can.base_driver import BusOptions
 from drivers.can.bus import CanFilter, CanFrame
 from drivers.can.dbc import (
     MessagePlan,
@@ -25,7 +26,6 @@ from drivers.can.dbc import (
     plan_number,
     plan_time,
 )
-from drivers.can.driver import BusOptions
 from drivers.can.pairing import Group, Pairing
 from drivers.measurements import DeviceStamp, Measurement, Stamp
 

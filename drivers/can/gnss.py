@@ -19,6 +19,7 @@ from typing import ClassVar
 from pydantic import Field, PositiveFloat, model_validator
 
 from drivers.base import DriverOptions
+from drivers.can.base_driver import CanDriver, Codec
 from drivers.can.dbc import (
     ANGLE_UNITS,
     LENGTH_UNITS,
@@ -28,7 +29,6 @@ from drivers.can.dbc import (
     plan_quantity,
 )
 from drivers.can.decoder import CanDecoder, CanOptions, Find, Signals, plan_flags
-from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import (
     Heading,
     Measurement,
@@ -39,7 +39,7 @@ from drivers.measurements import (
     Vector3,
 )
 from drivers.plausible import SIGMA_M, SPEED_M_S
-from drivers.rounding import NEAREST_SD
+from drivers.quantization import NEAREST_SD
 
 NAN = math.nan
 HALF_TURN, TURN = math.pi, 2.0 * math.pi

@@ -12,12 +12,12 @@ from typing import ClassVar
 from pydantic import PositiveFloat, model_validator
 
 from drivers.base import DriverOptions
+from drivers.can.base_driver import CanDriver, Codec
 from drivers.can.dbc import LENGTH_UNITS, PRESSURE_UNITS, plan_quantity
 from drivers.can.decoder import CanDecoder, CanOptions, Find, Signals, plan_flags
-from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import Height, Stamp
 from drivers.plausible import HEIGHT_M, SIGMA_M
-from drivers.rounding import NEAREST_SD
+from drivers.quantization import NEAREST_SD
 from drivers.standard_atmosphere import PRESSURE_PA, metres_a_pascal, pressure_height_m
 
 _ACCURACY, _FLAGS = 1, 2

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from drivers.base import DriverOptions, PermanentDriverError
+from drivers.can.base_driver import CanDriver, Codec
 from drivers.can.dbc import FORCE_UNITS, RATE_UNITS, plan_axis
 from drivers.can.decoder import CanDecoder, CanOptions, Find
-from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import ImuSample, Stamp
 
 AxisSource = str | float

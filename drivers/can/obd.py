@@ -24,10 +24,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from drivers.base import DriverOptions
+from drivers.can.base_driver import BusOptions, CanDriver, Codec
 from drivers.can.bus import CanFilter, CanFrame
-from drivers.can.driver import BusOptions, CanDriver, Codec
 from drivers.measurements import Measurement, WheelSpeed
-from drivers.rounding import Rounding, rounded_speed
+from drivers.quantization import Rounding, rounded_speed
 
 REQUESTS: dict[int, tuple[int, bool]] = {11: (0x7DF, False), 29: (0x18DB_33F1, True)}
 """Identifier of a request to every unit, and True for one of 29 bits."""

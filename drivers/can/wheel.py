@@ -19,6 +19,7 @@ from typing import ClassVar
 from pydantic import PositiveFloat, model_validator
 
 from drivers.base import DriverOptions
+from drivers.can.base_driver import CanDriver, Codec
 from drivers.can.dbc import (
     ANGLE_UNITS,
     ROTATION_UNITS,
@@ -27,10 +28,9 @@ from drivers.can.dbc import (
     plan_quantity,
 )
 from drivers.can.decoder import CanDecoder, CanOptions, Find, Signals, plan_flags
-from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import Stamp, WheelSpeed
 from drivers.plausible import SPEED_M_S
-from drivers.rounding import rounded_speed
+from drivers.quantization import rounded_speed
 
 MOST_WHEELS = 4
 LARGEST_STEERING_RAD = 0.5 * math.pi

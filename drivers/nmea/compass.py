@@ -19,9 +19,9 @@ from pydantic import Field, NonNegativeFloat
 
 from drivers.base import DriverOptions, Emit, Now, monotonic_ns
 from drivers.measurements import ArrivalStamp, Heading, MagneticHeading
-from drivers.nmea.framing import NmeaSplitter, Sentence
+from drivers.nmea.mixed_framing import NmeaSplitter, Sentence
+from drivers.quantization import NEAREST_SD
 from drivers.receiver import ReceiverDriver, ReceiverOptions
-from drivers.rounding import NEAREST_SD
 
 FORMATTERS = ("HDG", "HDM", "HDT")
 

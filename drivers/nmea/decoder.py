@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Literal
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import (
     Measurement,
 )
@@ -23,8 +23,8 @@ from drivers.nmea.epochs import (
     time_of_day_ns,
 )
 from drivers.nmea.fields import BadFieldError
-from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.judge import EpochJudge
+from drivers.nmea.mixed_framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.reasons import (
     ATTITUDES,
     FULLER,

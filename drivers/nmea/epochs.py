@@ -40,10 +40,10 @@ from drivers.nmea.fields import (
     step,
     typed,
 )
-from drivers.nmea.framing import Sentence
+from drivers.nmea.mixed_framing import Sentence
 from drivers.nmea.time import parse_time_of_day, printed_time
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
-from drivers.rounding import NEAREST_SD
+from drivers.quantization import NEAREST_SD
 
 INTEGRATED = frozenset({"II", "IN"})
 """Integrated instrumentation and navigation: a plotter or an adapter tells what it got, computed or

@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from datetime import date
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,
@@ -23,7 +23,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.epochs import INTEGRATED, Epoch
-from drivers.nmea.geoid import Geoid
+from drivers.nmea.geoid_fallback import Geoid
 from drivers.nmea.reasons import Received, note
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 
-from drivers.nmea.protocols import named
+from drivers.nmea.foreign_protocols import named
 
 REFUSALS = {
     "no_fix": "the receiver has no fix",

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from datetime import date
 
-from drivers.nmea.framing import Sentence
+from drivers.nmea.mixed_framing import Sentence
 
 ROUNDED_NS = 10_000_000
 """A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""

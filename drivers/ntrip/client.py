@@ -17,11 +17,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from drivers.aside import aside
 from drivers.base import Backoff, DriverOptions
 from drivers.byte_budget import ByteBudget
+from drivers.detached_call import aside
 from drivers.network_port import connect
-from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.ntrip.reply import CasterRefusedError, CasterReply, request
 from drivers.port import READ_BYTES
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from drivers.nmea.running_checks import crc24q
+from drivers.nmea.incremental_checksum import crc24q
 from drivers.raw.bits import Bits, Table, angle, bdgim_table, read, s, u
 from drivers.raw.messages import Ephemeris
 from drivers.raw.subframes import Decoded, RefusedError, Subframe, bdgim, ephemeris

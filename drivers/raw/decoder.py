@@ -20,12 +20,12 @@ from dataclasses import replace
 from datetime import date
 from typing import Protocol
 
-from drivers.decoding import BUILD_DATE
+from drivers.decoder_options import BUILD_DATE
 from drivers.measurements import UtcStamp
-from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.raw.bcnav import Bcnav1Decoder, Bcnav2Decoder
 from drivers.raw.beidou_words import GEO
-from drivers.raw.cnav import CnavDecoder
+from drivers.raw.cnav_group_delay import CnavDecoder
 from drivers.raw.d1 import D1Decoder
 from drivers.raw.d2 import D2Decoder
 from drivers.raw.inav import InavDecoder

@@ -10,7 +10,7 @@ from drivers.measurements import Measurement, PositionFix, TimeReport, UtcStamp
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS as NMEA_REFUSALS
 from drivers.nmea.driver import NmeaOptions
-from drivers.nmea.framing import Item, Sentence, StreamSplitter
+from drivers.nmea.mixed_framing import Item, Sentence, StreamSplitter
 from drivers.nmea.reasons import nothing_verified
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder

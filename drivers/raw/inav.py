@@ -12,7 +12,7 @@ changes at the start of a subframe, which holds all five. Source: Galileo OS SIS
 
 from __future__ import annotations
 
-from drivers.nmea.running_checks import crc24q
+from drivers.nmea.incremental_checksum import crc24q
 from drivers.raw.bits import Bits, angle, read, s, u
 from drivers.raw.messages import Ephemeris
 from drivers.raw.subframes import (

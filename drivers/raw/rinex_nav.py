@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from drivers.raw.beidou_words import GEO
-from drivers.raw.cnav import SIGNALS as CNAV_SIGNALS
+from drivers.raw.cnav_group_delay import SIGNALS as CNAV_SIGNALS
 from drivers.raw.messages import (
     Bdgim,
     Ephemeris,

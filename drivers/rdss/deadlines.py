@@ -1,6 +1,6 @@
 """Actions of an RDSS terminal's states at their deadlines: reads, requests, messages.
 
-The states are those of `drivers.rdss.terminal`, and all that is sent is sent here.
+The states are those of `drivers.rdss.request_state_machine`, and all that is sent is sent here.
 """
 
 from __future__ import annotations
@@ -8,22 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.rdss.cycle import (
-    BEAM_ATTEMPTS,
-    BEAM_POLL_NS,
-    BEAMS_STALE_NS,
-    FEEDBACK_NS,
-    GIVE_UP_NS,
-    POLL_NS,
-    POLL_REPLY_NS,
-    PROBE_NS,
-    TIMEOUTS_ALARM,
-    Action,
-    Notice,
-    Send,
-    State,
-    TerminalOptions,
-)
 from drivers.rdss.height import HeightSource
 from drivers.rdss.messages import (
     BeamPowerRequest,
@@ -39,6 +23,22 @@ from drivers.rdss.messages import (
 from drivers.rdss.outbox import Outgoing
 from drivers.rdss.probe import ENCODE
 from drivers.rdss.session import Session
+from drivers.rdss.state_tables import (
+    BEAM_ATTEMPTS,
+    BEAM_POLL_NS,
+    BEAMS_STALE_NS,
+    FEEDBACK_NS,
+    GIVE_UP_NS,
+    POLL_NS,
+    POLL_REPLY_NS,
+    PROBE_NS,
+    TIMEOUTS_ALARM,
+    Action,
+    Notice,
+    Send,
+    State,
+    TerminalOptions,
+)
 
 _POLLS: tuple[Callable[[int], Request], ...] = (
     SelfTestRequest,

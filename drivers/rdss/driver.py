@@ -17,11 +17,19 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
-from drivers.inputs import Inputs
+from drivers.input_queue import Inputs
 from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeReport
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
-from drivers.rdss.cycle import (
+from drivers.rdss.envelope import Carriage
+from drivers.rdss.fraction import FractionUnit
+from drivers.rdss.inbox import Inbox
+from drivers.rdss.mail import MessageStage
+from drivers.rdss.messages import BeamPower, Decoder, DeviceClock, Family, Message, Unknown
+from drivers.rdss.outbox import Outbox
+from drivers.rdss.report import PositionReport
+from drivers.rdss.request_state_machine import Terminal
+from drivers.rdss.state_tables import (
     BITS_A_BYTE,
     PROBE_BAUDS,
     SECOND,
@@ -33,15 +41,7 @@ from drivers.rdss.cycle import (
     SetBaud,
     TerminalOptions,
 )
-from drivers.rdss.envelope import Carriage
-from drivers.rdss.fraction import FractionUnit
-from drivers.rdss.inbox import Inbox
-from drivers.rdss.mail import MessageStage
-from drivers.rdss.messages import BeamPower, Decoder, DeviceClock, Family, Message, Unknown
-from drivers.rdss.outbox import Outbox
-from drivers.rdss.report import PositionReport
-from drivers.rdss.terminal import Terminal
-from drivers.serial_line import SerialLine
+from drivers.reconnecting_line import SerialLine
 
 log = logging.getLogger(__name__)
 

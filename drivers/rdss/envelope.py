@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 
 from drivers.rdss.messages import FieldError
 from drivers.rdss.report import FULL, REPORT, SHORT, SHORT_REPORT
-from drivers.rdss.wording import MIXED, Wording, digits, mixed
+from drivers.rdss.text_coding import MIXED, Wording, digits, mixed
 
 MARK = 0xF8
 TEXT, RECEIPT = 3, 4

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_HEIGHT_M
-from drivers.rdss.cycle import HINT_AGE_NS, HINT_SD_M, TerminalOptions
 from drivers.rdss.messages import HeightMode, PositionRequest
+from drivers.rdss.state_tables import HINT_AGE_NS, HINT_SD_M, TerminalOptions
 from drivers.standard_atmosphere import LAPSE_K_M, T0_K, pressure_height_m
 
 ZERO_CELSIUS_K = 273.15

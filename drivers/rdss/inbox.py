@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from drivers.rdss.cycle import MailReady
 from drivers.rdss.envelope import (
     RECEIPT,
     TEXT,
@@ -21,7 +20,8 @@ from drivers.rdss.mail import Fault, FleetFix, Kind, MessageReceived
 from drivers.rdss.messages import Fix, Text
 from drivers.rdss.report import PositionReport, decode_report
 from drivers.rdss.session import Session
-from drivers.rdss.wording import Wording, plain_text
+from drivers.rdss.state_tables import MailReady
+from drivers.rdss.text_coding import Wording, plain_text
 
 MOST_REMEMBERED = 128
 """Texts that asked for a receipt: two hours of a card that is sent one a minute (our choice)."""

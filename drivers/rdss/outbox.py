@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from drivers.rdss.cycle import GIVE_UP_NS
 from drivers.rdss.envelope import (
     RECEIPT,
     TEXT,
@@ -32,7 +31,8 @@ from drivers.rdss.report import (
     encode_report,
     encode_short,
 )
-from drivers.rdss.wording import Wording, level_bits, worded
+from drivers.rdss.state_tables import GIVE_UP_NS
+from drivers.rdss.text_coding import Wording, level_bits, worded
 
 MOST_WAITING = 32
 """Half an hour of a card of 60 s; who queues more gets a refusal (our choice)."""

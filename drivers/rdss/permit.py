@@ -6,7 +6,8 @@ them is noticed here.
 
 from __future__ import annotations
 
-from drivers.rdss.cycle import (
+from drivers.rdss.messages import Feedback, Outcome
+from drivers.rdss.state_tables import (
     BITS_A_BYTE,
     DEFAULT_SERVICE_S,
     FEEDBACK_NS,
@@ -15,7 +16,6 @@ from drivers.rdss.cycle import (
     SECOND,
     WAIT_MARGIN_NS,
 )
-from drivers.rdss.messages import Feedback, Outcome
 
 
 class TransmitPermit:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.cycle import Action, Notice, Send, SetBaud
 from drivers.rdss.messages import Family, IdentityRequest, Message
+from drivers.rdss.state_tables import Action, Notice, Send, SetBaud
 
 ENCODE: dict[Family, Callable[[Message], bytes]] = {
     "4.0": binary_4_0.encode,

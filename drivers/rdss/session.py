@@ -7,7 +7,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from drivers.rdss.cycle import (
+from drivers.rdss.messages import BeamPower, Family, Identity
+from drivers.rdss.outbox import Outbox, Turns
+from drivers.rdss.permit import Pace, TransmitPermit
+from drivers.rdss.probe import Probe
+from drivers.rdss.state_tables import (
     GIVE_UP_NS,
     HOLD_NS,
     IN_FLIGHT,
@@ -16,10 +20,6 @@ from drivers.rdss.cycle import (
     State,
     TerminalOptions,
 )
-from drivers.rdss.messages import BeamPower, Family, Identity
-from drivers.rdss.outbox import Outbox, Turns
-from drivers.rdss.permit import Pace, TransmitPermit
-from drivers.rdss.probe import Probe
 
 
 class Session:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 
 from drivers.measurements import Measurement, Vector3
-from drivers.nmea.framing import Frame, Item, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, Item, StreamSplitter
 from drivers.solution import Solution
 from drivers.solution_decoder import SolutionDecoder
 from drivers.ubx.messages import (

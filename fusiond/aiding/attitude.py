@@ -43,9 +43,9 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
-from fusiond.aiding.candidates import HeadingCandidate
-from fusiond.aiding.heading_history import HeadingHistory, Oriented
-from fusiond.aiding.over_ground import CourseMeasurement
+from fusiond.aiding.headings_without_imu import HeadingHistory, Oriented
+from fusiond.aiding.initialisation import HeadingCandidate
+from fusiond.aiding.wheel_and_heading import CourseMeasurement
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,

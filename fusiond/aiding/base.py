@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.candidates import Candidate
-from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import Candidate
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -132,7 +132,7 @@ class AidingMeasurement:
 
     screened: ClassVar[bool] = False
     """True if its rows are gated one by one, so that a bad one is left out alone
-    (fusiond.estimators.screening)."""
+    (fusiond.estimators.update_with_exclusion)."""
     period: ClassVar[float] = math.inf
     """Period of an innovation that is an angle."""
     locates: ClassVar[bool] = False
@@ -221,7 +221,7 @@ class AidingMeasurement:
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         """Receive the outcomes of its rows, for a receiver that counts them
-        (fusiond.estimators.screening); repeated after a rewind."""
+        (fusiond.estimators.update_with_exclusion); repeated after a rewind."""
 
     def candidates(self) -> Sequence[Candidate]:
         """Candidates for the start of alignment."""

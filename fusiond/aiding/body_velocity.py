@@ -12,15 +12,16 @@ m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, w
 seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the share p of a
 step q that its rounding takes off are estimated where the model has their blocks
 (fusiond.models.vehicle). c is what share of a typed drift counts, as the vehicle has shown
-(fusiond.navigator.drift_levels). With z = h(x^) - y, navigation errors computed minus true,
-parameters true minus estimated, and e_i the axis's unit vector:
+(fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors computed minus
+true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
         - tau e_i exp[m x] (e - C^T [g x] phi)) - c ds_w + q sign(y) dp + v               (wheel)
 
-a_forward = f + C^T g is smoothed, e what its force is wrong by (fusiond.aiding.preintegration): one
-sample of a shaken sensor would make the latency look smaller than it is.
+a_forward = f + C^T g is smoothed, e what its force is wrong by
+(fusiond.aiding.preintegrated_measurement): one sample of a shaken sensor would make the latency
+look smaller than it is.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
 T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
@@ -48,10 +49,10 @@ from fusiond.aiding.base import (
     State,
     Vector3,
 )
-from fusiond.aiding.candidates import STEADY, SpeedCandidate
-from fusiond.aiding.heading_history import HeadingHistory
-from fusiond.aiding.over_ground import SIGN_SIGMAS, GroundSpeed
-from fusiond.aiding.preintegration import add_of_force, turning
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import STEADY, SpeedCandidate
+from fusiond.aiding.preintegrated_measurement import add_of_force, turning
+from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled

@@ -6,7 +6,7 @@ D is the declination where the vehicle is. a (mounting, and what the field's mod
 b, c (the vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d is
 what lasts for some seconds (bridges, vehicles beside, currents of the own), a first-order
 Gauss-Markov process, of which as much counts as the compass has shown
-(fusiond.navigator.drift_levels); v is white. The measurement is psi_m + D:
+(fusiond.navigator.sensor_drift_magnitudes); v is white. The measurement is psi_m + D:
 
     z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev
 
@@ -24,9 +24,9 @@ import numpy as np
 from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import Innovation, NotApplicable, State
-from fusiond.aiding.candidates import HeadingCandidate
-from fusiond.aiding.heading_history import HeadingHistory
-from fusiond.aiding.over_ground import CourseMeasurement
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import HeadingCandidate
+from fusiond.aiding.wheel_and_heading import CourseMeasurement
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
 

@@ -9,10 +9,10 @@ l is the lever arm from the IMU to the antenna, b an error that successive fixes
 ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
 as many more as the fix's own sigma is larger there (fusiond.aiding.fix_errors), tau how much later
 than its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the
-acceleration, smoothed (fusiond.aiding.preintegration); where the model has states for them they are
-estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is not shared
-moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis. An error that lasts
-for seconds and has no state is noise.
+acceleration, smoothed (fusiond.aiding.preintegrated_measurement); where the model has states for
+them they are estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is
+not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis. An error
+that lasts for seconds and has no state is noise.
 
 An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
 and of dtau's square, is noise to it, where P is the filter's own:
@@ -27,8 +27,8 @@ are 5 cm, with u = C dl
     z_2 = phi x u,   var(phi_j u_k - phi_k u_j) = P_jj U_kk + X_kj^2 + P_kk U_jj + X_jk^2
                                                   - 2 (P_jk U_jk + X_jj X_kk)
 
-P, U and X = cov(u, phi) those of the two. (96 cars of tests/estimators/test_antenna_place.py, NEES
-a degree of lever arm and place: 1.5 without it, 1.1 with it.)
+P, U and X = cov(u, phi) those of the two. (96 cars of tests/estimators/test_unknown_lever_arm.py,
+NEES a degree of lever arm and place: 1.5 without it, 1.1 with it.)
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3; Bar-Shalom, Li, Kirubarajan (2001),
 section 10.3.2 (second-order terms).
@@ -57,9 +57,9 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.candidates import PositionCandidate
-from fusiond.aiding.heading_history import HeadingHistory
-from fusiond.aiding.preintegration import add_of_force
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.preintegrated_measurement import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius

@@ -16,8 +16,8 @@ downwards, the ionosphere that is left:
 
     rho^ = |s - p^ - a - K t^| + c_k^,    z_rho += u . K dt    (dt true minus estimated)
 
-with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.displacement); where the sky has
-changed, t is in part another one (`renewal`).
+with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.range_error_displacement); where the sky
+has changed, t is in part another one (`renewal`).
 
 Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: what the
 models of ionosphere and troposphere leave, BeiDou-2's offset), with what one sigma of each adds to
@@ -82,7 +82,7 @@ from fusiond.aiding.carrier_anchor import (
     go_on,
 )
 from fusiond.aiding.carrier_anchor_noise import phase_noise, walk_noise
-from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, CLOCK_DRIFT, CLOCK_OFFSET

@@ -4,12 +4,12 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
       = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ da + noise
 
 w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is how much later than its
-stamp the velocity is valid, a the acceleration (its error da: fusiond.aiding.preintegration),
-smoothed: with the noise of single samples in its Jacobian an offset would come out too small, and
-too sure. What is left of the product of the two errors is not taken for noise: on drive_0708 that
-cost a tenth of the accuracy in outages, and gave no more honest a sigma. A timing error of sigma
-s_t that is not shared changes the velocity by a s_t, which adds (a_i s_t)^2 to the variance of each
-axis.
+stamp the velocity is valid, a the acceleration (its error da:
+fusiond.aiding.preintegrated_measurement), smoothed: with the noise of single samples in its
+Jacobian an offset would come out too small, and too sure. What is left of the product of the two
+errors is not taken for noise: on drive_0708 that cost a tenth of the accuracy in outages, and gave
+no more honest a sigma. A timing error of sigma s_t that is not shared changes the velocity by a
+s_t, which adds (a_i s_t)^2 to the variance of each axis.
 
 A velocity that lags behind the position of the same stamp, by tau_p - tau, has been averaged or
 filtered for about twice as long. Of a vehicle that speeds up evenly that is a delay; of one that
@@ -43,9 +43,9 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.candidates import VelocityCandidate
-from fusiond.aiding.heading_history import HeadingHistory
-from fusiond.aiding.preintegration import add_of_force
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import VelocityCandidate
+from fusiond.aiding.preintegrated_measurement import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity

@@ -17,8 +17,8 @@ import fusiond.navigator.raw_gnss  # noqa: F401 - compiled before there are work
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.files.parquet_rows import Row, flat
-from fusiond.files.tables import read_solution, read_truth
 from fusiond.offline.compare import NothingToCompareError, compare
 from fusiond.offline.measurement_files import READERS
 from fusiond.offline.process import process

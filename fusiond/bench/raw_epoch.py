@@ -20,7 +20,7 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.gnss.orbit import is_beidou_geo
 from fusiond.models.blocks import CARRIER_CLOCK
 from fusiond.models.catalogue import make_model

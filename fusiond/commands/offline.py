@@ -245,7 +245,7 @@ def compare(
     """Compare a solution with a truth: errors, and their ratio to the stated sigma."""
     from fusiond.commands.compare_report import print_report  # noqa: PLC0415
     from fusiond.files.csv_tables import file_report  # noqa: PLC0415
-    from fusiond.files.tables import read_solution, read_truth  # noqa: PLC0415
+    from fusiond.files.measurement_csv import read_solution, read_truth  # noqa: PLC0415
     from fusiond.offline.compare import NothingToCompareError  # noqa: PLC0415
     from fusiond.offline.compare import compare as run_compare  # noqa: PLC0415
 

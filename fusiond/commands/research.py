@@ -172,7 +172,7 @@ def _studies_installed() -> None:
 
     missing = [name for name in ("scipy", "pywt", "matplotlib") if find_spec(name) is None]
     if missing:
-        from fusiond.files.extras import install  # noqa: PLC0415
+        from fusiond.files.install_extra import install  # noqa: PLC0415
 
         typer.echo(f"fusiond: studies need {', '.join(missing)}: {install('studies')}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE)

@@ -17,7 +17,7 @@ from fusiond.configuration.aiding import CompassAiding, GnssAiding, RawAiding, R
 from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 
 LONGEST_M: dict[VehicleClass, float] = {
     "road": 20.0,

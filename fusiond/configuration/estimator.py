@@ -16,7 +16,7 @@ from pydantic import (
 
 from fusiond.configuration.aiding import Probability, Section
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 
 
 def _has_wavelets() -> None:

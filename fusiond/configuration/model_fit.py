@@ -1,9 +1,10 @@
 r"""Fit of the model to the inertial sensor's errors.
 
 What a model has no state for is noise to it, so that it stays honest, at the price of its sigma:
-an accelerometer's bias (`fusiond.models.missing_states`), scale factors while the vehicle turns and
-speeds up (`fusiond.navigation.crosstalk`). The measure is a minute without measurements, t =
-60 s, one sigma of the displacement; of scale factors a quarter turn, one sigma of the heading:
+an accelerometer's bias (`fusiond.models.unmodelled_bias_noise`), scale factors while the vehicle
+turns and speeds up (`fusiond.navigation.crosstalk_noise`). The measure is a minute without
+measurements, t = 60 s, one sigma of the displacement; of scale factors a quarter turn, one sigma of
+the heading:
 
     an accelerometer bias b       b t^2 / 2
     what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)

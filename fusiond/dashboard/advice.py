@@ -1,7 +1,7 @@
 """Steps for the operator, the most urgent first, from `status` and `health`.
 
-The step for a `why` comes from the catalogue `fusiond.navigator.reasons`; sources, host and faults
-add theirs.
+The step for a `why` comes from the catalogue `fusiond.navigator.mode_reasons`; sources, host and
+faults add theirs.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from fusiond.navigator.reasons import REASONS, Weight, recognised
+from fusiond.navigator.mode_reasons import REASONS, Weight, recognised
 
 Said = Mapping[str, Any]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from fusiond.dashboard.broker import Access, Broker
 from fusiond.dashboard.vehicles import Hub
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 
 PMTILES = b"PMTiles\x03"
 """Header of a file of version 3."""

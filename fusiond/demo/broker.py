@@ -17,7 +17,7 @@ import subprocess
 import sys
 from types import TracebackType
 
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 
 _ATTEMPTS = 5
 """Attempts to find a free port; another process may take one before the broker does."""

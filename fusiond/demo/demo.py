@@ -39,10 +39,10 @@ from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.papers import town
-from fusiond.simulation.rdss.network import ConvoyVehicle
+from fusiond.simulation.rdss.short_messages import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.vehicle import SimulatedVehicle
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 from fusiond.configuration.schema import Config, Source
 from fusiond.simulation.can.imu import SIM_IMU
-from fusiond.simulation.can.sensors import SIM_SAR, SIM_STAR
+from fusiond.simulation.can.star_tracker_radar import SIM_SAR, SIM_STAR
 from fusiond.simulation.gnss.raw_stream import RawFormat
+from fusiond.simulation.live_devices import Device, SimulatedVehicle
 from fusiond.simulation.scenarios import Scenario
-from fusiond.simulation.vehicle import Device, SimulatedVehicle
 
 
 class Unplugged(NamedTuple):

@@ -25,11 +25,11 @@ from drivers.can.gnss import CanGnssDriver
 from drivers.can.imu import CanImuDriver
 from drivers.measurements import ImuSample
 from drivers.nmea.compass import FORMATTERS
-from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
+from drivers.nmea.mixed_framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
 from drivers.rate_search import BAUDS, LISTEN_NS
 from drivers.rdss.driver import RdssDriver, RdssOptions
+from drivers.reconnecting_line import SerialLine
 from drivers.sbf.framing import BlockSplitter
-from drivers.serial_line import SerialLine
 from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 

@@ -28,10 +28,10 @@ from fusiond.aiding.base import (
     State,
 )
 from fusiond.estimators.corrected_imu import sensor_estimates
+from fusiond.estimators.error_decorrelation import renew
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
-from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.fault_bank_interface import Hypotheses
 from fusiond.estimators.measurement_run import MeasurementRun
-from fusiond.estimators.memory import AHEAD, GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
@@ -40,10 +40,10 @@ from fusiond.estimators.propagation import (
     propagate_for,
 )
 from fusiond.estimators.published_state import WIDER, Published, sigmas, surely_moves, widen
-from fusiond.estimators.renewal import renew
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.screening import KEPT, Screened, screened
+from fusiond.estimators.state_array import AHEAD, GAP, memory
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
+from fusiond.estimators.update_with_exclusion import KEPT, Screened, screened
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -75,8 +75,8 @@ def gate_threshold(probability: float, degrees: int) -> float:
 class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
     L^-1 nu with S = L L^T). `rows`: of a screened measurement, what became of each row
-    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
-    that is out, the NIS if each of the faults for which it may be out lasts."""
+    (fusiond.estimators.update_with_exclusion); `whitened` is then 0 where a row was left out.
+    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts."""
 
     name: str
     nis: float = float("nan")

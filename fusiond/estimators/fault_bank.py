@@ -29,7 +29,7 @@ process noise than there is follows each of them, and would find its innovations
 
 All of it lies in the filter's memory: a snapshot copies it, a rewind restores it to the bit. How is
 said here; onsets are in fusiond.estimators.fault_onsets, signatures and evidence in
-fusiond.estimators.fault_rows, odds in fusiond.estimators.fault_odds.
+fusiond.estimators.fault_update, odds in fusiond.estimators.fault_odds.
 
 Source: Friedland, Treatment of bias in recursive filtering, IEEE Trans. AC 14 (1969), 359; Willsky,
 Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear

@@ -1,7 +1,7 @@
 """Compiled kernel: the sensitivities of a bank of hypotheses, carried on between two measurements.
 
 What lies between two measurements is one transition, which is carried from crossing to crossing as
-the covariance is (fusiond.estimators.block_covariance), and V is multiplied by it where a
+the covariance is (fusiond.estimators.multi_sample_covariance), and V is multiplied by it where a
 measurement is to be folded in. Most rows of it are those of the identity: of navigation errors
 nine, of others those that decay, grow with a rate, or are turned at rest.
 """
@@ -14,11 +14,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.block_covariance import DENSITIES, STEPS
-from fusiond.estimators.covariance import transition_for
+from fusiond.estimators.covariance_propagation import transition_for
 from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH
-from fusiond.estimators.fault_rows import add_rows, walk_path
-from fusiond.estimators.turned_axes import rest_rows
+from fusiond.estimators.fault_update import add_rows, walk_path
+from fusiond.estimators.multi_sample_covariance import DENSITIES, STEPS
+from fusiond.estimators.tilt_axes_propagation import rest_rows
 from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]

@@ -48,7 +48,7 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_carried import begin_transition
 from fusiond.estimators.fault_odds import solve
-from fusiond.estimators.fault_rows import concerns
+from fusiond.estimators.fault_update import concerns
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN

@@ -21,8 +21,8 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import judge, solve
 from fusiond.estimators.fault_onsets import restart_due
-from fusiond.estimators.fault_rows import account, keep_fed_back, sensitivity_rows
-from fusiond.estimators.fault_suspects import judge_what_waits, restarts
+from fusiond.estimators.fault_prescreen import judge_what_waits, restarts
+from fusiond.estimators.fault_update import account, keep_fed_back, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
 from fusiond.navigation.compiled import compiled
 

@@ -37,9 +37,9 @@ P_xi = J_0^-1 P J_0^-T
 
 the covariance transform of an error that is reset, without which tilt and velocity errors would,
 after a correction of 90 deg, be correlated with the sensor errors of the wrong axes (nor does what
-the force biases make downward change: fusiond.estimators.tilt_axes). One start of
-Gauss-Newton finds a heading that is off by up to 150 deg; with a sigma that reaches beyond it is
-begun at four headings, and the likeliest counts.
+the force biases make downward change: fusiond.estimators.tilt_frame_after_heading_update). One
+start of Gauss-Newton finds a heading that is off by up to 150 deg; with a sigma that reaches beyond
+it is begun at four headings, and the likeliest counts.
 
 Where the model has the IMU's mounting m against the vehicle, C is the vehicle's attitude,
 C_nb exp[m x]^T, since it is the vehicle that does not slide; the IMU's own error is then
@@ -76,9 +76,9 @@ from fusiond.estimators.invariant_error import (
 )
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.row_kernels import KNOWN, LARGE, PLAIN, SETTLES
-from fusiond.estimators.screening import KEPT
-from fusiond.estimators.tilt_axes import TiltAxesFilter
-from fusiond.estimators.tilt_axes_carried import keep_down_rows, keep_downward
+from fusiond.estimators.tilt_axes_update import keep_down_rows, keep_downward
+from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.blocks import CARRIER_ANCHOR
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING

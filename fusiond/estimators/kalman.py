@@ -20,8 +20,8 @@ from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
 from fusiond.estimators.measurement_run import MeasurementRun
 from fusiond.estimators.row_kernels import KNOWS, NO_AXES, Axes
-from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, whiten, work
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]

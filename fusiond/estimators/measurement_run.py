@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS
-from fusiond.estimators.hypotheses import Hypotheses
-from fusiond.estimators.memory import Memory
+from fusiond.estimators.fault_bank_interface import Hypotheses
 from fusiond.estimators.propagation import RECORD
 from fusiond.estimators.row_kernels import AT_H, RESULT, TURNED, Axes, run_for
+from fusiond.estimators.state_array import Memory
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 

@@ -1,8 +1,9 @@
 """Compiled kernels: propagation of the navigation state and its error statistics over IMU samples.
 
 The loop over samples lives here; what an interval does to a covariance is in
-fusiond.estimators.covariance. One pass carries a bank of covariances and error estimates along one
-navigation state, for filters that keep several, and a transition matrix where a filter asks for it.
+fusiond.estimators.covariance_propagation. One pass carries a bank of covariances and error
+estimates along one navigation state, for filters that keep several, and a transition matrix where a
+filter asks for it.
 """
 
 from __future__ import annotations
@@ -13,11 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.block_covariance import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
-from fusiond.estimators.block_sigmas import ROW, ROWS, WAITING, begin, fill, first_order
-from fusiond.estimators.block_sigmas import SIZE as BETWEEN
 from fusiond.estimators.corrected_imu import compensate, sensor_estimates, slopes
-from fusiond.estimators.covariance import (
+from fusiond.estimators.covariance_propagation import (
     decays,
     mirror,
     propagate_error,
@@ -26,7 +24,26 @@ from fusiond.estimators.covariance import (
     work_size,
 )
 from fusiond.estimators.fault_carried import carry_for, settle
-from fusiond.estimators.memory import (
+from fusiond.estimators.multi_sample_covariance import (
+    DENSITIES,
+    GRID_NS,
+    SPAN,
+    STEPS,
+    add_up,
+    cross_for,
+)
+from fusiond.estimators.multi_sample_sigmas import ROW, ROWS, WAITING, begin, fill, first_order
+from fusiond.estimators.multi_sample_sigmas import SIZE as BETWEEN
+from fusiond.estimators.published_state import (
+    ENTRIES,
+    WIDER,
+    entries,
+    in_fix_time,
+    moving,
+    sigmas_of,
+    widen,
+)
+from fusiond.estimators.state_array import (
     AHEAD,
     BANK,
     GAP,
@@ -44,16 +61,7 @@ from fusiond.estimators.memory import (
     XI_AT,
     scratch_size,
 )
-from fusiond.estimators.published_state import (
-    ENTRIES,
-    WIDER,
-    entries,
-    in_fix_time,
-    moving,
-    sigmas_of,
-    widen,
-)
-from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
+from fusiond.estimators.tilt_axes_propagation import rest_rows, turn_at_rest
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.imu_buffer import END, HEAD_SIZE, HOLD, ROW_SIZE, START

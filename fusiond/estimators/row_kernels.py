@@ -39,10 +39,13 @@ from fusiond.aiding.packed import (
 )
 from fusiond.estimators.fault_bank import SUSPECTS, UNJUDGED, UNWEIGHED, is_evidence
 from fusiond.estimators.fault_odds import judge
-from fusiond.estimators.fault_opened import judge_and_widen
-from fusiond.estimators.fault_suspects import any_likely, judge_what_waits
+from fusiond.estimators.fault_prescreen import any_likely, judge_what_waits
+from fusiond.estimators.fault_sizes import judge_and_widen
 from fusiond.estimators.gated_update import fold_and_account
-from fusiond.estimators.memory import (
+from fusiond.estimators.noise_scale import learn
+from fusiond.estimators.propagation import RECORD, propagate_for
+from fusiond.estimators.published_state import WIDER, surely_moves
+from fusiond.estimators.state_array import (
     BANK,
     LINE,
     NAV_AT,
@@ -53,11 +56,8 @@ from fusiond.estimators.memory import (
     WIDER_AT,
     XI_AT,
 )
-from fusiond.estimators.memory import SIZE as STATES
-from fusiond.estimators.noise_scale import learn
-from fusiond.estimators.propagation import RECORD, propagate_for
-from fusiond.estimators.published_state import WIDER, surely_moves
-from fusiond.estimators.tilt_axes_carried import (
+from fusiond.estimators.state_array import SIZE as STATES
+from fusiond.estimators.tilt_axes_update import (
     ESTIMATE_SIZE,
     carry_over,
     may_part,

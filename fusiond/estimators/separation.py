@@ -32,8 +32,8 @@ from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, work
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.files.csv_tables import MissingPackageError, TableError
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 
 Row = dict[str, Any]
 COMPRESSION = "zstd"

@@ -1,8 +1,8 @@
 """Cached choice of an epoch's signals, valid until signals or ephemerides change.
 
 One signal of each satellite serves as range and carrier, a second one for its slant delay
-(`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
-is the least uncertain; without a pair the first of `PREFERRED` that is there.
+(`fusiond.gnss.carrier_phase`): of all pairs with known group delays the one whose ionosphere-free
+range is the least uncertain; without a pair the first of `PREFERRED` that is there.
 
     variance = (gamma^2 (s^2 + s_a^2) + s^2 + s_b^2) / (gamma - 1)^2,   gamma = (f_a / f_b)^2
 
@@ -34,7 +34,7 @@ from drivers.raw.messages import (
     RawSignal,
     System,
 )
-from fusiond.gnss import carriers as ca
+from fusiond.gnss import carrier_phase as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.bdgim import TERMS, bdgim_terms
 from fusiond.gnss.corrections import Applied

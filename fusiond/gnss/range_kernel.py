@@ -4,8 +4,8 @@ r"""Range and range rate equations of an epoch, for all satellites at once.
     P + c (dt - d) - T - I = rho + b_system + noise
     D (1 + l . v_i / c) + c ddt = l . (v - v_r) + d + noise,    v_i = v + we x s
 
-Of a satellite with two carriers I is what they measure (fusiond.gnss.carriers), of variance V, up
-to an offset that its system's signals share (what the receiver delays one band more than the
+Of a satellite with two carriers I is what they measure (fusiond.gnss.carrier_phase), of variance V,
+up to an offset that its system's signals share (what the receiver delays one band more than the
 other). With I0 the model's delay, p the part of it that is not known, of satellite k, over
 those of its group
 
@@ -53,12 +53,12 @@ from fusiond.gnss.atmosphere import (
     zenith_delays,
 )
 from fusiond.gnss.bdgim import bdgim
-from fusiond.gnss.carriers import CARRIER as LENGTH
-from fusiond.gnss.carriers import CARRIER_VARIANCE as LENGTH_VARIANCE
-from fusiond.gnss.carriers import (
+from fusiond.gnss.carrier_phase import CARRIER as LENGTH
+from fusiond.gnss.carrier_phase import CARRIER_VARIANCE as LENGTH_VARIANCE
+from fusiond.gnss.carrier_phase import (
     CNO as CNO_A,
 )
-from fusiond.gnss.carriers import (
+from fusiond.gnss.carrier_phase import (
     P_A,
     SD_A,
     SLANT,
@@ -66,10 +66,10 @@ from fusiond.gnss.carriers import (
     SPAN,
     WITH_CODE,
 )
-from fusiond.gnss.carriers import (
+from fusiond.gnss.carrier_phase import (
     RATE as DOPPLER,
 )
-from fusiond.gnss.carriers import (
+from fusiond.gnss.carrier_phase import (
     SD_RATE as SD_DOPPLER,
 )
 from fusiond.gnss.ecef import to_geodetic
@@ -191,7 +191,7 @@ def range_rows(
     `least_cno` (dB Hz).
 
     `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
-    fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
+    fusiond.gnss.carrier_phase, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
     terms of BDGIM; `noise` (8,).
     """
     n = elements.shape[0]

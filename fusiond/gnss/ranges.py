@@ -17,7 +17,7 @@ to be used as one more unknown with unit variance (as `fusiond.gnss.single_point
 state of a filter; 0.3 of s_I stand for what differs from satellite to satellite.
 
 a and b are those of `RangeNoise` until the codes of satellites with two carriers have shown what
-this receiver's are (`fusiond.gnss.carriers`).
+this receiver's are (`fusiond.gnss.carrier_phase`).
 
 Which signals of a satellite serve: `fusiond.gnss.plan`.
 
@@ -42,7 +42,7 @@ import numpy.typing as npt
 from drivers.raw.messages import (
     RawGnssEpoch,
 )
-from fusiond.gnss import carriers as ca
+from fusiond.gnss import carrier_phase as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.plan import Plan, Planner, RangeNoise, RangeOptions

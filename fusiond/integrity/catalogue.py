@@ -52,7 +52,7 @@ from fusiond.estimators.fault_bank import (
     FaultTable,
     fault_table,
 )
-from fusiond.integrity.service import LASTS_S
+from fusiond.integrity.series_states import LASTS_S
 from fusiond.models.model import Model
 from fusiond.models.vehicle import FIX_TIME, MOUNTING, VELOCITY_TIME
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
@@ -292,7 +292,7 @@ def over_kind() -> Kind:
 
 def changed_kind(device: str) -> Kind:
     """Jump of a device's positions within their shared error, found outside the bank, which would
-    take it for a fault (fusiond.integrity.shared_error)."""
+    take it for a fault (fusiond.integrity.correlated_fix_jumps)."""
     text = f"{device} position has changed within what its fixes share,"
     of = "position_change", text, "m", FOLLOWED, OVER
     return Kind(*of, (1.0, 1.0, 1.0), RECEIVER_PER_H, device=device)

@@ -9,10 +9,10 @@ A hypothesis is identified where
 
 A fault that is a step of states (of the inertial unit, of a clock) is removed from the state, V b
 with the covariance V M V^T, and navigation continues. A source's fault is removed likewise, from
-its onset on, and the affected series leave service (fusiond.integrity.service). Hypotheses of one
-class and device with similar odds are combined by the moments of their mixture, kinds as well as
-onsets, weighted by their fit alone: an estimated rate and size must not decide between them. Where
-two classes explain the evidence none is accused, and the published covariance includes both.
+its onset on, and the affected series leave service (fusiond.integrity.series_states). Hypotheses of
+one class and device with similar odds are combined by the moments of their mixture, kinds as well
+as onsets, weighted by their fit alone: an estimated rate and size must not decide between them.
+Where two classes explain the evidence none is accused, and the published covariance includes both.
 
 Where positions and velocities of a device fit each other and both are out, it is the filter that is
 wrong, by more than any hypothesis says: after `FITS_NS` where nothing has explained why they are
@@ -33,13 +33,14 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
+from fusiond.estimators.fault_bank_interface import Estimated, Hypotheses
 from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
-from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
-from fusiond.integrity.device_agreement import Agreement
+from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
-from fusiond.integrity.fault_finding import Finding, Lasting
-from fusiond.integrity.service import (
+from fusiond.integrity.position_velocity_agreement import Agreement
+from fusiond.integrity.series_exclusion import Finding, Lasting
+from fusiond.integrity.series_states import (
     DISAGREES,
     FORGET_NS,
     REPEATS,
@@ -48,7 +49,6 @@ from fusiond.integrity.service import (
     Service,
     value_of,
 )
-from fusiond.integrity.shared_error import renewed_slots
 
 Array = NDArray[np.float64]
 
@@ -232,7 +232,7 @@ class Diagnosis:
 
     def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
         """False for a position's fault before the position of that instant has arrived, if it may
-        be the shared error (fusiond.integrity.shared_error)."""
+        be the shared error (fusiond.integrity.correlated_fix_jumps)."""
         kind = self._kinds[int(found.item(BEST)) // RESTARTS]
         if kind.of != PLACE or measurement.locates:
             return True

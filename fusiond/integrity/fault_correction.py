@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.estimators.base import Estimator
-from fusiond.estimators.hypotheses import Estimated
+from fusiond.estimators.fault_bank_interface import Estimated
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -54,7 +54,7 @@ def mixed(taken: Sequence[Estimated]) -> Correction:
 
 
 def _bent(mean: Array) -> Array:
-    """What a straight line leaves out of a correction (n, n)."""
+    """Covariance (n, n) of the part of a correction that V b, a straight line, leaves out."""
     half, left = 0.5 * float(np.linalg.norm(mean[:3])), np.zeros(len(mean))
     for first in (PLACE_ROW - 3, PLACE_ROW):
         left[first : first + 3] = half * np.linalg.norm(mean[first : first + 3])

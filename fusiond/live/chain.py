@@ -17,8 +17,8 @@ from fusiond.live.injection import Injection
 from fusiond.live.innovations import Innovations
 from fusiond.live.messaging import Messaging
 from fusiond.live.operator import Operator
-from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.sources import Sources
+from fusiond.live.tick import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_state import SavedState

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pydantic import TypeAdapter
 
 from fusiond.live.chain import Chain
-from fusiond.live.warm_keeper import KeptState
+from fusiond.live.state_in_memory import KeptState
+from fusiond.navigator.restart_from_memory import WarmStart
 from fusiond.navigator.saved_calibration import SavedCalibration
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.warm_start import WarmStart
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import Kind, Stage, TextEncoding
 from drivers.rdss.messages import FieldError
 from drivers.rdss.outbox import Outbox, Outgoing
-from drivers.rdss.wording import Wording, plain_text
+from drivers.rdss.text_coding import Wording, plain_text
 from fusiond.outputs.messages.short_message import ShortMessage
 
 SECOND_NS = 1_000_000_000

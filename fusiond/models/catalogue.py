@@ -21,8 +21,8 @@ from fusiond.models.blocks import (
     navigation_blocks,
     parameter,
 )
-from fusiond.models.missing_states import with_force_biases_as_noise
 from fusiond.models.model import Model
+from fusiond.models.unmodelled_bias_noise import with_force_biases_as_noise
 from fusiond.navigation.error_model import FORCE_ERROR
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.crosstalk import Crosstalk
+from fusiond.navigation.crosstalk_noise import Crosstalk
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigation.vibration import Vibration
 

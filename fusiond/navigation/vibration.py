@@ -7,7 +7,7 @@ With means y_k of n samples, each over tau = n T, the Hadamard variance
 is N^2 / tau for white noise of density N^2, whatever the bias and its drift. Motion, and vibration
 that averages out, only add to tau H(tau) at one tau or another, so the smallest over several tau
 bounds the density that attitude and velocity integrate; which share of it they do is found by
-predictions (fusiond.navigator.noise_share). The mean is over the last seconds and past
+predictions (fusiond.navigator.imu_noise_share). The mean is over the last seconds and past
 samples alone: an engine that starts is in it at once, and a replay gives the same numbers.
 
 Ten seconds are too slow for a noise that rises tenfold at once: after one of them the attitude is
@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.from_instants import FromInstants
+from fusiond.navigation.stepwise_factors import FromInstants
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -18,12 +18,12 @@ from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
-from fusiond.integrity.verdicts import Verdicts
+from fusiond.integrity.source_monitors import Verdicts
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
-from fusiond.navigation.crosstalk import Crosstalk
+from fusiond.navigation.crosstalk_noise import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
 

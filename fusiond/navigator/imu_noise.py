@@ -1,7 +1,7 @@
 """Noise of an inertial unit as observed in navigation.
 
-Which share of what the samples show is noise (fusiond.navigator.noise_share), and how good the unit
-is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was
+Which share of what the samples show is noise (fusiond.navigator.imu_noise_share), and how good the
+unit is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was
 `SETTLES_NS` ago, on a grid of time, and count for samples `COUNTS_NS` later: neither the order in
 which measurements come nor how many samples at once leaves a trace.
 """
@@ -20,8 +20,8 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.drift_levels import DriftLevels
-from fusiond.navigator.noise_share import COUNTS_NS, EVERY_NS, NoiseShares
+from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS, NoiseShares
+from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 from fusiond.navigator.timeline import Timeline
 from fusiond.navigator.unit_grade import UnitGrade
 

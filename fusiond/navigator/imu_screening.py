@@ -23,7 +23,7 @@ from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
 from fusiond.navigator.imu_unit_check import other_unit
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

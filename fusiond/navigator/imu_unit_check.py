@@ -23,14 +23,14 @@ import numpy as np
 
 from drivers.measurements import PositionFix
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer, squares
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.rate_unit_check import PROOF, WayTurns
-from fusiond.navigator.reasons import reason
 
 # In a loop of 2 g for half of the time nobody flies, and half of gravity for as long nobody falls.
 FORCE_RANGE = (0.5, 2.0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
-from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.fault_bank_interface import Hypotheses
 from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.estimators.row_kernels import (
     ENDS,
@@ -20,8 +20,8 @@ from fusiond.estimators.row_kernels import (
     OF_STATE,
 )
 from fusiond.integrity.diagnosis import Diagnosis
-from fusiond.integrity.service import Series
-from fusiond.navigator.raw_innovation import RawInnovation, of_rows
+from fusiond.integrity.series_states import Series
+from fusiond.navigator.ungated_innovation import RawInnovation, of_rows
 
 if TYPE_CHECKING:
     from fusiond.navigator.timeline import Entry

@@ -15,7 +15,7 @@ from fusiond.models.blocks import Block, ImuNoise
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
-from fusiond.navigator.drift_levels import DriftLevels
+from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 
 GATE = 0.9999
 """Gate probability, as the measured measurements' default."""

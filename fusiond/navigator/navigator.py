@@ -36,21 +36,21 @@ from fusiond.navigator.assembly import (
     verdicts_of,
 )
 from fusiond.navigator.calibration import CalibrationWatch
-from fusiond.navigator.drift_levels import DriftLevels
+from fusiond.navigator.fault_events import ServiceEvents
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
-from fusiond.navigator.imu_change import hand_over, publish_by_axes
+from fusiond.navigator.imu_handover import hand_over, publish_by_axes
 from fusiond.navigator.imu_noise import ImuNoise
 from fusiond.navigator.imu_screening import AHEAD_NS, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import operator_position
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.motion_constraints import ConstraintMaker, vehicle_blocks
-from fusiond.navigator.protection import NO_BOUND, ProtectionWatch
+from fusiond.navigator.protection_events import NO_BOUND, ProtectionWatch
 from fusiond.navigator.published_solution import publish_by_own_clock, solution_of
-from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.service_events import ServiceEvents
+from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 from fusiond.navigator.source_status import SourceService
 from fusiond.navigator.status import NavigationStatus, OutcomeWatch, StartedNavigation
 from fusiond.navigator.timeline import Entry, Timeline
@@ -179,7 +179,7 @@ class Navigator:
         return taken
 
     def change_imu(self) -> None:
-        """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
+        """The samples from now on are the spare's (fusiond.navigator.imu_handover)."""
         self._screening.change()
         self._units.change()
         self._imu_noise.change()
@@ -282,26 +282,8 @@ class Navigator:
             if self.started is not None:
                 self.reset(self._units.wrong)
             return
-        if self.started is None:
-            if self._screening.lags:
-                return
-            start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
-            too_old = start is None or self._start_is_too_old()
-            if start is None or too_old or self._aligner.waits(start, self._latency):
-                return
-            if self.calibration is not None and not self.trial.on_trial:
-                start = self.calibration.taken_up(start, self.model)
-            self.calibrating.restart()
-            first = self.imu.index_after(start.t_ns) + self.imu.start
-            self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
-            if isinstance(self.estimator, InvariantFilter):
-                self.estimator.turns = start.turns
-            self.timeline.start(start.used)
-            self._imu_noise.started(start, self.estimator, self.imu)
-            self.verdicts.reset()
-            self.started = start
-            self.trial.begin(start)
-            self._event("aligned", self.outcome_watch.begin(start))
+        if self.started is None and not self._begin():
+            return
         self.timeline.advance(record or self.keeps_solutions)
         e = self.estimator
         if not 0 <= e.t_ns - self._verdicts_ns < VERDICTS_NS:
@@ -337,6 +319,29 @@ class Navigator:
         self._imu_noise.look(self.timeline, self.imu)
         if e.t_ns >= self.calibrating.due_ns or self.calibrating.turned:
             self._calibrate()
+
+    def _begin(self) -> bool:
+        """Start the filter if the alignment is ready; False while it is not."""
+        if self._screening.lags:
+            return False
+        start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
+        too_old = start is None or self._start_is_too_old()
+        if start is None or too_old or self._aligner.waits(start, self._latency):
+            return False
+        if self.calibration is not None and not self.trial.on_trial:
+            start = self.calibration.taken_up(start, self.model)
+        self.calibrating.restart()
+        first = self.imu.index_after(start.t_ns) + self.imu.start
+        self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
+        if isinstance(self.estimator, InvariantFilter):
+            self.estimator.turns = start.turns
+        self.timeline.start(start.used)
+        self._imu_noise.started(start, self.estimator, self.imu)
+        self.verdicts.reset()
+        self.started = start
+        self.trial.begin(start)
+        self._event("aligned", self.outcome_watch.begin(start))
+        return True
 
     def _calibrate(self) -> None:
         """Look at the calibration; one that was taken up and proves wrong is given up."""

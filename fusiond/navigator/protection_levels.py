@@ -2,7 +2,7 @@
 
 Each bounds the error by itself: that of solution separation in the filter
 (fusiond.integrity.protection), and that of each raw receiver's epochs
-(fusiond.navigator.epoch_protection). The least of them is published; each is computed at its equal
+(fusiond.navigator.raw_araim). The least of them is published; each is computed at its equal
 part of the integrity risk, so that the least holds whichever it is.
 """
 
@@ -19,7 +19,7 @@ from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.protection import IntegrityRisk, filter_protection
-from fusiond.navigator.epoch_protection import EpochProtection
+from fusiond.navigator.raw_araim import EpochProtection
 from fusiond.navigator.raw_gnss import RawEpochMeasurement
 
 

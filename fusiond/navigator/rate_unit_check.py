@@ -46,7 +46,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.candidates import PositionCandidate
+from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 

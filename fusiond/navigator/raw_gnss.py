@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from drivers.raw.messages import Ephemeris, NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
-from fusiond.aiding.candidates import Candidate, PositionCandidate, VelocityCandidate
-from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.initialisation import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeMeasurement, nothing_left
 from fusiond.configuration.aiding import RawAiding
-from fusiond.estimators.screening import KEPT
-from fusiond.gnss.displacement import Displacement
+from fusiond.estimators.update_with_exclusion import KEPT
+from fusiond.gnss.best_four_satellites import best_four
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
-from fusiond.gnss.levels import Levels, take_off
 from fusiond.gnss.orbit import WEEK_S
+from fusiond.gnss.range_error_displacement import Displacement
 from fusiond.gnss.range_kernel import (
     CARRIER_VARIANCE,
     RANGE_VALUES,
@@ -43,7 +43,7 @@ from fusiond.gnss.ranges import (
     Rows,
     nothing_kept,
 )
-from fusiond.gnss.selection import best_four
+from fusiond.gnss.satellite_biases import Levels, take_off
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
 from fusiond.navigator.raw_sky import REASONS, Sky, sky_of

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.pseudorange import PseudorangeMeasurement
-from fusiond.estimators.screening import KEPT, RESIDUAL
+from fusiond.estimators.update_with_exclusion import KEPT, RESIDUAL
 from fusiond.gnss.ranges import Rows
 from fusiond.gnss.single_point import Dops, dops
 

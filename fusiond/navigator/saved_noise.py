@@ -2,10 +2,10 @@
 
 Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
 divide (fusiond.aiding.fix_errors), which share of what the samples show is noise
-(fusiond.navigator.noise_share), and how much of typed drifts there is
-(fusiond.navigator.drift_levels). The next drive is through other streets, so no more than `CARRIED`
-of it counts: two of ten minutes, which two minutes of it outweigh. A week on, antenna and load may
-be others: less by e.
+(fusiond.navigator.imu_noise_share), and how much of typed drifts there is
+(fusiond.navigator.sensor_drift_magnitudes). The next drive is through other streets, so no more
+than `CARRIED` of it counts: two of ten minutes, which two minutes of it outweigh. A week on,
+antenna and load may be others: less by e.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fusiond.aiding.fix_errors import MOST_SHOWN, SHOWN
-from fusiond.navigator.drift_levels import GRID as LEVELS
-from fusiond.navigator.noise_share import GRID
+from fusiond.navigator.imu_noise_share import GRID
 from fusiond.navigator.saved_state import STRICT
+from fusiond.navigator.sensor_drift_magnitudes import GRID as LEVELS
 
 CARRIED = 0.2
 FADES_S = 7.0 * 86400.0

@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from fusiond.estimators.federated.options import local_of
-from fusiond.integrity.fault_finding import Finding
-from fusiond.integrity.service import Series, Service
+from fusiond.integrity.series_exclusion import Finding
+from fusiond.integrity.series_states import Series, Service
 from fusiond.navigator.timeline import Timeline
 
 CORRECTED_SHOWN_NS = 60_000_000_000

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.integrity.diagnosis import Diagnosis
-from fusiond.integrity.verdicts import Verdicts
+from fusiond.integrity.source_monitors import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import VE, VN
@@ -24,8 +24,8 @@ from fusiond.navigator.alignment.start_check import StartTrial
 from fusiond.navigator.health_check import FailedMeasurements
 from fusiond.navigator.imu_screening import BEARABLE_YAW_RAD, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
-from fusiond.navigator.protection import ProtectionWatch
-from fusiond.navigator.reasons import joined, reason
+from fusiond.navigator.mode_reasons import joined, reason
+from fusiond.navigator.protection_events import ProtectionWatch
 from fusiond.navigator.timeline import JUDGED, Entry
 
 COURSE_M_S = 3.0
@@ -133,8 +133,8 @@ class OutcomeWatch:
         """By source the last instant that was fused."""
         self.position_ns = 0
         self.basis = ""
-        """Why it navigates, in words: how its heading came about, or which fixes ended the last
-        coasting."""
+        """Reason of the mode `navigating`: the origin of its heading, or the fixes that ended the
+        last coasting."""
 
     def refuse(self, source: str, name: str) -> str:
         """Count a refusal; its name."""

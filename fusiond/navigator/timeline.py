@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement, Feedback
-from fusiond.aiding.candidates import Candidate
+from fusiond.aiding.initialisation import Candidate
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.estimators.row_kernels import JUDGE, KEEP
 from fusiond.integrity.catalogue import Kind
@@ -27,7 +27,7 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.measurement_rows import MeasurementRows, Span, raw_of
-from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
+from fusiond.navigator.ungated_innovation import RawInnovation, raw_innovation
 
 Key = tuple[int, str, int]
 

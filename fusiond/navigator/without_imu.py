@@ -10,9 +10,9 @@ so that velocity changes by the model's noise and by what is measured alone. Att
 and not published; a lever arm counts by its upward part (`AidingMeasurement.without_attitude`). Of
 a vehicle that does not slide a heading says which way it goes, and a wheel how fast: both together
 carry the position on where no fix comes. Bearings count with the attitude of a star tracker or
-another sensor, and on a road with a heading (`fusiond.aiding.bearing`); alone they say nothing.
-With `[estimator] filter = "federated"` the receivers have a local filter each, as in experiments 3
-and 4 of paper 004; every other filter is here the Kalman filter.
+another sensor, and on a road with a heading (`fusiond.aiding.landmark_bearing`); alone they say
+nothing. With `[estimator] filter = "federated"` the receivers have a local filter each, as in
+experiments 3 and 4 of paper 004; every other filter is here the Kalman filter.
 
 The first fix, or an operator's position, makes a start that knows next to nothing, and is then a
 measurement like any other. When the inertial unit has aligned, its navigation takes over.
@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import AttitudeMeasurement
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import HeadingCandidate, PositionCandidate
-from fusiond.aiding.heading_history import HeadingHistory, KnownHeading
+from fusiond.aiding.headings_without_imu import HeadingHistory, KnownHeading
+from fusiond.aiding.initialisation import HeadingCandidate, PositionCandidate
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.configuration.constraints import NonHolonomic
 from fusiond.configuration.schema import Config
@@ -46,8 +46,8 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, VD, VE, VN
 from fusiond.navigator.alignment.start import UNKNOWN_HEIGHT_SD_M
 from fusiond.navigator.assembly import estimator_without_imu
 from fusiond.navigator.imu_screening import BEARABLE_GAP_S
+from fusiond.navigator.mode_reasons import joined, reason
 from fusiond.navigator.published_solution import solution_of
-from fusiond.navigator.reasons import joined, reason
 from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]

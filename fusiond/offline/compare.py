@@ -20,7 +20,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fusiond.files.csv_tables import Flags, Floats
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 
 MAX_GAP_S = 1.0

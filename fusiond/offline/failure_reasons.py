@@ -13,7 +13,7 @@ from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import Rejection, counts
-from fusiond.files.tables import ImuTable
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import magnitudes, squares
 from fusiond.navigator.imu_unit_check import CourseTurns, force_unit, rms_unit

@@ -22,9 +22,9 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
+from drivers.quantization import rounded_speed
 from drivers.raw.messages import Correction, RawEvent, RawGnssEpoch
 from drivers.raw.weeks import leap_seconds, utc_ns
-from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.configuration.aiding import (
     Aiding,
@@ -40,7 +40,7 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.file_kind import kind_of
 from fusiond.files.log_bytes import log_bytes
-from fusiond.files.tables import (
+from fusiond.files.measurement_csv import (
     ImuTable,
     read_attitude,
     read_barometer,

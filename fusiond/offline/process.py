@@ -24,8 +24,8 @@ from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.files.csv_tables import counts
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.files.solution_csv import STATUS
-from fusiond.files.tables import ImuTable
 from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import longest_step

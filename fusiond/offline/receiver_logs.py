@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.bestpos.decoder import BestposDecoder
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
-from drivers.nmea.protocols import named
+from drivers.nmea.foreign_protocols import named
 from drivers.raw.messages import (
     Bdgim,
     Correction,
@@ -33,7 +33,7 @@ from drivers.raw.rinex import (
     RinexError,
     version_and_type,
 )
-from drivers.raw.rinex2 import as_version_3
+from drivers.raw.rinex2_to_3 import as_version_3
 from drivers.raw.rinex_nav import Broadcast, navigation
 from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
 from drivers.sbf.decoder import SbfDecoder
@@ -42,10 +42,10 @@ from drivers.ubx.decoder import UbxDecoder
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
-from fusiond.files.extras import install
 from fusiond.files.file_kind import kind_of
+from fusiond.files.install_extra import install
 from fusiond.files.log_bytes import log_bytes
-from fusiond.files.tables import ImuTable
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.measurement_files import SECONDS_OF_WEEK, Arrival
 from fusiond.offline.nmea_file import EARLIEST_DATE

@@ -13,9 +13,9 @@ from itertools import islice
 from typing import Any
 
 from drivers.base import Emit, Emitted
+from drivers.can.base_driver import CanDriver
 from drivers.can.bus import CanFrame
-from drivers.can.driver import CanDriver
-from drivers.can.python_can import can
+from drivers.can.python_can_import import can
 from drivers.measurements import TimeReport
 from fusiond.clock.recorder_clock import (
     ENOUGH_REPORTS,

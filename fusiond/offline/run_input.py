@@ -21,7 +21,7 @@ from drivers.raw.messages import (
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counts
-from fusiond.files.tables import ImuTable, read_imu
+from fusiond.files.measurement_csv import ImuTable, read_imu
 from fusiond.offline.failure_reasons import FileRead
 from fusiond.offline.measurement_files import (
     OF_A_RECEIVER,
@@ -66,7 +66,7 @@ def read_recorded(
     units: list[tuple[int, ImuSample]] = []
     if can_log is not None:
         # python-can and the DBC files' reader come only where there is a bus to be read.
-        from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
+        from fusiond.offline.can_through_drivers import read_can_log  # noqa: PLC0415
 
         log = read_can_log(can_log, config)
         imu, arrivals, units = log.imu, log.arrivals, log.units

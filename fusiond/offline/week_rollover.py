@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, date, datetime
 from typing import NamedTuple
 
-from drivers.decoding import BUILD_DATE
+from drivers.decoder_options import BUILD_DATE
 from drivers.nmea.reasons import ROLLOVER
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from drivers.base import DriverStatus, State
 from fusiond.configuration.outputs import Prometheus
-from fusiond.integrity.service import Service
+from fusiond.integrity.series_states import Service
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.derived_figures import motion, usable

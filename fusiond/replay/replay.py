@@ -25,7 +25,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
-from fusiond.live.warm_keeper import KEPT_STATE
+from fusiond.live.state_in_memory import KEPT_STATE
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.state_file import DamagedStateError
 from fusiond.navigator.timeline import Entry

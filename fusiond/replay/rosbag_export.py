@@ -20,7 +20,7 @@ from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
 from fusiond.replay.csv_export import arrivals

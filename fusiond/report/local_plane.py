@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 
 Origin = tuple[float, float, float]

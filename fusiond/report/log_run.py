@@ -12,7 +12,7 @@ import numpy as np
 
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 from fusiond.files.csv_tables import Floats
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.recording.channels import INNOVATION, STATE
 from fusiond.recording.info import info
 from fusiond.recording.log_metadata import CONFIG

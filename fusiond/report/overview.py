@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fusiond.files.tables import TrajectoryTable
-from fusiond.integrity.service import Service
+from fusiond.files.measurement_csv import TrajectoryTable
+from fusiond.integrity.series_states import Service
 from fusiond.navigation.solution import Mode
 from fusiond.report.local_plane import metres_from, origin_of
 from fusiond.report.page_items import Item, Section, Sentence, Table, Track

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fusiond.files.tables import TrajectoryTable, read_truth
+from fusiond.files.measurement_csv import TrajectoryTable, read_truth
 from fusiond.report import filter_plots, imu_and_host, overview, states
 from fusiond.report.log_run import run_from_log
 from fusiond.report.page import page

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fusiond.files.csv_tables import file_report
-from fusiond.files.tables import read_solution
+from fusiond.files.measurement_csv import read_solution
 from fusiond.report.run import Problem, Run
 
 POSIX_FROM_S = 1e9

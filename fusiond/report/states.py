@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.offline.compare import Errors, NothingToCompareError, errors_of, report_of
 from fusiond.report.local_plane import metres_from, origin_of
 from fusiond.report.page_items import Item, Plot, Section, Sentence, Series, Table

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.files.fixed_decimal import MAX_CELL, format_rows
-from fusiond.simulation.aiding_sensors import sensor_tables
 from fusiond.simulation.barometer import BAROMETER_COLUMNS, Barometer, barometer_stream
 from fusiond.simulation.gnss.raw import GnssRaw
 from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
@@ -18,6 +17,7 @@ from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre
 from fusiond.simulation.scenarios import Scenario, random_streams
+from fusiond.simulation.star_tracker_radar import sensor_tables
 
 Array = NDArray[np.float64]
 

@@ -21,11 +21,11 @@ from pathlib import Path
 from drivers.can.bus import Interface
 from fusiond.configuration.draft import Draft, DraftSource, toml
 from fusiond.files.csv_tables import MissingPackageError
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import ANTENNA_M, CAR_IMU, REAR_AXLE_M, SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
 
 VCAN, MULTICAST = "vcan0", "239.74.163.2"
 REST_S = 20.0

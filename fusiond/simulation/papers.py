@@ -22,7 +22,7 @@ from fusiond.simulation.scenarios import SCENARIOS, Scenario
 from fusiond.simulation.trajectories import Leg, Path, flight, follow, level_flight
 
 if TYPE_CHECKING:
-    from fusiond.simulation.vehicle import Device
+    from fusiond.simulation.live_devices import Device
 
 REST_S = 8.0
 COURSE_DEG = 40.0

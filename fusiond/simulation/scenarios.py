@@ -9,7 +9,6 @@ import numpy as np
 
 from fusiond.configuration.aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
 from fusiond.configuration.schema import Config, Imu
-from fusiond.simulation.aiding_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.barometer import BarometerOptions
 from fusiond.simulation.gnss.masks import Mask
 from fusiond.simulation.gnss.raw import GnssRawOptions
@@ -17,6 +16,7 @@ from fusiond.simulation.gnss.receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
+from fusiond.simulation.star_tracker_radar import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.trajectories import Path, drive, flight, level_flight, static
 
 ANTENNA_M = (0.0, 0.0, -1.0)

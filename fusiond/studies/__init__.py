@@ -17,13 +17,13 @@ STUDIES = {
     "federated": "fusiond.studies.federated.study",
     "ukf": "fusiond.studies.ukf.study",
     "bds-tight": "fusiond.studies.bds_tight.study",
-    "consistency": "fusiond.studies.consistency",
+    "consistency": "fusiond.studies.consistency_verdict_errors",
     "reduced-order": "fusiond.studies.reduced_order.study",
     "protection": "fusiond.studies.protection",
     "vehicle": "fusiond.studies.vehicle.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
-    "drives": "fusiond.studies.drives",
-    "papers": "fusiond.studies.papers",
+    "drives": "fusiond.studies.random_drives",
+    "papers": "fusiond.studies.paper_models_nees",
 }
 
 

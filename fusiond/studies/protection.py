@@ -40,8 +40,8 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, gnss_fixes
 from fusiond.studies.faults.runs import VEHICLE
+from fusiond.studies.faults.sensor_data import DURATION_S, Drive, Recording, gnss_fixes
 from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, on_processes, step_counter
 from fusiond.studies.navigation_error import nav_error, true_nav

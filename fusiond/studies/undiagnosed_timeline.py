@@ -6,7 +6,7 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.fault_correction import Correction
-from fusiond.integrity.service import Series
+from fusiond.integrity.series_states import Series
 
 
 class Trusting(Diagnosis):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
+from fusiond.aiding.landmark_bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.gnss.ecef import to_ecef

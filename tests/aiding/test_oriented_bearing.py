@@ -10,8 +10,7 @@ import pytest
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
-from fusiond.aiding.heading_history import (
+from fusiond.aiding.headings_without_imu import (
     CORNER_RAD_S,
     HOLDS_NS,
     LEVEL_SD_RAD,
@@ -20,6 +19,7 @@ from fusiond.aiding.heading_history import (
     KnownHeading,
     Oriented,
 )
+from fusiond.aiding.landmark_bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.models.blocks import misalignment
 from fusiond.models.constant_velocity import constant_velocity
 from fusiond.navigation.strapdown import LAT, STEP_SIZE

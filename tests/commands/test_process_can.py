@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
-from fusiond.files.tables import read_gnss, read_solution
+from fusiond.files.measurement_csv import read_gnss, read_solution
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 from tests.places import DATA, REPOSITORY

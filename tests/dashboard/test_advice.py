@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fusiond.dashboard.advice import advice
-from fusiond.navigator.reasons import joined, reason
+from fusiond.navigator.mode_reasons import joined, reason
 from tests.dashboard.serving import said
 
 

@@ -30,8 +30,8 @@ from fusiond.doctor.discovery import (
 )
 from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.drivers.bestpos.logs import bestpos
 from tests.drivers.nmea.sentences import gga, made
 from tests.drivers.raw.frames import measurement, rawx

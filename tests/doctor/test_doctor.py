@@ -25,8 +25,8 @@ from fusiond.configuration.schema import Config
 from fusiond.doctor import devices as doctor_devices
 from fusiond.doctor.doctor import _beams_line, doctor, examine
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.broker import Broker, free_port
 from tests.pty_device import Device
 

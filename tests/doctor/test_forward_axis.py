@@ -17,9 +17,9 @@ from fusiond.commands.app import app
 from fusiond.configuration.load import load_config
 from fusiond.doctor.forward_axis import ForwardAxis, axes_of
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive as path
-from fusiond.simulation.vehicle import SimulatedVehicle
 
 RATE_HZ = 100.0
 REST_S = 12.0

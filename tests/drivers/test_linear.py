@@ -25,7 +25,7 @@ from drivers.bestpos.decoder import BestposDecoder
 from drivers.bestpos.framing import LogSplitter
 from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.nmea.framing import NmeaSplitter, StreamSplitter
+from drivers.nmea.mixed_framing import NmeaSplitter, StreamSplitter
 from drivers.ntrip import client
 from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.raw.decoder import RawDecoder

@@ -20,7 +20,7 @@ from drivers.measurements import DeviceEvent, PositionFix
 from drivers.network_port import open_port
 from drivers.nmea.driver import NmeaDriver, NmeaOptions
 from drivers.port import READ_BYTES
-from drivers.serial_line import SerialLine
+from drivers.reconnecting_line import SerialLine
 from fusiond.doctor.devices import open_findings
 from tests.broker import free_port
 from tests.drivers.at_work import at_work

@@ -10,9 +10,9 @@ from fusiond.models.vehicle import CLOCK_SKEW, CLOCK_SKEW_SD, FIX_TIME, VELOCITY
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
-from fusiond.studies.faults.published import against
-from fusiond.studies.faults.recording import Recording
 from fusiond.studies.faults.scenes import CODE, RTK, Vehicle, scene
+from fusiond.studies.faults.sensor_data import Recording
+from fusiond.studies.faults.solution_errors import against
 
 SKEW = 250e-6
 """As of the unit of drive_0708: 0.1 s in 400 s."""

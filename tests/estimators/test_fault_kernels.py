@@ -33,13 +33,13 @@ from fusiond.estimators.fault_bank import (
     WAITS,
     fault_table,
 )
+from fusiond.estimators.fault_bank_interface import Hypotheses
 from fusiond.estimators.fault_carried import mix, settle
 from fusiond.estimators.fault_odds import MOST_OF_UNIT
-from fusiond.estimators.fault_rows import _at_past, _past, walk_path
-from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.fault_update import _at_past, _past, walk_path
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.published_state import MOVING, moving, opened_variances
-from fusiond.estimators.tilt_axes_carried import turn_covariance
+from fusiond.estimators.tilt_axes_update import turn_covariance
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import MOUNTING, mounting

@@ -21,7 +21,7 @@ from fusiond.estimators.federated.isolation import INNOVATION
 from fusiond.estimators.federated.no_reset import NoResetFilter
 from fusiond.estimators.federated.options import FederatedOptions, Mode
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.gnss.constellation import EPOCH_S, Constellation, constellation
+from fusiond.gnss.nominal_constellation import EPOCH_S, Constellation, constellation
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.models.blocks import CLOCK_OFFSET, clock_blocks
 from fusiond.models.catalogue import make_model

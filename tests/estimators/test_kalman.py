@@ -17,8 +17,8 @@ from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.base import gate_threshold
-from fusiond.estimators.block_covariance import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.multi_sample_covariance import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import dense_transition
 from tests import runs

@@ -11,7 +11,7 @@ from fusiond.aiding.body_velocity import NonHolonomicConstraint
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
-from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import mounting
 from fusiond.navigation.imu_buffer import ImuBuffer

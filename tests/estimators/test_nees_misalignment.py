@@ -14,12 +14,17 @@ import pytest
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Linearised
-from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
+from fusiond.aiding.landmark_bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.si_units import ARCSEC, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.blocks import misalignment
 from fusiond.models.catalogue import make_model
-from fusiond.simulation.aiding_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
+from fusiond.simulation.star_tracker_radar import (
+    SarOptions,
+    SarRadar,
+    StarTracker,
+    StarTrackerOptions,
+)
 from tests import runs
 from tests.estimators.monte_carlo import (
     FIRST_FIX_S,

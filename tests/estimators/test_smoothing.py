@@ -15,7 +15,7 @@ from fusiond.estimators.base import Outcome
 from fusiond.estimators.published_state import Published
 from fusiond.estimators.smoothing.backward import Smoother
 from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes_of
-from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.models.vehicle import ANTENNA_LEVER, antenna_lever

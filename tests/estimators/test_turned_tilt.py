@@ -2,7 +2,7 @@
 
 Consumer sensors (50 mg, 3 deg/s), a heading known to 3 deg, ten seconds at rest, half a minute
 straight on and a bend. What a filter makes of headings that it only thinks has turned tilt and
-biases apart (fusiond.estimators.tilt_axes).
+biases apart (fusiond.estimators.tilt_frame_after_heading_update).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
-from fusiond.estimators.covariance import mirror
+from fusiond.estimators.covariance_propagation import mirror
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.tilt_axes import TiltAxesFilter
-from fusiond.estimators.tilt_axes_carried import turn_rows
-from fusiond.estimators.turned_axes import TURN_SIZE, rest_axes, rest_rows, turn_at_rest
+from fusiond.estimators.tilt_axes_propagation import TURN_SIZE, rest_axes, rest_rows, turn_at_rest
+from fusiond.estimators.tilt_axes_update import turn_rows
+from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity

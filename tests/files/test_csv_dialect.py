@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import ImuTable, read_imu
+from fusiond.files.measurement_csv import ImuTable, read_imu
 
 HEADER = "t_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2"
 ROWS = ["0.00,0.001,-0.002,0,0.15,-9.75,1e-3", "0.01,0.001,-.002,0,0.25,-9.80,2E+1"]

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.file_kind import kind_of
-from fusiond.files.tables import ImuTable
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.offline.measurement_files import READERS
 from fusiond.offline.nmea_file import read_nmea, receiver_of
 from fusiond.offline.receiver_logs import read_solutions

@@ -12,8 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fusiond.files.fixed_decimal import MAX_CELL, MAX_DECIMALS, format_rows
+from fusiond.files.measurement_csv import read_solution
 from fusiond.files.solution_csv import COLUMNS, STATUS, SolutionWriter
-from fusiond.files.tables import read_solution
 from fusiond.navigation.solution import Mode
 
 NO_LABELS = np.zeros((1, 0), dtype=np.uint8)

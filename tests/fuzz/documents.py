@@ -19,9 +19,9 @@ from pydantic import TypeAdapter
 
 from fusiond.dashboard.schemas import topics
 from fusiond.dashboard.vehicles import REFUSALS, Hub
-from fusiond.files import tables
+from fusiond.files import measurement_csv
 from fusiond.files.csv_tables import TableError
-from fusiond.live.warm_keeper import KEPT_STATE
+from fusiond.live.state_in_memory import KEPT_STATE
 from fusiond.navigator.saved_calibration import SavedCalibration
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.state_file import DamagedStateError, read_state, write_state
@@ -166,14 +166,14 @@ def state(data: bytes) -> None:
 
 
 TABLES: tuple[Callable[[Path], Any], ...] = (
-    tables.read_imu,
-    tables.read_gnss,
-    tables.read_rdss,
-    tables.read_attitude,
-    tables.read_bearing,
-    tables.read_wheel,
-    tables.read_truth,
-    tables.read_barometer,
+    measurement_csv.read_imu,
+    measurement_csv.read_gnss,
+    measurement_csv.read_rdss,
+    measurement_csv.read_attitude,
+    measurement_csv.read_bearing,
+    measurement_csv.read_wheel,
+    measurement_csv.read_truth,
+    measurement_csv.read_barometer,
 )
 
 

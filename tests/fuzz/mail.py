@@ -6,13 +6,13 @@ import binascii
 import math
 from collections import Counter
 
-from drivers.rdss.cycle import TerminalOptions
 from drivers.rdss.envelope import MARK
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import MessageReceived, TextEncoding
 from drivers.rdss.messages import Identity, Text
 from drivers.rdss.report import MODES
 from drivers.rdss.session import Session
+from drivers.rdss.state_tables import TerminalOptions
 from tests.fuzz.documents import input_of
 
 OWN, OTHER = 242286, 242407

@@ -20,7 +20,7 @@ _SHARED = ("drivers.cycle", "drivers.solution", "drivers.solution_decoder", "dri
 _HUB = ("advice", "history", "hub", "schemas", "vehicle")
 
 PARSERS = {
-    "splitter": Parser(("drivers.nmea.framing",), 128),
+    "splitter": Parser(("drivers.nmea.mixed_framing",), 128),
     "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 256),
     "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 192),
     "ssr": Parser(("drivers.raw.ssr",), 160),
@@ -28,7 +28,9 @@ PARSERS = {
     "ubx": Parser(("drivers.ubx.decoder", "drivers.ubx.messages", *_SHARED), 256),
     "bestpos": Parser(("drivers.bestpos.decoder", "drivers.bestpos.framing", *_SHARED), 640),
     "sbf": Parser(("drivers.sbf.decoder", "drivers.sbf.framing", *_SHARED), 256),
-    "rinex": Parser(("drivers.raw.rinex", "drivers.raw.rinex2", "drivers.raw.rinex_nav"), 1200),
+    "rinex": Parser(
+        ("drivers.raw.rinex", "drivers.raw.rinex2_to_3", "drivers.raw.rinex_nav"), 1200
+    ),
     "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
     "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
     "rdss_mail": Parser(
@@ -36,7 +38,7 @@ PARSERS = {
             "drivers.rdss.envelope",
             "drivers.rdss.inbox",
             "drivers.rdss.report",
-            "drivers.rdss.wording",
+            "drivers.rdss.text_coding",
         ),
         212,
     ),
@@ -49,7 +51,7 @@ PARSERS = {
     "can_log": Parser(
         tuple(f"fusiond.offline.{m}" for m in ("can_blf", "can_frames", "can_text")), 400
     ),
-    "dbc": Parser(("drivers.can.dbc_flaws",), 400),
+    "dbc": Parser(("drivers.can.dbc_salvage",), 400),
     "csv": Parser(
         tuple(f"fusiond.files.{m}" for m in ("csv_tables", "csv_dialect", "tables")), 160
     ),

@@ -6,7 +6,7 @@ import itertools
 from datetime import date
 from typing import TypeVar
 
-from drivers.nmea.running_checks import crc24q
+from drivers.nmea.incremental_checksum import crc24q
 from drivers.rdss.framing import checksum
 from tests.drivers.raw.frames import ubx
 

@@ -6,10 +6,10 @@ import itertools
 import struct
 import zlib
 
-from drivers.can.dbc_flaws import UnreadableError, sound_part
+from drivers.can.dbc_salvage import UnreadableError, sound_part
 from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock
 from fusiond.files.csv_tables import TableError
-from fusiond.offline.can_frames import Refusals, messages
+from fusiond.offline.can_log_reader import Refusals, messages
 from tests.fuzz.documents import INPUT_FILE, input_of
 
 SUFFIXES = (".log", ".asc", ".trc", ".blf")

@@ -13,12 +13,12 @@ from typing import Any
 
 from drivers.bestpos.decoder import BestposDecoder
 from drivers.bestpos.framing import log_crc
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Heading, PositionFix
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.messages import Ephemeris
 from drivers.raw.rinex import ObservationReader, RinexError, version_and_type
-from drivers.raw.rinex2 import as_version_3
+from drivers.raw.rinex2_to_3 import as_version_3
 from drivers.raw.rinex_nav import navigation
 from drivers.sbf.decoder import SbfDecoder
 from drivers.ubx.decoder import UbxDecoder

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusiond.files.tables import read_solution, read_truth
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.papers import configured

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch, RawSignal
+from fusiond.gnss.best_four_satellites import EXHAUSTIVE_UP_TO, best_four, gdop_squared
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.group_delay import group_delay
 from fusiond.gnss.orbit import Orbits
 from fusiond.gnss.ranges import RangeModel
-from fusiond.gnss.selection import EXHAUSTIVE_UP_TO, best_four, gdop_squared
 from fusiond.gnss.single_point import SinglePoint, dops, single_point
 from fusiond.gnss.store import EphemerisStore
 from tests.gnss.examples import ephemeris, oracle_pseudorange, signals_epoch, vector

@@ -27,7 +27,7 @@ from drivers.raw.messages import (
     RawGnssEpoch,
     System,
 )
-from fusiond.files.tables import read_gnss
+from fusiond.files.measurement_csv import read_gnss
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.ranges import RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point

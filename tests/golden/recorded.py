@@ -15,12 +15,12 @@ from pathlib import Path
 import can
 import numpy as np
 
+from drivers.can.base_driver import CanDriver
 from drivers.can.bus import CanFilter
-from drivers.can.driver import CanDriver
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Source
-from fusiond.files.tables import read_imu
-from fusiond.offline.can_frames import messages
+from fusiond.files.measurement_csv import read_imu
+from fusiond.offline.can_log_reader import messages
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.clock.host_time import Host, S, utc
 from tests.places import DATA, REPOSITORY

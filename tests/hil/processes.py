@@ -15,7 +15,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.files.tables import read_truth
+from fusiond.files.measurement_csv import read_truth
 from tests.places import REPOSITORY
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
@@ -124,7 +124,7 @@ class DaemonProcess:
 
 
 class VehicleProcess:
-    """`python -m fusiond.simulation.vehicle`, its plugs, and the truth at any instant of UTC.
+    """`python -m fusiond.simulation.live_devices`, its plugs, and the truth at any instant of UTC.
 
     `async with` starts nothing, as for the daemon."""
 
@@ -141,7 +141,7 @@ class VehicleProcess:
         """Start it, and wait until its devices are there."""
         self._process = await asyncio.create_subprocess_exec(
             sys.executable,
-            *("-m", "fusiond.simulation.vehicle", *self._arguments),
+            *("-m", "fusiond.simulation.live_devices", *self._arguments),
             *("--gnss-link", str(self.gnss), "--rdss-link", str(self.rdss)),
             *("--truth", str(self._truth), "--start-file", str(self._start)),
             cwd=REPOSITORY,

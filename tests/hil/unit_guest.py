@@ -14,7 +14,7 @@ from typing import TextIO
 from tests.hil.uml import HERE, REPOSITORY, run_in_uml
 
 _KERNELS = """
-import fusiond.live.daemon, fusiond.simulation.vehicle
+import fusiond.live.daemon, fusiond.simulation.live_devices
 from fusiond.navigation.compiled import FOLDER
 print(FOLDER)
 """

@@ -18,9 +18,9 @@ from fusiond.integrity.consistency import (
     judge,
     whiten,
 )
-from fusiond.integrity.monitor import ConsistencyMonitor
-from fusiond.studies import consistency as study
-from fusiond.studies.level_axis import Aided, Fault, innovations
+from fusiond.integrity.innovation_window import ConsistencyMonitor
+from fusiond.studies import consistency_verdict_errors as study
+from fusiond.studies.single_axis_ins import Aided, Fault, innovations
 
 Array = NDArray[np.float64]
 PAPER_RHO = (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusiond.estimators.hypotheses import Estimated
+from fusiond.estimators.fault_bank_interface import Estimated
 from fusiond.integrity.fault_correction import mixed
 
 N = 15

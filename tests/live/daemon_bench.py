@@ -21,9 +21,9 @@ from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.patience import until
 
 REST = replace(SCENARIOS["drive"], path=partial(drive, rest_s=60.0))

@@ -24,11 +24,11 @@ from pathlib import Path
 
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.warm_start import LONGEST_GAP_S, RESTARTED
+from fusiond.navigator.restart_from_memory import LONGEST_GAP_S, RESTARTED
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.hil.processes import SIM_IMU
 from tests.live.conditions import CONDITIONS, spoil
 from tests.live.told import ToldDaemon

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.rdss.messages import Family
 from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.rdss.centre import RdssOptions
-from fusiond.simulation.rdss.network import MessageNetwork
+from fusiond.simulation.rdss.short_messages import MessageNetwork
 from fusiond.simulation.rdss.terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS
 from tests.broker import Listener

@@ -2,7 +2,7 @@
 
 The vehicle is simulated here; its bytes pass a `Wire` and its samples an `AlteredImu` on their way
 to pseudo terminals and a CAN bus, a real one where `vcan0` is up. Judged as the matrix of faults on
-values (`fusiond.studies.faults.judge`), on samples of whole seconds.
+values (`fusiond.studies.faults.scoring`), on samples of whole seconds.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from drivers.base import monotonic_ns
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.can.imu import CanImu
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
-from fusiond.studies.faults.judge import Course, Event, Sample
 from fusiond.studies.faults.runs import compared
+from fusiond.studies.faults.scoring import Course, Event, Sample
 from tests.broker import Broker
 from tests.hil.processes import SIM_IMU
 from tests.live.told import ToldDaemon

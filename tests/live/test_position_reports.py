@@ -13,13 +13,13 @@ from drivers.base import DriverStatus
 from drivers.rdss.envelope import opened
 from drivers.rdss.messages import TextRequest
 from drivers.rdss.report import PositionReport, decode_report
-from drivers.rdss.wording import Wording
+from drivers.rdss.text_coding import Wording
 from fusiond.navigation.earth import meridian_radius
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.fleet import FleetMessage
 from fusiond.outputs.messages.short_message import ShortMessage
 from fusiond.outputs.topics import Topic
-from fusiond.simulation.rdss.network import ConvoyVehicle
+from fusiond.simulation.rdss.short_messages import ConvoyVehicle
 from tests.live.daemon_bench import NO_MQTT, PARKED, RDSS, REST, Bench, running
 from tests.patience import until
 

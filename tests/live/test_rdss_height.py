@@ -13,7 +13,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.can.height import CanHeightDecoder
-from drivers.can.python_can import can
+from drivers.can.python_can_import import can
 from drivers.measurements import DelayedFix
 from drivers.rdss.messages import HeightMode, PositionRequest
 from drivers.standard_atmosphere import standard_pressure_pa
@@ -21,8 +21,8 @@ from fusiond.clock.stamp_mapping import Instant
 from fusiond.live.daemon import Daemon
 from fusiond.live.sources import Emitted
 from fusiond.simulation.can.encoder import CanEncoder
-from fusiond.simulation.can.sensors import SIM_BAROMETER
-from fusiond.simulation.vehicle import SimulatedVehicle
+from fusiond.simulation.can.star_tracker_radar import SIM_BAROMETER
+from fusiond.simulation.live_devices import SimulatedVehicle
 from tests.live.daemon_bench import NO_MQTT, PARKED, RDSS, REST, Bench, running
 from tests.patience import until
 

@@ -18,7 +18,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.replay.run import ReplayOptions, replay
 from fusiond.simulation.can.imu import CanImu
-from fusiond.simulation.vehicle import SimulatedVehicle
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.studies.faults.runs import compared
 from tests.live.daemon_bench import NO_MQTT, PARKED, REST, Bench, imu_section, running
 from tests.patience import until

@@ -12,20 +12,25 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.attitude import STAR_BLOCK
-from fusiond.aiding.bearing import SAR_BLOCK
+from fusiond.aiding.landmark_bearing import SAR_BLOCK
 from fusiond.configuration import load as loading
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import ARCSEC
-from fusiond.files.tables import read_attitude, read_bearing
+from fusiond.files.measurement_csv import read_attitude, read_bearing
 from fusiond.live import sources as serving
 from fusiond.live.daemon import Daemon
 from fusiond.offline.process import process
-from fusiond.simulation.aiding_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.files import simulate
+from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.vehicle import SimulatedVehicle
+from fusiond.simulation.star_tracker_radar import (
+    SarOptions,
+    SarRadar,
+    StarTracker,
+    StarTrackerOptions,
+)
 from tests.live.daemon_bench import running
 from tests.patience import until
 from tests.places import REPOSITORY

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fusiond.studies.faults.judge import Course, judge
+from fusiond.studies.faults.scoring import Course, judge
 from tests.live.rig import REST_S, Rig, rig, under_way
 from tests.live.wire_faults import FAULTS, Action, plugged
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.navigation.crosstalk import STOP_M_S, WITHIN_FIXES_M_S, Crosstalk
+from fusiond.navigation.crosstalk_noise import STOP_M_S, WITHIN_FIXES_M_S, Crosstalk
 from fusiond.navigator.navigator import Navigator
 
 PERIOD_S, G = 0.02, 9.8

@@ -15,9 +15,9 @@ from fusiond.models.model import Model
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.unit_grade import UnitGrade
-from fusiond.studies.faults.published import against
-from fusiond.studies.faults.recording import Recording
 from fusiond.studies.faults.scenes import RATE_HZ, RTK, Vehicle, drawing, scene
+from fusiond.studies.faults.sensor_data import Recording
+from fusiond.studies.faults.solution_errors import against
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.measurements import Attitude, Bearing, MonotonicStamp, PositionFix
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
-from fusiond.aiding.bearing import SAR_BLOCK, BearingMeasurement
+from fusiond.aiding.landmark_bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.rdss_position import BIAS_BLOCK
 from fusiond.configuration.aiding import (

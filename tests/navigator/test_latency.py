@@ -15,9 +15,9 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.position_jumps import Epoch
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults import imu_faults, measurement_faults
-from fusiond.studies.faults.judge import longest_lie_s
-from fusiond.studies.faults.recording import Drive, Recording
 from fusiond.studies.faults.runs import VEHICLE, navigate
+from fusiond.studies.faults.scoring import longest_lie_s
+from fusiond.studies.faults.sensor_data import Drive, Recording
 
 TICKS_HZ = 100.0
 LATE_S = measurement_faults.LATE_S

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.configuration.schema import Config
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.reasons import reason
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import Leg, follow
 from tests import runs

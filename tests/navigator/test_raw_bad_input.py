@@ -13,7 +13,7 @@ from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, Ephemeris, RawG
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.gnss.constellation import ephemeris, gps_slots
+from fusiond.gnss.nominal_constellation import ephemeris, gps_slots
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigator.raw_gnss import RawGnss

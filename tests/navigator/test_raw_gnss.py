@@ -13,14 +13,14 @@ import pytest
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
-from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
-from fusiond.files.tables import read_solution, read_truth
+from fusiond.estimators.update_with_exclusion import GATED, KEPT, RESIDUAL
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.catalogue import make_model

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from drivers.measurements import Measurement, PositionFix
-from fusiond.integrity.service import Service
+from fusiond.integrity.series_states import Service
 from fusiond.navigator.source_status import CORRECTED_SHOWN_NS, WORST_FIRST, SourceService, worst
 from fusiond.outputs.messages.fault import FaultReport, fault_report
 from tests.navigator import vehicle

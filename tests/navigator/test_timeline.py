@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
-from fusiond.estimators import hypotheses
+from fusiond.estimators import fault_bank_interface
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.diagnosis import Diagnosis
@@ -150,13 +150,13 @@ def test_rows_of_one_instant_are_judged_together_as_each_by_itself(
 def count(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts how often the hypotheses are judged, from now on."""
     judged: Counter[str] = Counter()
-    kernel = hypotheses.judge_and_widen
+    kernel = fault_bank_interface.judge_and_widen
 
     def counted(*given: object) -> None:
         judged["judge_and_widen"] += 1
         kernel(*given)
 
-    monkeypatch.setattr(hypotheses, "judge_and_widen", counted)
+    monkeypatch.setattr(fault_bank_interface, "judge_and_widen", counted)
     return judged
 
 

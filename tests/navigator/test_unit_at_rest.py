@@ -14,8 +14,8 @@ from fusiond.configuration.si_units import imu_noise
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
 from fusiond.navigator.unit_grade import AS_ITS_CLASS, GRID, Values, graded_at_rest
-from fusiond.studies.faults.published import against, longest_s
 from fusiond.studies.faults.scenes import CODE, Vehicle, scene
+from fusiond.studies.faults.solution_errors import against, longest_s
 
 UNITS, UNSEEN = 400, 0.02
 END_S = 45.0

@@ -20,9 +20,9 @@ from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.published import against, published
-from fusiond.studies.faults.recording import Recording, gnss_fixes
 from fusiond.studies.faults.scenes import CODE, RTK, Receiver, Vehicle, drawing, scene
+from fusiond.studies.faults.sensor_data import Recording, gnss_fixes
+from fusiond.studies.faults.solution_errors import against, published
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.aiding.bearing import line_of_sight
+from fusiond.aiding.landmark_bearing import line_of_sight
 from fusiond.configuration.schema import Config
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigation.solution import Mode, Solution

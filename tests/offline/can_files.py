@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from fusiond.offline.can_frames import Refusals, messages
+from fusiond.offline.can_log_reader import Refusals, messages
 from tests.offline.recorded_bus import BEGIN_S, bus
 
 FRAMES = list(bus(2))

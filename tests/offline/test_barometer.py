@@ -11,13 +11,13 @@ import pytest
 
 from drivers.can.height import CanHeightDecoder
 from fusiond.configuration.load import load_config
-from fusiond.files.tables import read_barometer, read_imu, read_solution, read_truth
+from fusiond.files.measurement_csv import read_barometer, read_imu, read_solution, read_truth
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
 from fusiond.simulation.barometer import Barometer, barometer_stream
 from fusiond.simulation.can.encoder import CanEncoder
 from fusiond.simulation.can.imu import CanImu
-from fusiond.simulation.can.sensors import SIM_BAROMETER
+from fusiond.simulation.can.star_tracker_radar import SIM_BAROMETER
 from fusiond.simulation.files import Simulated, simulate
 from fusiond.simulation.scenarios import SCENARIOS
 

@@ -22,7 +22,7 @@ from fusiond.commands.app import app
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import sensor_to_body
-from fusiond.files.tables import read_gnss, read_solution, read_truth
+from fusiond.files.measurement_csv import read_gnss, read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_from_rpy, rpy_from_dcm
 from fusiond.offline.calibrate import calibrate, files

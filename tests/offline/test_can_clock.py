@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.commands.app import app
 from fusiond.configuration.load import load_config
-from fusiond.offline.can_log import CanLog, read_can_log
+from fusiond.offline.can_through_drivers import CanLog, read_can_log
 from tests.offline.recorded_bus import BEGIN_S, CONFIG, bus, candump
 from tests.places import DATA
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fusiond.files.csv_tables import TableError
-from fusiond.offline.can_frames import channels
+from fusiond.offline.can_log_reader import channels
 from tests.offline.can_files import FRAMES, absolute, delta, read, same, terminal
 from tests.offline.recorded_bus import BEGIN_S, candump
 

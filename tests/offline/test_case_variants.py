@@ -19,8 +19,8 @@ import pytest
 
 from drivers.measurements import Heading, PositionFix
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import ImuTable
-from fusiond.offline.can_frames import Refusals, messages
+from fusiond.files.measurement_csv import ImuTable
+from fusiond.offline.can_log_reader import Refusals, messages
 from fusiond.offline.measurement_files import READERS
 from tests.offline.can_files import FRAMES, asc, same, written
 

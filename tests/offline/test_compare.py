@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fusiond.commands.compare_report import print_report
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.offline.compare import NothingToCompareError, compare
 
 LAT, LON, HEIGHT = 0.7, 2.0, 100.0

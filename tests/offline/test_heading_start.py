@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.load import load_config
-from fusiond.files.tables import read_solution, read_truth
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.offline.process import process
 from fusiond.simulation.files import Simulated, simulate
 from fusiond.simulation.scenarios import SCENARIOS

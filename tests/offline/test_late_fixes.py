@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusiond.files.tables import TrajectoryTable, read_solution, read_truth
+from fusiond.files.measurement_csv import TrajectoryTable, read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.studies.faults.recording import town
 from fusiond.studies.faults.runs import VEHICLE
+from fusiond.studies.faults.sensor_data import town
 
 Array = NDArray[np.float64]
 

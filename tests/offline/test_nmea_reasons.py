@@ -13,7 +13,7 @@ import pytest
 
 from drivers.measurements import PositionFix
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import ImuTable
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.offline.measurement_files import READERS
 
 DAY = datetime(2026, 3, 24, 7, 33, 2, tzinfo=UTC)

@@ -11,7 +11,7 @@ from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawGnssEpoch
 from fusiond.configuration.load import load_config
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import TrajectoryTable, read_solution
+from fusiond.files.measurement_csv import TrajectoryTable, read_solution
 from fusiond.offline.process import process
 from tests.drivers.raw.test_ssr import head, packed
 from tests.places import DATA, REPOSITORY

@@ -18,7 +18,13 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.load import load_config
-from fusiond.files.tables import GnssTable, TrajectoryTable, read_gnss, read_solution, read_truth
+from fusiond.files.measurement_csv import (
+    GnssTable,
+    TrajectoryTable,
+    read_gnss,
+    read_solution,
+    read_truth,
+)
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.offline.compare import compare
 from fusiond.offline.process import process

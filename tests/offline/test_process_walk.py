@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch, System
 from fusiond.commands.app import app
 from fusiond.configuration.load import load_config
-from fusiond.files.tables import TrajectoryTable, read_gnss, read_solution
+from fusiond.files.measurement_csv import TrajectoryTable, read_gnss, read_solution
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.gnss.ranges import RangeModel
 from fusiond.gnss.single_point import single_point

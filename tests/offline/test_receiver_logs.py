@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import PositionFix, UtcStamp
 from drivers.ubx.decoder import UbxDecoder
 from fusiond.commands.app import app
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import TrajectoryTable, read_imu, read_solution
+from fusiond.files.measurement_csv import TrajectoryTable, read_imu, read_solution
 from fusiond.navigation.gps_time import utc_ns_to_gps
 from fusiond.offline.nmea_file import EARLIEST_DATE
 from fusiond.offline.receiver_logs import decoding_of, read_solutions

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from fusiond.commands.app import app
 from fusiond.files.csv_tables import TableError
-from fusiond.files.tables import read_imu, read_solution
+from fusiond.files.measurement_csv import read_imu, read_solution
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.offline.measurement_files import READERS

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.measurements import MonotonicStamp
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.files.tables import ImuTable
+from fusiond.files.measurement_csv import ImuTable
 from fusiond.offline.measurement_files import READERS
 from tests.places import DATA
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.load import ConfigError, load_config
+from fusiond.files.measurement_csv import TrajectoryTable, read_solution, read_truth
 from fusiond.files.parquet_rows import flat
 from fusiond.files.solution_csv import SMOOTHED
-from fusiond.files.tables import TrajectoryTable, read_solution, read_truth
 from fusiond.navigation.solution import Mode
 from fusiond.offline import smooth
 from fusiond.offline.compare import compare

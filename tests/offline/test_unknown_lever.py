@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
-from fusiond.files.tables import read_solution, read_truth
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.offline.calibrate import calibrate, files
 from fusiond.offline.process import process

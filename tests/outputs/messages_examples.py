@@ -7,12 +7,12 @@ from typing import Any
 
 from drivers.rdss.mail import MessageStage
 from drivers.rdss.report import PositionReport
-from drivers.rdss.wording import worded
+from drivers.rdss.text_coding import worded
 from fusiond.clock.results import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
-from fusiond.integrity.fault_finding import Finding
-from fusiond.integrity.service import Service
+from fusiond.integrity.series_exclusion import Finding
+from fusiond.integrity.series_states import Service
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter
 from fusiond.outputs.messages.base import stamp

@@ -8,7 +8,7 @@ from typing import Any
 
 from fusiond.configuration.schema import Config
 from fusiond.demo.demo import demo_setup
-from fusiond.simulation.vehicle import SimulatedVehicle
+from fusiond.simulation.live_devices import SimulatedVehicle
 from tests.clock.host_time import MS, Host
 from tests.recording.rig import Rig
 

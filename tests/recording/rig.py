@@ -19,8 +19,8 @@ from fusiond.live.chain import Chain
 from fusiond.live.events import Events
 from fusiond.live.publishing import Publishing
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
-from fusiond.live.scheduler import Scheduler
-from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
+from fusiond.live.state_in_memory import KEPT_STATE, WarmKeeper
+from fusiond.live.tick import Scheduler
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import NAMES, Command
 from fusiond.outputs.topics import EVENT

@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
-from fusiond.files.tables import read_gnss, read_imu, read_rdss, read_solution
+from fusiond.files.measurement_csv import read_gnss, read_imu, read_rdss, read_solution
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import Inject, RequestFix
 from fusiond.recording.channels import INPUT, STATE

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.configuration.schema import Config
-from fusiond.files.tables import TrajectoryTable
+from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.report.input_statistics import spectrum
 from fusiond.report.page import page
 from fusiond.report.plot_arrays import BUCKETS, thinned

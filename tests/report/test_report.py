@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fusiond.files.measurement_csv import read_truth
 from fusiond.files.solution_csv import STATUS, SolutionWriter
-from fusiond.files.tables import read_truth
 from fusiond.offline.compare import compare
 from fusiond.recording.reader import Log
 from fusiond.report.local_plane import metres_from, origin_of

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from fusiond.configuration.schema import Config
-from fusiond.files.tables import read_solution, read_truth
+from fusiond.files.measurement_csv import read_solution, read_truth
 from fusiond.offline.compare import compare
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config, Imu
-from fusiond.files.tables import read_gnss, read_imu, read_rdss, read_truth
+from fusiond.files.measurement_csv import read_gnss, read_imu, read_rdss, read_truth
 from fusiond.simulation.files import simulate
 from fusiond.simulation.gnss.receiver import GnssOptions
 from fusiond.simulation.markov import gauss_markov

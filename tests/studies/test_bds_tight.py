@@ -18,7 +18,7 @@ from fusiond.gnss.ecef import ned_axes, to_geodetic
 from fusiond.gnss.single_point import SinglePoint
 from fusiond.navigator.intake import Intake
 from fusiond.studies import STUDIES
-from fusiond.studies.bds_tight import paper, runs
+from fusiond.studies.bds_tight import paper_setup, runs
 from fusiond.studies.bds_tight import study as bds_tight
 
 FILTERS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white")
@@ -55,7 +55,7 @@ def test_the_papers_own_set_up() -> None:
     assert own["model"] == "ins20"
     assert (own["west_m"], own["up_m"]) == pytest.approx((200.0, 40.0), abs=0.1)
     rows, gains = own["rows"], own["gains"]
-    for quantity in paper.BEFORE:
+    for quantity in paper_setup.BEFORE:
         of_ukf, of_ekf = (rows[row][quantity] for row in ("tight_ukf", "tight_ekf"))
         assert of_ukf == pytest.approx(of_ekf, rel=0.01), quantity
     assert gains["velocity"] > 1.5
@@ -64,19 +64,19 @@ def test_the_papers_own_set_up() -> None:
     assert rows["ins_alone"]["position"] > 100.0 * rows["tight_ukf"]["position"]
     # Never too sure; too cautious, as everywhere under the open sky (docs/bds-tight.md).
     assert 0.2 < rows["tight_ukf"]["nees_per_dof"] < 1.4
-    ends = paper.truth().at(np.array([0.0, 500.0])).v_ned
+    ends = paper_setup.truth().at(np.array([0.0, 500.0])).v_ned
     np.testing.assert_allclose(ends, 0.0, atol=1e-9)
 
 
 def test_the_filters_clock_is_the_simulated_one() -> None:
     """First-order Markov: sigma, correlation time and density of both are the same."""
-    noise = clock_noise(paper.MARKOV)
-    assert noise.drift_tau_s == paper.CLOCK.clock_drift_correlation_s == 300.0
-    assert noise.drift_steady == pytest.approx(paper.CLOCK.clock_drift_sd_m_s)
+    noise = clock_noise(paper_setup.MARKOV)
+    assert noise.drift_tau_s == paper_setup.CLOCK.clock_drift_correlation_s == 300.0
+    assert noise.drift_steady == pytest.approx(paper_setup.CLOCK.clock_drift_sd_m_s)
     assert noise.drift_white == 0.0
     density = 2.0 * noise.drift_steady**2 / noise.drift_tau_s
-    assert density == pytest.approx(clock_noise(paper.WALK).drift_white)
-    assert math.isinf(clock_noise(paper.WALK).drift_tau_s)
+    assert density == pytest.approx(clock_noise(paper_setup.WALK).drift_white)
+    assert math.isinf(clock_noise(paper_setup.WALK).drift_tau_s)
 
 
 def test_the_canyons_leave_as_many_satellites_as_they_say() -> None:

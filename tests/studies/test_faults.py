@@ -12,7 +12,10 @@ import pytest
 from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.configuration.load import load_config
 from fusiond.studies.faults import imu_faults, measurement_faults
-from fusiond.studies.faults.judge import (
+from fusiond.studies.faults.extra_faults import EVERY
+from fusiond.studies.faults.library import FAULTS, PHASES
+from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
+from fusiond.studies.faults.scoring import (
     QUANTITIES,
     Course,
     Event,
@@ -22,10 +25,7 @@ from fusiond.studies.faults.judge import (
     longest_lie_s,
     recovered_s,
 )
-from fusiond.studies.faults.library import FAULTS, PHASES
-from fusiond.studies.faults.more import EVERY
-from fusiond.studies.faults.recording import Drive, Received, Recording
-from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
+from fusiond.studies.faults.sensor_data import Drive, Received, Recording
 
 GOOD = (1.0,) * len(QUANTITIES)
 BEGIN_S, END_S = 10.0, 20.0

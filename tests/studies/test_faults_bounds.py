@@ -19,8 +19,8 @@ from fusiond.studies.faults.bounds import (
     jobs,
     trusted,
 )
-from fusiond.studies.faults.recording import Alter
 from fusiond.studies.faults.scenes import CODE, Scene, Vehicle, scene
+from fusiond.studies.faults.sensor_data import Alter
 from fusiond.studies.faults.service import FAULTS
 from fusiond.studies.faults.tables import TABLES
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.measurements import MonotonicStamp, PositionFix, WheelSpeed
+from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.faulty_hours import (
     APART_S,
     JUDGED_S,
@@ -30,8 +31,7 @@ from fusiond.studies.faults.hours import (
     stated_per_h,
 )
 from fusiond.studies.faults.library import TO_THE_END
-from fusiond.studies.faults.more import EVERY
-from fusiond.studies.faults.recording import Received, Recording
+from fusiond.studies.faults.sensor_data import Received, Recording
 from fusiond.studies.faults.tables import TABLES
 
 HOURS = range(40)

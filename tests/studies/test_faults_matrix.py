@@ -16,14 +16,12 @@ from drivers.measurements import PositionFix
 from fusiond.navigation.solution import Solution
 from fusiond.simulation.imu_truth import metres_to_geodetic
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.drawn import drawn
+from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.hours import hour_of, rates
-from fusiond.studies.faults.judge import LIE_S, NAVIGATING, Sample, longest_lie_s
 from fusiond.studies.faults.library import FAULTS, Fault
 from fusiond.studies.faults.measurement_faults import carried_off, step, velocity_bias
-from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
-from fusiond.studies.faults.recording import Drive, Recording
+from fusiond.studies.faults.random_drives import drawn
 from fusiond.studies.faults.runs import (
     VEHICLE,
     Row,
@@ -34,6 +32,8 @@ from fusiond.studies.faults.runs import (
     run_fault,
     run_row,
 )
+from fusiond.studies.faults.scoring import LIE_S, NAVIGATING, Sample, longest_lie_s
+from fusiond.studies.faults.sensor_data import Drive, Recording
 from fusiond.studies.faults.tables import TABLES, put_into
 
 NOT_COUNTED = pytest.mark.xfail(

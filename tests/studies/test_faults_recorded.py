@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.load import load_config
-from fusiond.offline.can_log import read_can_log
-from fusiond.studies.faults.more import EVERY
+from fusiond.offline.can_through_drivers import read_can_log
+from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.tables import TABLES
 from tests.places import DATA, REPOSITORY

@@ -9,14 +9,6 @@ import pytest
 
 from drivers.measurements import PositionFix
 from fusiond.studies.faults.measurement_faults import frozen
-from fusiond.studies.faults.published import (
-    STEP_S,
-    Published,
-    lasting_from,
-    longest_s,
-    published,
-)
-from fusiond.studies.faults.recording import Recording
 from fusiond.studies.faults.runs import ANTENNA_M
 from fusiond.studies.faults.scenes import (
     CODE,
@@ -28,6 +20,7 @@ from fusiond.studies.faults.scenes import (
     drawing,
     scene,
 )
+from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.service import (
     AFTER_OUTAGES,
     BEGINS_S,
@@ -42,6 +35,13 @@ from fusiond.studies.faults.service import (
     jobs,
     old,
     service_run,
+)
+from fusiond.studies.faults.solution_errors import (
+    STEP_S,
+    Published,
+    lasting_from,
+    longest_s,
+    published,
 )
 from fusiond.studies.faults.tables import TABLES
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.studies.faults.published import AXES, STEP_S, Published
-from fusiond.studies.faults.real import DRIVES, RealJob, real_run
-from fusiond.studies.faults.real import jobs as real_jobs
+from fusiond.studies.faults.recorded_fault_free import DRIVES, RealJob, real_run
+from fusiond.studies.faults.recorded_fault_free import jobs as real_jobs
 from fusiond.studies.faults.scenes import CODE, Vehicle, scene
-from fusiond.studies.faults.sharpness import (
+from fusiond.studies.faults.sigma_sharpness import (
     CELLS,
     DURATION_S,
     FIRST_S,
@@ -26,6 +25,7 @@ from fusiond.studies.faults.sharpness import (
     phases_of,
     sharpness_run,
 )
+from fusiond.studies.faults.solution_errors import AXES, STEP_S, Published
 from fusiond.studies.faults.tables import TABLES
 from tests.places import DATA
 

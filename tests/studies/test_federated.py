@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fusiond.studies.federated import papers as federated_papers
+from fusiond.studies.federated import linear_experiments as federated_papers
 from fusiond.studies.federated import study as federated
 
 

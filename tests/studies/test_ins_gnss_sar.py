@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from fusiond.gnss.best_four_satellites import gdop_squared
 from fusiond.gnss.ecef import ned_axes, to_ecef
-from fusiond.gnss.selection import gdop_squared
 from fusiond.studies import STUDIES, ins_gnss_sar
 from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.cost import costs

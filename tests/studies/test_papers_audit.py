@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from fusiond.estimators.federated.fusion import fuse_correlated, fuse_uncorrelated
 from fusiond.studies import STUDIES
-from fusiond.studies.federated import papers
+from fusiond.studies.federated import linear_experiments
 from fusiond.studies.reduced_order import flight
 from tests.places import REPOSITORY
 
@@ -50,7 +50,10 @@ def test_the_share_of_zeros_of_paper_002() -> None:
 
 
 def test_experiments_1_and_2_of_paper_004() -> None:
-    walk, constant = papers.random_truth(50, 0), papers.constant_truth(50, 0)
+    walk, constant = (
+        linear_experiments.random_truth(50, 0),
+        linear_experiments.constant_truth(50, 0),
+    )
     said = f"{walk['filtered_rms_m']:.2f} m of {walk['measured_rms_m']:.2f} m measured"
     assert said in PAGE, said
     said = ", ".join(f"{x:.2f}" for x in constant["rms_m"])

@@ -15,7 +15,7 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.models.catalogue import make_model
 from fusiond.navigator.intake import Intake

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.files.csv_tables import TableError
 from fusiond.files.parquet_rows import RowFile, read_rows, write_rows
-from fusiond.studies import drives
+from fusiond.studies import random_drives
 from fusiond.studies.monte_carlo import of_run, on_processes, runs_on
 from fusiond.studies.rdss import static
 from fusiond.studies.rdss.runs import simulate
@@ -55,7 +55,7 @@ def kept_runs(
 
 
 def test_a_row_a_drive_by_the_names_of_batch(tmp_path: Path) -> None:
-    path, work = tmp_path / "rows.parquet", partial(drives.drive_run, DURATION_S, 3)
+    path, work = tmp_path / "rows.parquet", partial(random_drives.drive_run, DURATION_S, 3)
     first, made = kept_runs(path, work, 2)
     assert made == 2
     assert kept_runs(path, work, 2) == (first, 0)
@@ -117,7 +117,7 @@ def test_runs_are_children_of_the_seeds_sequence() -> None:
 
 def test_the_command_goes_on_where_its_rows_end(tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
-    kept_runs(path, partial(drives.drive_run, drives.DURATION_S, 0), 2, "drives")
+    kept_runs(path, partial(random_drives.drive_run, random_drives.DURATION_S, 0), 2, "drives")
     call = ["study", "drives", "--workers", "1", "--out", str(path), "--runs"]
     done = CliRunner().invoke(app, [*call, "2"])
     assert "2 there" in done.stderr

@@ -19,14 +19,14 @@ from typer.testing import CliRunner, Result
 
 from fusiond.commands.app import app
 from fusiond.integrity.consistency import LAGS, ConsistencyOptions
-from fusiond.integrity.monitor import ConsistencyMonitor
+from fusiond.integrity.innovation_window import ConsistencyMonitor
 from fusiond.studies import ABOUT, STUDIES
 from fusiond.studies.monte_carlo import nees_interval
 from fusiond.studies.rdss import correlated as rdss_correlated
 from fusiond.studies.rdss import dynamic as rdss_dynamic
 from fusiond.studies.rdss import static as rdss_static
 from fusiond.studies.rdss.runs import RDSS_ALONE, monte_carlo, simulate
-from fusiond.studies.rdss.study import judged_windows, plot, tables
+from fusiond.studies.rdss.statistics import judged_windows, plot, tables
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
 KEYS = {

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
-from fusiond.estimators.federated.carried import CarriedFilter
+from fusiond.estimators.federated.continuing_base import CarriedFilter
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 

@@ -42,8 +42,8 @@ from fusiond.estimators.base import AS_STATED, Estimator, Outcome, gate_threshol
 from fusiond.estimators.federated.bank import combine
 from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection, Record
 from fusiond.estimators.federated.options import FederatedOptions, local_of
-from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import normalised_innovation_squared, update
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 

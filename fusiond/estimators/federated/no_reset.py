@@ -31,7 +31,7 @@ from fusiond.estimators.federated.bank import (
     inverse_of_factor,
     publish,
 )
-from fusiond.estimators.federated.carried import CarriedFilter
+from fusiond.estimators.federated.continuing_base import CarriedFilter
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.models.model import Model
 

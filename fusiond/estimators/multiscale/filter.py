@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import AS_STATED, Estimator, Outcome, gate_threshold
-from fusiond.estimators.memory import RECORDED, USED
 from fusiond.estimators.multiscale.block import (
     Block,
     Window,
@@ -41,8 +40,9 @@ from fusiond.estimators.multiscale.block import (
 )
 from fusiond.estimators.multiscale.wavelet import wavelet_matrix
 from fusiond.estimators.published_state import sigmas
-from fusiond.estimators.screening import KEPT
+from fusiond.estimators.state_array import RECORDED, USED
 from fusiond.estimators.update import fuse, update, work
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 

@@ -1,5 +1,6 @@
 """Kalman filter that records nodes for the smoother. It propagates each sample alone
-(fusiond.estimators.block_covariance): its sigmas equal the other filter's within 1e-4 of them.
+(fusiond.estimators.multi_sample_covariance): its sigmas equal the other filter's within 1e-4 of
+them.
 
 Nodes hang on each other, the newest in front. A snapshot holds the newest of its instant, so a
 rewind takes the tape back with the state, and what was written since is forgotten with it: the tape
@@ -16,13 +17,13 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, Renewal
 from fusiond.estimators.base import Outcome, Snapshot
+from fusiond.estimators.error_decorrelation import renew
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
-from fusiond.estimators.renewal import renew
-from fusiond.estimators.screening import KEPT, Screened
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
-from fusiond.estimators.tilt_axes import TiltAxesFilter
-from fusiond.estimators.tilt_axes_carried import turn_rows
+from fusiond.estimators.tilt_axes_update import turn_rows
+from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
+from fusiond.estimators.update_with_exclusion import KEPT, Screened
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer

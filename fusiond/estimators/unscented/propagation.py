@@ -7,7 +7,7 @@ state that the computed one may stand for: it has its own sensor errors taken ou
 runs through `strapdown_step` beside the computed state. P' is what velocity, position and
 parameters have of their own. In them one interval is linear: the largest second-order terms, g (dr
 / R)^2 and dv^2 / R, are 2e-5 m/s^2 for 10 km and 2e-5 m/s^2 for 10 m/s. So P' takes the transition
-F of fusiond.estimators.covariance, with the noise Q:
+F of fusiond.estimators.covariance_propagation, with the noise Q:
 
     P <- sum o_k o_k^T + sum e_k e_k^T + F P' F^T + Q        mean <- f(dx) + sum e_k / s
 
@@ -30,14 +30,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.block_covariance import shake, widen_for_gap
 from fusiond.estimators.corrected_imu import compensate, sensor_estimates, slopes
-from fusiond.estimators.covariance import (
+from fusiond.estimators.covariance_propagation import (
     covariance_for,
     kept_part,
     mirror,
     propagate_parameters,
 )
+from fusiond.estimators.multi_sample_covariance import shake, widen_for_gap
 from fusiond.estimators.published_state import in_fix_time, sigmas
 from fusiond.estimators.unscented.sigma_points import NO_PIVOT
 from fusiond.estimators.update import feed_back

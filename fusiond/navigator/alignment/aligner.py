@@ -15,10 +15,9 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import Window
-from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.course import from_course
 from fusiond.navigator.alignment.evidence import AlignmentEvidence
-from fusiond.navigator.alignment.headings import (
+from fusiond.navigator.alignment.heading_at_rest import (
     from_compass,
     from_config,
     from_dual_antenna,
@@ -26,12 +25,13 @@ from fusiond.navigator.alignment.headings import (
     from_positions,
     from_saved,
 )
+from fusiond.navigator.alignment.heading_from_positions import Track
+from fusiond.navigator.alignment.heading_source_data import Basis
 from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.missing import Journal, why_not
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.positions import Track
 from fusiond.navigator.alignment.start import Place, Start
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.saved_state import SavedState
 
 HeadingSource = Callable[[Basis, ImuBuffer, Place], Start | None]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.candidates import VelocityCandidate
+from fusiond.aiding.initialisation import VelocityCandidate
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.alignment import level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
@@ -34,8 +34,8 @@ from fusiond.navigation.rotation import (
     wrap_angle,
 )
 from fusiond.navigator.alignment import motion_fit, sensed_motion
-from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.evidence import TOGETHER_NS, Fix, Standstill
+from fusiond.navigator.alignment.heading_source_data import Basis
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.rest import rest_bias
 from fusiond.navigator.alignment.start import (
@@ -50,7 +50,7 @@ from fusiond.navigator.alignment.start import (
     build_start,
     velocity_of,
 )
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.sensor_ladder import evidence_against, worse_classes
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import (
+from fusiond.aiding.initialisation import (
     HeadingCandidate,
     HeightCandidate,
     PositionCandidate,
@@ -33,7 +33,7 @@ from fusiond.navigator.alignment.start import (
     as_geodetic,
     velocity_of,
 )
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
 from fusiond.navigator.unit_grade import AS_ITS_CLASS, Values, graded_at_rest
@@ -146,7 +146,7 @@ class AlignmentEvidence:
         """By source the last fix at which positions had moved otherwise than the velocities of
         their receiver, and not by chance: which of those before it were wrong nobody knows."""
         self._contradictions: Counter[str] = Counter()
-        """How many such fixes, by source."""
+        """Number of such fixes by source."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -425,19 +425,19 @@ class AlignmentEvidence:
         return Place(p, where, math.hypot(max(p.sd[:2]), self._contradicts(p)), sd_height)
 
     def _contradicts(self, p: PositionCandidate) -> float:
-        """How far (m) a position is from another source's of that time, beyond what both may be
-        off: which of them is, nobody knows."""
+        """Distance (m) of a position from another source's of that time, if it exceeds the sigmas
+        of both; which of them is wrong is unknown."""
         largest = 0.0
         for source, other in self._by_source.items():
-            apart_s = abs(other.t_ns - p.t_ns) * 1e-9
+            interval_s = abs(other.t_ns - p.t_ns) * 1e-9
             suspect = other.t_ns - self.contradicted_ns.get(source, -ANY_TIME_NS) < FIXES_NS
-            if other is p or suspect or apart_s > TOGETHER_NS * 1e-9:
+            if other is p or suspect or interval_s > TOGETHER_NS * 1e-9:
                 continue
             moved = np.array([other.lat_rad - p.lat_rad, other.lon_rad - p.lon_rad])
             moved[1] = math.remainder(float(moved[1]), 2.0 * math.pi)
             away = math.hypot(*(moved / as_geodetic(np.ones(3), p.lat_rad)[:2]).tolist())
             sd = math.hypot(max(p.sd[:2]), max(other.sd[:2]))
-            if away - self._speed * apart_s > CONTRADICTION_SIGMAS * sd:
+            if away - self._speed * interval_s > CONTRADICTION_SIGMAS * sd:
                 largest = max(largest, away)
         return largest
 

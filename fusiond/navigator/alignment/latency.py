@@ -45,7 +45,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.candidates import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
 from fusiond.estimators.base import gate_threshold
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
@@ -62,7 +62,7 @@ from fusiond.navigator.alignment.position_jumps import (
     velocities_alone,
 )
 from fusiond.navigator.alignment.sensed_motion import MOST_FIXES
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 
 MOST_DELAY_S = 3.0
 """The longest that is searched."""

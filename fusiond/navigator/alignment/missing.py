@@ -14,9 +14,9 @@ from collections.abc import Callable
 from fusiond.navigation.alignment import gyrocompass_sd
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.alignment.basis import Basis
-from fusiond.navigator.alignment.headings import HEADING_AGE_NS, ON_THE_WAY
-from fusiond.navigator.reasons import joined, reason
+from fusiond.navigator.alignment.heading_at_rest import HEADING_AGE_NS, ON_THE_WAY
+from fusiond.navigator.alignment.heading_source_data import Basis
+from fusiond.navigator.mode_reasons import joined, reason
 
 # What a traffic light or a short rest changes back is not worth a line.
 SETTLED_NS = 5_000_000_000

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.candidates import (
+from fusiond.aiding.initialisation import (
     Candidate,
     HeadingCandidate,
     PositionCandidate,

@@ -15,14 +15,14 @@ from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_elements, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
-from fusiond.navigator.alignment.headings import CLAIMS
+from fusiond.navigator.alignment.heading_at_rest import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.reasons import reason
+from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.state_file import RefusedStateError
 
 if TYPE_CHECKING:
-    from fusiond.navigator.warm_start import WarmStart
+    from fusiond.navigator.restart_from_memory import WarmStart
 
 # Sigmas of heading and course beyond which a claimed heading is contradicted, and for how long: an
 # obstacle that the vehicle slides at takes less.

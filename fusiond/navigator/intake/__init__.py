@@ -20,21 +20,21 @@ from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility
 from fusiond.models.blocks import Block
 from fusiond.navigator.intake import (
     attitude,
-    bearing,
     compass,
     gnss,
     heading,
     height,
+    landmark_bearing,
     raw,
     rdss,
     wheel,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
-from fusiond.navigator.intake.pace import Pace
 from fusiond.navigator.intake.plausible import refusal
+from fusiond.navigator.intake.rate_check import Pace
 
 if TYPE_CHECKING:
-    from fusiond.navigator.drift_levels import DriftLevels
+    from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 
 KINDS: tuple[Kind, ...] = (
     gnss.KIND,
@@ -45,7 +45,7 @@ KINDS: tuple[Kind, ...] = (
     compass.KIND,
     attitude.KIND,
     height.KIND,
-    bearing.KIND,
+    landmark_bearing.KIND,
 )
 
 

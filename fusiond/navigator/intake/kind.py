@@ -12,8 +12,8 @@ from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 
 if TYPE_CHECKING:
-    from fusiond.navigator.drift_levels import DriftLevels
     from fusiond.navigator.raw_gnss import RawGnss
+    from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 
 S = TypeVar("S", bound=Aiding)
 

@@ -30,7 +30,7 @@ troposphere lasts for hours, but orbit errors last, too, and are noise to the fi
 of epochs it would solve for a zenith delay of 0.12 m, which differs from height and clock by the
 lowest satellites alone, and find what 0.6 m of orbits make of it, many of its sigmas, and metres of
 height. An epoch alone says little of them beyond their sigma. What lasts is in the displacement
-(fusiond.gnss.displacement)."""
+(fusiond.gnss.range_error_displacement)."""
 
 
 CLOCK_RAMP = "clock_ramp"

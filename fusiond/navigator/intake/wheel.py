@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.measurements import WheelSpeed
-from drivers.rounding import SHARED_SD
+from drivers.quantization import SHARED_SD
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.configuration.aiding import WheelAiding

@@ -23,7 +23,7 @@ from functools import cached_property
 from drivers.base import DriverStatus
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.outputs import Foxglove
-from fusiond.files.extras import install
+from fusiond.files.install_extra import install
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.foxglove.channels import CHANNELS, Channel
 from fusiond.outputs.messages.base import Message

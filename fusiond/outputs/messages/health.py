@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from drivers.base import State
 from fusiond.clock.results import ClockStatus
 from fusiond.integrity.consistency import Verdict
-from fusiond.integrity.service import Service
+from fusiond.integrity.series_states import Service
 from fusiond.outputs.messages.base import Count, Message, Number, stamp
 from fusiond.outputs.messages.fault import FaultReport
 

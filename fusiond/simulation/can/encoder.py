@@ -14,7 +14,7 @@ from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 
 from drivers.can.decoder import CanDecoder
-from drivers.can.python_can import can
+from drivers.can.python_can_import import can
 
 
 class CanEncoder:

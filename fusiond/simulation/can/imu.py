@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.can.python_can import can
+from drivers.can.python_can_import import can
 from fusiond.simulation.can.encoder import CanEncoder
 
 SIM_IMU = CanImuOptions(

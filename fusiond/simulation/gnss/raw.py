@@ -23,8 +23,8 @@ group delay; all lengths m. What is drawn, one sigma in `GnssRawOptions`:
     n    white; its sigma is that at 45 dB Hz times 10^((45 - C/N0) / 20)
     C/N0 36 + 12 sin E dB Hz, and noise
 
-True orbits are those of `fusiond.gnss.constellation`; what is broadcast is the same, quantised.
-Everything random is drawn at construction, so the start (GPS time) may be set later.
+True orbits are those of `fusiond.gnss.nominal_constellation`; what is broadcast is the same,
+quantised. Everything random is drawn at construction, so the start (GPS time) may be set later.
 
 Source: Groves, 2nd ed., sections 8.5.3 and 9.1.2.3; multipath by elevation: RTCA DO-229D J.2.4.
 """
@@ -53,9 +53,9 @@ from fusiond.gnss.atmosphere import (
     mapping_coefficients,
     zenith_delays,
 )
-from fusiond.gnss.constellation import EPOCH_S, constellation, ephemeris, slots
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.group_delay import group_delay
+from fusiond.gnss.nominal_constellation import EPOCH_S, constellation, ephemeris, slots
 from fusiond.gnss.orbit import CONSTANTS, WEEK_S, Orbits
 from fusiond.navigation.gps_time import GPS_EPOCH_POSIX_S
 from fusiond.simulation.gnss.masks import Mask, View

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from typing import Literal
 
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch, RawSignal
-from fusiond.gnss.constellation import system_time
+from fusiond.gnss.nominal_constellation import system_time
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.simulation.gnss import rtcm3_encode, ubx_encode
 from fusiond.simulation.gnss.nav_subframes import (

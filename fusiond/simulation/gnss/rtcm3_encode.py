@@ -22,7 +22,7 @@ from drivers.raw.messages import (
     RawSignal,
     System,
 )
-from fusiond.gnss.constellation import system_time
+from fusiond.gnss.nominal_constellation import system_time
 from fusiond.simulation.gnss.nav_fields import FIELDS, Bits, wire
 
 PREAMBLE = 0xD3

@@ -48,7 +48,7 @@ from drivers.rdss.messages import (
     Unknown,
     VersionRequest,
 )
-from drivers.rdss.wording import Wording, level_bits
+from drivers.rdss.text_coding import Wording, level_bits
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions

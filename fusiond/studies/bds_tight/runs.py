@@ -43,8 +43,8 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
-from fusiond.gnss.constellation import slots
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
+from fusiond.gnss.nominal_constellation import slots
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.ranges import RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point

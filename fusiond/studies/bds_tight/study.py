@@ -13,7 +13,8 @@ and the epochs from `COUNTED_S` on, those under `stretch` over the epochs with f
                  stretch, so many seconds after that
 
 `orbit_errors` repeats some rows with smaller orbit and clock errors: they make NEES.
-`paper_case` is the paper's own set-up, state vector and all (`fusiond.studies.bds_tight.paper`).
+`paper_case` is the paper's own set-up, state vector and all
+(`fusiond.studies.bds_tight.paper_setup`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.studies.bds_tight import paper
+from fusiond.studies.bds_tight import paper_setup
 from fusiond.studies.bds_tight.runs import (
     CASES,
     COMPARED,
@@ -78,7 +79,7 @@ def run_study(
         raise ValueError("runs must be at least 2")
     step = step_counter(progress, 2 * count)
     results = monte_carlo(count, seed, step)
-    own = paper.found(count, seed, step)
+    own = paper_setup.found(count, seed, step)
     cases = {case: _case(case, [r[0][case] for r in results]) for case in CASES}
     growth = {row: cases["canyon3"][row]["growth_m"] for row in ("tight_ekf", "coasting")}
     three = {
@@ -283,10 +284,10 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             orbits.append([f"{entry['orbit_error_m']:.1f}", case, *figures])
     own = result["paper_case"]
     mine = [
-        [row.replace("_", " "), *(_text(figures[key]) for key in paper.COLUMNS.values())]
+        [row.replace("_", " "), *(_text(figures[key]) for key in paper_setup.COLUMNS.values())]
         for row, figures in own["rows"].items()
     ]
-    mine.append(["gain", *(_text(own["gains"].get(key)) for key in paper.COLUMNS.values())])
+    mine.append(["gain", *(_text(own["gains"].get(key)) for key in paper_setup.COLUMNS.values())])
     grown = [f"grown {s:.0f} s" for s in GROWTH_S]
     by_row = [f"{row.replace('_', ' ')} {what}" for row in COMPARED for what in ("m", "NEES")]
     return [
@@ -307,7 +308,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
         (
             f"The paper's set-up, {own['model']}, {own['west_m']:.0f} m west and "
             f"{own['up_m']:.0f} m up",
-            ["", *paper.COLUMNS],
+            ["", *paper_setup.COLUMNS],
             mine,
         ),
     ]
@@ -352,7 +353,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(11.0, 2.8 * (len(series) + 3)), layout="constrained")
     low, high = result["nees_interval"]
     panels = figure.subplots(len(series) + 3, 2)
-    paper.draw(panels[len(series) :], result["paper_case"]["series"])
+    paper_setup.draw(panels[len(series) :], result["paper_case"]["series"])
     for axes, (case, s) in zip(panels, series.items(), strict=False):
         for ax, key in zip(axes, ("horizontal_rms_m", "nees_mean"), strict=True):
             for row, values in s[key].items():

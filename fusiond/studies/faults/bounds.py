@@ -34,14 +34,14 @@ from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Outcome
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
-from fusiond.studies.faults.judge import LIE_S, MOST_SIGMA
 from fusiond.studies.faults.library import FAULTS as MATRIX
 from fusiond.studies.faults.library import PHASES, PhaseName
-from fusiond.studies.faults.published import JUDGED, STEP_S, Published, against, longest_s
-from fusiond.studies.faults.recording import Recording
 from fusiond.studies.faults.runs import TICKS_PER_S, VEHICLE, placed
 from fusiond.studies.faults.scenes import Share, Vehicle, drawing, scene
+from fusiond.studies.faults.scoring import LIE_S, MOST_SIGMA
+from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.service import BEGINS_S, DURATION_S, FAULTS, LASTS_S, RECEIVERS
+from fusiond.studies.faults.solution_errors import JUDGED, STEP_S, Published, against, longest_s
 from fusiond.studies.undiagnosed_timeline import Trusting
 
 Array = NDArray[np.float64]

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.hours import (
     HOUR_S,
     KINDS,
@@ -33,7 +34,11 @@ from fusiond.studies.faults.hours import (
     stated_per_h,
     tests_of,
 )
-from fusiond.studies.faults.judge import (
+from fusiond.studies.faults.library import TO_THE_END
+from fusiond.studies.faults.measurement_faults import sparing
+from fusiond.studies.faults.power import largest
+from fusiond.studies.faults.runs import navigate
+from fusiond.studies.faults.scoring import (
     LIE_S,
     NAVIGATING,
     Course,
@@ -42,12 +47,7 @@ from fusiond.studies.faults.judge import (
     judge,
     longest_lie_s,
 )
-from fusiond.studies.faults.library import TO_THE_END
-from fusiond.studies.faults.measurement_faults import sparing
-from fusiond.studies.faults.more import EVERY
-from fusiond.studies.faults.power import largest
-from fusiond.studies.faults.recording import GNSS, SECOND, Recording, town
-from fusiond.studies.faults.runs import navigate
+from fusiond.studies.faults.sensor_data import GNSS, SECOND, Recording, town
 
 APART_S = (180.0, 480.0)
 """Least and largest interval between the starts of two faults, and before the first."""

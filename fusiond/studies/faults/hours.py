@@ -40,9 +40,10 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.judge import MOST_SIGMA, NAVIGATING, QUANTITIES, longest_lie_s
 from fusiond.studies.faults.library import with_second, with_wheels
-from fusiond.studies.faults.recording import (
+from fusiond.studies.faults.runs import VEHICLE, navigate
+from fusiond.studies.faults.scoring import MOST_SIGMA, NAVIGATING, QUANTITIES, longest_lie_s
+from fusiond.studies.faults.sensor_data import (
     REST_S,
     TOWN_LEGS,
     WHEEL_EVERY_S,
@@ -50,7 +51,6 @@ from fusiond.studies.faults.recording import (
     Received,
     Recording,
 )
-from fusiond.studies.faults.runs import VEHICLE, navigate
 
 FALSE = 1.0 / (1.0 + math.exp(DECIDED))
 """Probability that an identified fault is false."""

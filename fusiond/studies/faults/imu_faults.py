@@ -9,7 +9,7 @@ import numpy as np
 
 from fusiond.configuration.si_units import DEG
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.studies.faults.recording import Recording
+from fusiond.studies.faults.sensor_data import Recording
 
 RATE_RANGE_RAD_S = 2000.0 * DEG
 FORCE_RANGE_M_S2 = 10.0 * STANDARD_GRAVITY_M_S2

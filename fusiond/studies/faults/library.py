@@ -17,7 +17,7 @@ from fusiond.configuration.schema import Config, SpareImu
 from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
-from fusiond.studies.faults.recording import (
+from fusiond.studies.faults.sensor_data import (
     BEND_S,
     DURATION_S,
     GNSS,

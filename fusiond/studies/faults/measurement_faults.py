@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.simulation.imu_truth import metres_to_geodetic
-from fusiond.studies.faults.recording import Alter, Received, Recording
+from fusiond.studies.faults.sensor_data import Alter, Received, Recording
 
 STEP_M = 500.0
 DRIFT_M_S = 0.5

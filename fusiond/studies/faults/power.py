@@ -19,10 +19,10 @@ from typing import Any
 from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
-from fusiond.studies.faults.judge import LIE_S
 from fusiond.studies.faults.library import PHASES, Fault
-from fusiond.studies.faults.recording import Alter, Drive
 from fusiond.studies.faults.runs import run_fault
+from fusiond.studies.faults.scoring import LIE_S
+from fusiond.studies.faults.sensor_data import Alter, Drive
 
 LASTS_S = 60.0
 BEGINS = 10

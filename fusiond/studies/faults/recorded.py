@@ -32,17 +32,17 @@ from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import sensor_to_body
-from fusiond.files.tables import TrajectoryTable, read_imu, read_solution
+from fusiond.files.measurement_csv import TrajectoryTable, read_imu, read_solution
 from fusiond.navigation.solution import Solution
-from fusiond.offline.can_log import read_can_log
+from fusiond.offline.can_through_drivers import read_can_log
 from fusiond.offline.measurement_files import READERS, Arrival, source_of
 from fusiond.offline.process import process
 from fusiond.simulation.imu_truth import States
-from fusiond.studies.faults.judge import QUANTITIES, Course, Sample, judge
+from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.library import Fault, PhaseName
-from fusiond.studies.faults.more import EVERY
-from fusiond.studies.faults.recording import Received, Recording, town
 from fusiond.studies.faults.runs import VEHICLE, compared, driven
+from fusiond.studies.faults.scoring import QUANTITIES, Course, Sample, judge
+from fusiond.studies.faults.sensor_data import Received, Recording, town
 
 Array = NDArray[np.float64]
 

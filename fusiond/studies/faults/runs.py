@@ -21,8 +21,6 @@ from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
-from fusiond.studies.faults.drawn import drawn
-from fusiond.studies.faults.judge import Course, Event, Sample, axis_ratio, judge
 from fusiond.studies.faults.library import (
     FAULTS,
     PHASES,
@@ -32,7 +30,9 @@ from fusiond.studies.faults.library import (
     with_spare,
     with_wheels,
 )
-from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, town
+from fusiond.studies.faults.random_drives import drawn
+from fusiond.studies.faults.scoring import Course, Event, Sample, axis_ratio, judge
+from fusiond.studies.faults.sensor_data import DURATION_S, Drive, Recording, town
 
 Array = NDArray[np.float64]
 

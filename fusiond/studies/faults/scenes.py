@@ -36,9 +36,9 @@ from fusiond.configuration.sensor_class import CLASSES, SensorClass
 from fusiond.simulation.gnss.receiver import GnssOptions, GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.studies.faults.drawn import drawn_by
-from fusiond.studies.faults.recording import Received, Recording, gnss_fixes
+from fusiond.studies.faults.random_drives import drawn_by
 from fusiond.studies.faults.runs import ANTENNA_M, VEHICLE
+from fusiond.studies.faults.sensor_data import Received, Recording, gnss_fixes
 
 Share = Literal["looked", "scored"]
 SHARES: tuple[Share, ...] = ("looked", "scored")

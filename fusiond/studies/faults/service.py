@@ -28,18 +28,6 @@ from drivers.measurements import PositionFix
 from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
-from fusiond.studies.faults.judge import LIE_S
-from fusiond.studies.faults.published import (
-    AXES,
-    JUDGED,
-    STEP_S,
-    Bools,
-    Published,
-    lasting_from,
-    longest_s,
-    published,
-)
-from fusiond.studies.faults.recording import Alter, Received, Recording
 from fusiond.studies.faults.scenes import (
     CODE,
     RTK,
@@ -50,6 +38,18 @@ from fusiond.studies.faults.scenes import (
     Vehicle,
     drawing,
     scene,
+)
+from fusiond.studies.faults.scoring import LIE_S
+from fusiond.studies.faults.sensor_data import Alter, Received, Recording
+from fusiond.studies.faults.solution_errors import (
+    AXES,
+    JUDGED,
+    STEP_S,
+    Bools,
+    Published,
+    lasting_from,
+    longest_s,
+    published,
 )
 
 BEGINS_S = (150.0, 270.0)

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from fusiond.studies.faults.markdown import number, table
-from fusiond.studies.faults.published import AXES
-from fusiond.studies.faults.real import PHASE as COMPARED
-from fusiond.studies.faults.sharpness import PHASES, figures, outside
+from fusiond.studies.faults.recorded_fault_free import PHASE as COMPARED
+from fusiond.studies.faults.sigma_sharpness import PHASES, figures, outside
+from fusiond.studies.faults.solution_errors import AXES
 
 Row = dict[str, Any]
 Rows = list[Row]

@@ -1,8 +1,8 @@
 r"""Study `federated`: the four experiments of paper 004, and faults in one of three local filters.
 
-Experiments: `fusiond.studies.federated.papers` (1 to 3), `fusiond.studies.federated.platform` (4,
-with an inertial unit), `fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has
-them).
+Experiments: `fusiond.studies.federated.linear_experiments` (1 to 3),
+`fusiond.studies.federated.platform` (4, with an inertial unit),
+`fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has them).
 Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its
 start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
 is the median over the runs; a run in which it is not detected counts as later than any.
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.studies.federated import papers, platform, without_imu
+from fusiond.studies.federated import linear_experiments, platform, without_imu
 from fusiond.studies.federated.runs import (
     DRIFT_M_S,
     DURATION_S,
@@ -86,9 +86,9 @@ def run_study(
         "seed": seed,
         "paper": PAPER,
         "experiments": {
-            "1_random_truth": papers.random_truth(count, seed),
-            "2_constant_truth": papers.constant_truth(count, seed),
-            "3_two_sensors": papers.two_sensors(count, seed),
+            "1_random_truth": linear_experiments.random_truth(count, seed),
+            "2_constant_truth": linear_experiments.constant_truth(count, seed),
+            "3_two_sensors": linear_experiments.two_sensors(count, seed),
             "4_active_and_passive": platform.platform(
                 on_processes(partial(platform.simulate, seed), count, step)
             ),

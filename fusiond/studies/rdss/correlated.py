@@ -13,7 +13,7 @@ from typing import Any
 from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.dynamic import level_drive
 from fusiond.studies.rdss.runs import Case, Filter
-from fusiond.studies.rdss.study import plot, run_cases, tables
+from fusiond.studies.rdss.statistics import plot, run_cases, tables
 
 __all__ = ["CASES", "plot", "run_study", "tables"]
 

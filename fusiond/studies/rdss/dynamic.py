@@ -17,7 +17,7 @@ from typing import Any
 from fusiond.simulation.trajectories import Path, Profile, drive
 from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.runs import Case
-from fusiond.studies.rdss.study import add_times, plot, run_cases, tables
+from fusiond.studies.rdss.statistics import add_times, plot, run_cases, tables
 
 __all__ = ["CASES", "level_drive", "plot", "run_study", "tables"]
 DEFAULT_RUNS = 100

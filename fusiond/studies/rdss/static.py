@@ -11,7 +11,7 @@ from typing import Any
 from fusiond.simulation.trajectories import static
 from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.runs import Case
-from fusiond.studies.rdss.study import add_times, plot, run_cases, tables
+from fusiond.studies.rdss.statistics import add_times, plot, run_cases, tables
 
 __all__ = ["CASE", "plot", "run_study", "tables"]
 

@@ -3,8 +3,8 @@ r"""Cost of a step in studies `reduced-order` and `ins-gnss-sar`, as CPU time.
 `step`: the filter's own recursion, as paper 002 times it: the covariance propagated once, then the
 epoch's ranges, rates (of four satellites or of all in view) and two angles gated, folded in and fed
 back. These are the live filter's kernels, called from compiled code: no INS, no geometry, no
-Python, and no judgement of single ranges (`fusiond.estimators.screening`), which the paper's filter
-does not have.
+Python, and no judgement of single ranges (`fusiond.estimators.update_with_exclusion`), which the
+paper's filter does not have.
 
 `live second`: a second of the running filter (`KalmanEstimator`): 100 IMU samples through the
 strapdown equations and the covariance, rows computed from satellites and radar point, every range
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import State
-from fusiond.estimators.covariance import covariance_for, mirror, work_size
+from fusiond.estimators.covariance_propagation import covariance_for, mirror, work_size
 from fusiond.estimators.update import fuse
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
-from fusiond.aiding.bearing import BearingMeasurement
+from fusiond.aiding.landmark_bearing import BearingMeasurement
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator
-from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
+from fusiond.gnss.best_four_satellites import best_four
+from fusiond.gnss.nominal_constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S
-from fusiond.gnss.selection import best_four
 from fusiond.models.blocks import SAR_MISALIGNMENT, misalignment
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -121,8 +121,8 @@ def model(
 def filters(sar_sd: float = SAR_SD_RAD, sar_tau_s: float = math.inf) -> dict[str, Model]:
     """The filters compared; the first describes the truth.
 
-    `17` has the accelerometer biases as white noise (`fusiond.models.missing_states`), `17_bare`
-    takes no notice of them.
+    `17` has the accelerometer biases as white noise (`fusiond.models.unmodelled_bias_noise`),
+    `17_bare` takes no notice of them.
     """
     return {
         "23": model("ins23", sar_sd, sar_tau_s),

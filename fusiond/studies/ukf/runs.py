@@ -34,10 +34,10 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.screening import KEPT
 from fusiond.estimators.unscented.filter import UnscentedEstimator
-from fusiond.gnss.constellation import Constellation, constellation
+from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.gnss.ecef import ned_axes, to_ecef
+from fusiond.gnss.nominal_constellation import Constellation, constellation
 from fusiond.models.blocks import ClockNoise, clock_blocks
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

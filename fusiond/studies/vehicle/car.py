@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from drivers.measurements import Height, MonotonicStamp, PositionFix, WheelSpeed
-from drivers.rounding import SHARED_SD, rounded_speed
+from drivers.quantization import SHARED_SD, rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicConstraint

@@ -14,7 +14,7 @@ from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.navigation.crosstalk import Crosstalk
+from fusiond.navigation.crosstalk_noise import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.motion_constraints import vehicle_blocks

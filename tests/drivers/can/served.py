@@ -10,8 +10,8 @@ from typing import Any
 import can
 
 from drivers.base import Emitted
+from drivers.can.base_driver import CanDriver, Codec
 from drivers.can.bus import CanFrame
-from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import DeviceEvent, Measurement
 from tests.patience import until
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.can.aids import CanAttitudeDriver, CanBearingDriver
-from drivers.can.driver import CanDriver
+from drivers.can.attitude_bearing import CanAttitudeDriver, CanBearingDriver
+from drivers.can.base_driver import CanDriver
 from drivers.can.gnss import CanGnssDriver
 from drivers.can.height import CanHeightDriver
 from drivers.can.imu import CanImuDriver

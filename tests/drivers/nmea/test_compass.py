@@ -12,7 +12,7 @@ import pytest
 from drivers.measurements import ArrivalStamp, Heading, MagneticHeading
 from drivers.nmea import compass
 from drivers.nmea.compass import CompassDecoder, CompassDecoding, CompassDriver, CompassOptions
-from drivers.rounding import NEAREST_SD
+from drivers.quantization import NEAREST_SD
 from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import made, wire
 from tests.patience import until

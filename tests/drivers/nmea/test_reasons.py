@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.protocols import named
+from drivers.nmea.foreign_protocols import named
 from drivers.nmea.reasons import MANY, MOST_NAMES, implausible_date
 from tests.drivers.nmea.sentences import (
     GGA,

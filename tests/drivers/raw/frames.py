@@ -7,7 +7,7 @@ import random
 import struct
 from typing import Any
 
-from drivers.nmea.running_checks import crc24q
+from drivers.nmea.incremental_checksum import crc24q
 from drivers.raw.lnav import parity
 from drivers.raw.messages import Ephemeris
 

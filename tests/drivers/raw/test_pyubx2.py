@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pyubx2 import UBXReader
 
-from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.raw import ubx
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch, RawSignal

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.measurements import PositionFix, TimeReport, UtcStamp
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDecoder
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch

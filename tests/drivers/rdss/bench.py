@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.cycle import SECOND, Action, FixReady, Notice, Send, SetBaud, TerminalOptions
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -24,7 +23,16 @@ from drivers.rdss.messages import (
     SelfTestRequest,
     TextRequest,
 )
-from drivers.rdss.terminal import Terminal
+from drivers.rdss.request_state_machine import Terminal
+from drivers.rdss.state_tables import (
+    SECOND,
+    Action,
+    FixReady,
+    Notice,
+    Send,
+    SetBaud,
+    TerminalOptions,
+)
 
 USER = 242286
 FIX = Fix(USER, 31776.0, 23.0, 113.0, 14.0, fraction=50)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from drivers.rdss.cycle import Action, MailReady, TerminalOptions
 from drivers.rdss.envelope import (
     RECEIPT,
     TEXT,
@@ -31,7 +30,8 @@ from drivers.rdss.messages import (
 )
 from drivers.rdss.outbox import Change
 from drivers.rdss.report import PositionReport
-from drivers.rdss.wording import Wording
+from drivers.rdss.state_tables import Action, MailReady, TerminalOptions
+from drivers.rdss.text_coding import Wording
 from tests.drivers.rdss.bench import USER, Bench
 
 OTHER = 242407

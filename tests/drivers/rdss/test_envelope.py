@@ -37,7 +37,7 @@ from drivers.rdss.report import (
     encode_report,
     encode_short,
 )
-from drivers.rdss.wording import Wording, level_bits, mixed
+from drivers.rdss.text_coding import Wording, level_bits, mixed
 from fusiond.navigation.solution import Mode
 
 sigmas = st.one_of(st.none(), st.floats(0.0, 1e6))

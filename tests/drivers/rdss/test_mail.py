@@ -24,7 +24,7 @@ from drivers.rdss.messages import (
 )
 from drivers.rdss.outbox import MOST_ATTEMPTS
 from drivers.rdss.report import decode_report
-from drivers.rdss.wording import Wording
+from drivers.rdss.text_coding import Wording
 from tests.drivers.rdss.bench import FIX, USER
 from tests.drivers.rdss.mail_bench import (
     HERE,

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.rdss.cycle import SECOND, State
 from drivers.rdss.envelope import (
     sealed,
 )
@@ -22,7 +21,8 @@ from drivers.rdss.messages import (
 )
 from drivers.rdss.outbox import MOST_ATTEMPTS, MOST_WAITING, Turns
 from drivers.rdss.report import REPORT, encode_report
-from drivers.rdss.wording import mixed
+from drivers.rdss.state_tables import SECOND, State
+from drivers.rdss.text_coding import mixed
 from tests.drivers.rdss.bench import FIX, OK, USER
 from tests.drivers.rdss.mail_bench import (
     HERE,

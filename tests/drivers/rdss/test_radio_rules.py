@@ -8,7 +8,6 @@ from contextlib import suppress
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.rdss.cycle import State
 from drivers.rdss.mail import MessageRefusedError
 from drivers.rdss.messages import (
     BeamPower,
@@ -22,6 +21,7 @@ from drivers.rdss.messages import (
     SelfTest,
     TextRequest,
 )
+from drivers.rdss.state_tables import State
 from tests.drivers.rdss.bench import FIX, OK, USER, Bench
 
 

@@ -6,7 +6,6 @@ import itertools
 
 import pytest
 
-from drivers.rdss.cycle import State
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -15,6 +14,7 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
 )
+from drivers.rdss.state_tables import State
 from tests.drivers.rdss.bench import FIX, USER, Bench, good, refuse, say
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Heading, Measurement, PositionFix, TimeReport, UtcStamp
 from drivers.sbf.decoder import SbfDecoder
 from drivers.sbf.framing import BlockSplitter

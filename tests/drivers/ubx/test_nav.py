@@ -13,7 +13,7 @@ import pyubx2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.decoding import SolutionDecoding
+from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,

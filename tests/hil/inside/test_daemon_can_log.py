@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from drivers.measurements import PositionFix
 from fusiond.configuration.load import load_config
-from fusiond.offline.can_frames import messages
-from fusiond.offline.can_log import CanLog, read_can_log
+from fusiond.offline.can_log_reader import messages
+from fusiond.offline.can_through_drivers import CanLog, read_can_log
 from fusiond.offline.process import process
 from fusiond.studies.navigation_error import metres
 from tests.broker import Broker

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.load import load_config
-from fusiond.files.tables import read_solution
+from fusiond.files.measurement_csv import read_solution
 from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import KNOT_M_S, latitude, longitude, sentence

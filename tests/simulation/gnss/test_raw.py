@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, Klobuchar
-from fusiond.gnss.constellation import constellation, slots
 from fusiond.gnss.ecef import ned_axes, to_ecef
+from fusiond.gnss.nominal_constellation import constellation, slots
 from fusiond.gnss.ranges import RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore

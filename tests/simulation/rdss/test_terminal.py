@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.cycle import FixReady, Send, TerminalOptions
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -33,7 +32,8 @@ from drivers.rdss.messages import (
     Unknown,
     VersionRequest,
 )
-from drivers.rdss.terminal import Terminal
+from drivers.rdss.request_state_machine import Terminal
+from drivers.rdss.state_tables import FixReady, Send, TerminalOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.rdss.terminal import RdssTerminal

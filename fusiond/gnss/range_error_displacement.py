@@ -1,0 +1,237 @@
+r"""Displacement of the antenna's position by slowly varying range errors.
+
+Errors of orbits, clocks, group delays and of what is left of the ionosphere last for many minutes,
+each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. A
+filter that takes e for white and n for another one at each epoch solves place and clock with the
+weights of an epoch, R + S S^T, and what it finds of them is off, for as long as they last, by
+
+    b = G (e + S n),     G = first three rows of (A^T R^-1 A + L)^-1 A^T R^-1,   A = [H  S]
+    B = cov(b) = G V G^T + (G S)(G S)^T,      b = K t,  K = B^1/2 symmetric,  t ~ N(0, I)
+
+H = [-u 1_system], u unit vectors to the satellites north, east, down, R the variance of a range
+with what lasts, L what else knows of place (30 m), of the errors that all share (their unit
+variance), and of the clock: nothing does. Its offset is solved of the same ranges, so that delay of
+a whole sky goes into clock and height together. With a clock known to 1 m half of it cancels: low
+satellites, which are longer, lift the place that a later clock sinks (10 satellites with 1 m of
+ionosphere unknown at the zenith: 0.9 m downwards for 2.3). So u . K t is the part of the errors
+that looks like a displacement: all of it with four satellites, whose geometry makes much of little,
+and little with thirty.
+
+Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
+satellites' levels (fusiond.gnss.satellite_biases) do not know of their errors, V_k,
+
+    K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
+
+with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
+what levels know they know of what all share, too. Here the clock is known, for it is that of the
+sky before, from which it has gone a metre. A filter that lets K grow and adds nothing solves
+t of how the ranges part when satellites go, and is sure of a place that it does not know.
+
+Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.ranges import Rows
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+PLACE_M, FREE_M, CLOCK_M = 30.0, 1e3, 1.0
+"""Sigmas before the epoch of the position (an inertial unit over a minute), of the clock, and of
+the clock since the previous sky: a crystal with a random walk of 0.1 m by the root of a second,
+over a hundred."""
+SHARED = (rk.COMMON, rk.TROPOSPHERE_SIGMA, rk.BEIDOU_2_SIGMA)
+"""Rows of S. What a receiver delays BeiDou-2 more has a state that lasts: no displacement is of
+it."""
+PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
+"""Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
+satellites, scaled to the present sky."""
+LEAST_M = 1e-3
+"""Least K along an axis (m); a sky with less displaces nothing and ends the state."""
+FLOOR_M = 0.2
+"""Noise of a range over a minute, which bounds a satellite's weight."""
+HOLDS_S = 30.0
+"""A satellite of a MEO moves by a quarter of a degree."""
+FLICKERS_S = 3.0
+"""Time within which satellites that disappear and return belong to one sky, with unchanged errors.
+"""
+
+
+@compiled("void(f8[:, ::1], i8)", forceinline=True)
+def _invert(a: Array, m: int) -> None:
+    """Invert a positive definite matrix (m, m) in place by Gauss-Jordan elimination."""
+    for p in range(m):
+        pivot = 1.0 / a[p, p]
+        a[p, p] = 1.0
+        for j in range(m):
+            a[p, j] *= pivot
+        for i in range(m):
+            if i != p:
+                f = a[i, p]
+                a[i, p] = 0.0
+                for j in range(m):
+                    a[i, j] -= f * a[p, j]
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1])", allocates=True)
+def roots(b: Array, out: Array) -> None:
+    """Write (6, 3): the symmetric root of B (3, 3), and its inverse where B is not nearly 0."""
+    a, v = b.copy(), np.eye(3)
+    for _ in range(12):  # Jacobi's rotations: the third round is exact to rounding
+        if a[0, 1] == 0.0 and a[0, 2] == 0.0 and a[1, 2] == 0.0:
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if a[p, q] == 0.0:
+                    continue
+                half = 0.5 * (a[q, q] - a[p, p]) / a[p, q]
+                t = 1.0 / (abs(half) + math.sqrt(1.0 + half * half))
+                if half < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(1.0 + t * t)
+                s = t * c
+                for k in range(3):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                for k in range(3):
+                    x, y = v[k, p], v[k, q]
+                    v[k, p], v[k, q] = c * x - s * y, s * x + c * y
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = out[3 + i, j] = 0.0
+            for k in range(3):
+                root = math.sqrt(max(a[k, k], 0.0))
+                out[i, j] += v[i, k] * root * v[j, k]
+                if root > LEAST_M:
+                    out[3 + i, j] += v[i, k] / root * v[j, k]
+
+
+@compiled(
+    "void(f8[:, ::1], i8[::1], i8, f8[::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True
+)
+def displace(
+    values: Array,
+    clock: npt.NDArray[np.int64],
+    clocks: int,
+    noise: Array,
+    variance: Array,
+    clock_m: float,
+    effect: Array,
+    out: Array,
+) -> None:
+    """Write the effect of errors of `variance` (n,) on ranges that are weighted by `noise` (n,),
+    and its roots.
+
+    `effect` (3, n + 2): G and G S by rows' `values`; `out` (6, 3): K and its inverse.
+
+    `clock` (n,) below `clocks`: which of the clocks' offsets each has, known to `clock_m`.
+    """
+    n, shared = clock.shape[0], 3 + clocks
+    m = shared + len(SHARED)
+    normal, rows = np.zeros((m, m)), np.zeros((n, m))
+    for i in range(m):
+        known = PLACE_M if i < 3 else clock_m if i < shared else 1.0
+        normal[i, i] = 1.0 / (known * known)
+    for k in range(n):
+        row = rows[k]
+        row[0], row[1] = -values[rk.NORTH, k], -values[rk.EAST, k]
+        row[2], row[3 + clock[k]] = math.sin(values[rk.ELEVATION, k]), 1.0
+        for j in range(len(SHARED)):
+            row[shared + j] = values[SHARED[j], k]
+        w = 1.0 / noise[k]
+        for i in range(m):
+            for j in range(m):
+                normal[i, j] += w * row[i] * row[j]
+    _invert(normal, m)
+    b = np.zeros((3, 3))
+    for i in range(3):
+        effect[i, n] = effect[i, n + 1] = 0.0
+        for k in range(n):
+            g = 0.0
+            for j in range(m):
+                g += normal[i, j] * rows[k, j]
+            effect[i, k] = g / noise[k]
+            effect[i, n] += effect[i, k] * values[rk.COMMON, k]
+            effect[i, n + 1] += effect[i, k] * values[rk.TROPOSPHERE_SIGMA, k]
+    for i in range(3):
+        for j in range(3):
+            for k in range(n):
+                b[i, j] += effect[i, k] * effect[j, k] * variance[k]
+            for k in (n, n + 1):
+                b[i, j] += effect[i, k] * effect[j, k]
+    roots(b, out)
+
+
+class Displacement(NamedTuple):
+    """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
+    two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
+    3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states."""
+
+    t_s: float
+    satellites: tuple[str, ...]
+    effect: Array
+    variance: Array
+    root: Array
+    back: Array
+    shape: Array
+
+    @classmethod
+    def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
+        """Displacement for an epoch's rows, with residual `variance` (n,) m^2 of lasting errors."""
+        n = len(rows.satellites)
+        effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
+        clocks = int(rows.clock.max(initial=0)) + 1
+        lasting, of = rows.values[rk.LASTING].copy(), (rows.values, rows.clock, clocks)
+        noise = rows.values[rk.VARIANCE] - variance + lasting
+        # Fewer satellites than unknowns leave the clock as it was: free, it would take a direction
+        # of the place that the displacement of the sky before has.
+        free = FREE_M if n >= 3 + clocks else CLOCK_M
+        displace(*of, noise, lasting, free, effect, out)
+        unknown = variance + FLOOR_M**2
+        displace(*of, unknown, unknown, CLOCK_M, effect, left)
+        known = np.sqrt(variance / rows.values[rk.LASTING])
+        for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
+            effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
+        root = out[:3]
+        return cls(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA)
+
+    def holds(self, rows: Rows, t_s: float) -> bool:
+        """True if the rows have the same satellites within its validity."""
+        same = rows.satellites == self.satellites
+        return 0.0 <= t_s - self.t_s < (HOLDS_S if same else FLICKERS_S)
+
+    def carried(self, before: Displacement) -> tuple[Array, Array]:
+        """Transition R (3, 3) and noise covariance cov(w) (3, 3) from the sky `before`."""
+        n, last = len(self.satellites), len(before.satellites)
+        moved: dict[str, Array] = {}
+        left: dict[str, float] = {}
+        for k, name in enumerate(self.satellites):
+            moved[name], left[name] = self.effect[:, k].copy(), float(self.variance[k])
+        for k, name in enumerate(before.satellites):
+            moved[name] = moved.get(name, 0.0) - before.effect[:, k]
+            left.setdefault(name, float(before.variance[k]))
+        new = np.zeros((3, 3))
+        for name, g in moved.items():
+            new += left[name] * np.multiply.outer(g, g)
+        for k in range(2):
+            g = self.effect[:, n + k] - before.effect[:, last + k]
+            new += np.multiply.outer(g, g)
+        kept: Array = _times(self.back, before.root)
+        return kept, _times(_times(self.back, new), self.back)
+
+
+def _times(a: Array, b: Array) -> Array:
+    """A B (3, 3), in one order of operations on all machines."""
+    found: Array = (a[:, :, None] * b[None, :, :]).sum(axis=1)
+    return found

@@ -1,0 +1,239 @@
+r"""Service of measurement series: one table of states, with named transitions.
+
+A series is what one source says of one thing (`gnss`, `gnss_velocity`).
+
+    nominal      its measurements are fused
+    suspected    the last one failed its gate
+    out          they are looked at, not fused
+    probation    fused again, after they were out
+
+    from                  to           when
+    nominal               suspected    `gate`: a measurement fails
+    suspected             nominal      one passes
+    suspected             out          the third in a row fails, and no fault of the inertial unit
+                                       explains it
+    probation             out          a measurement fails: what was wrong comes again
+    any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
+                                       itself to the bit while the vehicle moves
+    out                   probation    `READMIT_COUNT` in a row pass against what is published, and
+                                       the fault for which it is out is likelier over than not; one
+                                       that repeated itself says something new each time. Whether
+                                       a fault is over is asked of all that it has spoiled
+    probation             nominal      it has been in service for as long as it was out
+
+Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
+four sigma lasts are one case in a thousand. Time alone re-admits nothing.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.initialisation import (
+    Candidate,
+    PositionCandidate,
+    SpeedCandidate,
+    VelocityCandidate,
+)
+from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
+
+Array = NDArray[np.float64]
+
+REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
+LASTS_S, RETURNS, MOST_EVIDENCE, MOST_SURE = 60.0, 2.0, 12.0, 24.0
+"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
+to one; the most (chi-square) that one measurement tells of that; and the most (log likelihood) that
+one series does, four such measurements."""
+REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
+# Position repeated to the bit so often while the vehicle moves: receivers print metres to the
+# centimetre or finer, so that two alike are chance, three are not. Chance of that kind is the fix
+# before once more, of a receiver that says what it has oftener than it has something: no
+# measurement of its instant.
+REPEATED = 2
+# Speeds and velocities are printed coarser: so rare a run of equal ones is none, by the probability
+# that one repeats the one before, as this series has shown it (average of so many).
+CHANCE, REPEATS_KEPT = 1e-9, 100.0
+# What has not been heard of for so long (ns) is judged anew.
+FORGET_NS = 10_000_000_000
+
+
+class Service(enum.StrEnum):
+    """States of a series."""
+
+    NOMINAL = "nominal"
+    SUSPECTED = "suspected"
+    OUT = "out"
+    PROBATION = "probation"
+
+
+@dataclass(slots=True)
+class Series:
+    """Service of one series: state and its start, reason of exclusion, failures and passes in a
+    row."""
+
+    source: str
+    device: str
+    locates: bool
+    moves: bool
+    state: Service = Service.NOMINAL
+    out: bool = False
+    """True if the series is excluded: compared, not fused."""
+    since_ns: int = 0
+    received_ns: int = 0
+    reason: str = ""
+    failed: int = 0
+    passed: int = 0
+    out_ns: int = 0
+    """Instant (ns) of its last exclusion."""
+    proven_ns: int = 0
+    """End of probation (ns), which is as long as the exclusion was."""
+    over: float = 0.0
+    """Log likelihood ratio that the excluding fault is over rather than lasting."""
+    value: object = None
+    repeats: int = 0
+    """So many values in a row, of a vehicle that moves, were that before them, to the bit."""
+    unchanged: bool = False
+    """True if the last value repeated the one before it, to the bit."""
+    noise: Array = field(default_factory=unlearned)
+    repeating: float = 1.0
+    """Probability that a value repeats the one before it, as observed in motion."""
+    shares: bool = False
+    """True for positions with a shared error that the filter estimates."""
+
+    @staticmethod
+    def of(measurement: AidingMeasurement) -> Series:
+        """New series, for its first measurement."""
+        return Series(
+            measurement.source,
+            measurement.device,
+            measurement.locates,
+            measurement.moves,
+            since_ns=measurement.t_ns,
+            shares=any(getattr(each, "bias", ()) for each in measurement.candidates()),
+        )
+
+    def copied(self) -> Series:
+        """A copy for a checkpoint."""
+        other = Series(*_EACH(self))
+        other.noise = self.noise.copy()
+        return other
+
+    def received(self, t_ns: int) -> None:
+        """Note an arrival."""
+        if t_ns - self.received_ns > FORGET_NS:
+            self.failed = self.passed = self.repeats = 0
+            if self.state is Service.SUSPECTED:
+                self.state, self.since_ns = Service.NOMINAL, t_ns
+        self.received_ns = t_ns
+
+    def exclude(self, t_ns: int, reason: str) -> None:
+        """Exclude the series."""
+        self.state, self.since_ns, self.reason, self.out_ns = Service.OUT, t_ns, reason, t_ns
+        self.out = True
+        forget_lately(self.noise)
+        self.failed = self.passed = 0
+        self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
+
+    def gated(self, t_ns: int, explained: bool) -> None:
+        """Note a gate failure of a series in service; `explained`: by a fault of the inertial
+        unit."""
+        self.failed += 1
+        again = self.state is Service.PROBATION
+        if again:  # what was wrong comes again, so it is known why
+            self.exclude(t_ns, self.reason)
+        elif self.failed >= REFUSED_IN_A_ROW and not explained:
+            self.exclude(t_ns, DISAGREES)
+        elif self.state is not Service.SUSPECTED:
+            self.state, self.since_ns = Service.SUSPECTED, t_ns
+
+    def fused(self, t_ns: int, whitened: tuple[float, ...]) -> None:
+        """Note a pass of the gate, with the whitened innovation."""
+        rows = len(whitened)
+        if 0 < rows <= 3:
+            y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
+            learn(self.noise, t_ns * 1e-9, y0, y1, y2, rows)
+        self.failed = 0
+        if t_ns > self.proven_ns and self.state is not Service.NOMINAL:
+            self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
+
+    def looked_at(
+        self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
+    ) -> None:
+        """Compare a measurement of an excluded series with the published solution. `lasting`:
+        increase of the innovation's chi-square if the excluding fault lasts; NaN if unknown.
+        `others`: log likelihood that the fault is over, by its other series.
+
+        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
+        """
+        if self.unchanged and self.reason == REPEATS:
+            passes = False
+        self.passed = self.passed + 1 if passes else 0
+        if math.isfinite(lasting):
+            self.over += 0.5 * max(-MOST_EVIDENCE, min(lasting, MOST_EVIDENCE))
+            self.over = max(-MOST_EVIDENCE, min(self.over, MOST_SURE))
+            prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
+            if self.over + others + prior < RETURNS:
+                return
+            if not passes:  # what was wrong is over, and it is not where the filter is
+                self.reason = STILL
+        if self.passed >= READMIT_COUNT:
+            self.readmit(t_ns)
+
+    def readmit(self, t_ns: int) -> None:
+        """Return the series to service."""
+        self.proven_ns = 2 * t_ns - self.out_ns
+        self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
+        self.failed = self.passed = 0
+
+    @property
+    def stale(self) -> bool:
+        """True if the last position was the one before it once more."""
+        return self.locates and self.repeats > 0
+
+    def went_on(self, t_ns: int, value: object, moved: int) -> None:
+        """Note several arrivals of a nominal series, the last at `t_ns`, without repeated values;
+        `value` is None for a constraint. The vehicle moved at `moved` of them."""
+        self.received_ns = t_ns
+        if value is None:
+            return
+        self.value, self.repeats, self.unchanged = value, 0, False
+        for _ in range(0 if self.locates else moved):
+            self.repeating += -self.repeating / REPEATS_KEPT
+
+    def repeats_itself(self, value: object, moving: bool) -> bool:
+        """True if values repeat to the bit too often for a measurement of a `moving` vehicle. At
+        rest values may repeat."""
+        self.unchanged = value == self.value
+        same = moving and self.unchanged
+        self.value, self.repeats = value, self.repeats + 1 if same else 0
+        if self.locates:
+            return self.repeats >= REPEATED
+        chance = min(max(self.repeating, 0.01), 1.0 - 1e-12)
+        if moving and not same:
+            self.repeating += -self.repeating / REPEATS_KEPT
+        elif moving:
+            self.repeating += (1.0 - self.repeating) / REPEATS_KEPT
+        return same and self.repeats >= math.log(CHANCE) / math.log(chance)
+
+
+_EACH = attrgetter(*(each.name for each in fields(Series)))
+
+
+def value_of(candidates: Sequence[Candidate]) -> tuple[float, ...] | None:
+    """Values that a frozen sensor repeats to the bit."""
+    for candidate in candidates:
+        if isinstance(candidate, PositionCandidate):
+            return candidate.lat_rad, candidate.lon_rad
+        if isinstance(candidate, VelocityCandidate):
+            return candidate.v_ned
+        if isinstance(candidate, SpeedCandidate):
+            return (candidate.speed_m_s,)
+    return None

@@ -1,0 +1,151 @@
+"""The fixed-rate tick: absolute deadlines on the monotonic clock, no backlog, garbage out of ticks.
+
+    deadline_k = t_0 + k * period
+
+A tick that could not start within its own period is skipped and counted as an overrun; those that
+follow keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick is up to
+1 ms late on an idle machine; the tick is told its deadline, not the time it woke.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from math import ceil, log10
+
+from fusiond.live.garbage_collection import Collector
+from fusiond.outputs.messages.health import SchedulerStatus
+
+SECOND_NS = 1_000_000_000
+
+_FIRST_BIN_NS = 10_000
+_BINS_PER_DECADE = 10
+_BINS = 6 * _BINS_PER_DECADE + 1
+
+
+class Every:
+    """Due once a period, on the tick's own time."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._next_ns = 0
+
+    def due(self, t_ns: int) -> bool:
+        """True if a period has passed; those missed altogether are not made up for."""
+        behind_ns = t_ns - self._next_ns
+        if behind_ns < 0:
+            return False
+        start_ns = t_ns if behind_ns > self._period_ns else self._next_ns
+        self._next_ns = start_ns + self._period_ns
+        return True
+
+
+class LatencyHistogram:
+    """Histogram of latency in fixed log-spaced bins, ten a decade from 10 us to 10 s."""
+
+    def __init__(self) -> None:
+        self.bins = [0] * _BINS
+        self.count = 0
+        self.max_ns = 0
+        self.sum_ns = 0
+
+    def add(self, lateness_ns: int) -> None:
+        index = 0
+        if lateness_ns > _FIRST_BIN_NS:
+            index = min(_BINS - 1, ceil(_BINS_PER_DECADE * log10(lateness_ns / _FIRST_BIN_NS)))
+        self.bins[index] += 1
+        self.count += 1
+        self.max_ns = max(self.max_ns, lateness_ns)
+        self.sum_ns += lateness_ns
+
+    def quantile_ms(self, p: float) -> float:
+        """Upper edge (ms) of the bin with the quantile, at most 26 % high; 0 if empty."""
+        wanted = p * self.count
+        seen = 0
+        for index, n in enumerate(self.bins):
+            seen += n
+            if n and seen >= wanted:
+                edge_ns = _FIRST_BIN_NS * pow(10.0, index / _BINS_PER_DECADE)
+                return min(float(edge_ns), self.max_ns) / 1e6
+        return 0.0
+
+    def at_most(self) -> tuple[tuple[float, int], ...]:
+        """Ticks that were no later than each edge (s): two edges a decade, 0.1 ms to 1 s."""
+        half = _BINS_PER_DECADE // 2
+        edges = range(2 * half, 5 * _BINS_PER_DECADE + 1, half)
+        return tuple(
+            (_FIRST_BIN_NS * 1e-9 * pow(10.0, k / _BINS_PER_DECADE), sum(self.bins[: k + 1]))
+            for k in edges
+        )
+
+
+class Scheduler:
+    """Calls `tick(deadline_ns)` at `rate_hz` until cancelled.
+
+    `on_time(now_ns)` is called after every tick that started within its own period and ended
+    before the next: the watchdog's food. `now` and `sleep` (seconds) are the clock and may be a
+    test's. An exception of `tick` leaves `run`.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        tick: Callable[[int], None],
+        *,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        on_time: Callable[[int], None] | None = None,
+    ) -> None:
+        self.period_ns = round(SECOND_NS / rate_hz)
+        self._tick = tick
+        self._now = now
+        self._sleep = sleep
+        self._on_time = on_time
+        self._collector = Collector(now)
+        self.lateness = LatencyHistogram()
+        self.ticks = 0
+        self.overruns = 0
+
+    async def run(self) -> None:
+        """Tick until cancelled; the first deadline is one period from now."""
+        self._collector.start()
+        try:
+            await self._run()
+        finally:
+            self._collector.stop()
+
+    async def _run(self) -> None:
+        deadline = self._now() + self.period_ns
+        while True:
+            # Also when late: other tasks must run between two ticks.
+            await self._sleep(max(0, deadline - self._now()) / SECOND_NS)
+            behind_ns = self._now() - deadline
+            if behind_ns < 0:
+                continue
+            self.lateness.add(behind_ns)
+            missed = behind_ns // self.period_ns
+            self.overruns += missed
+            deadline += missed * self.period_ns
+            self._tick(deadline)
+            self.ticks += 1
+            deadline += self.period_ns
+            now = self._now()
+            if self._on_time is not None and not missed and now < deadline:
+                self._on_time(now)
+            self._collector.use_slack(deadline - now)
+
+    def status(self) -> SchedulerStatus:
+        """A snapshot for `health`."""
+        return SchedulerStatus(
+            ticks=self.ticks,
+            overruns=self.overruns,
+            lateness_p50_ms=self.lateness.quantile_ms(0.5),
+            lateness_p99_ms=self.lateness.quantile_ms(0.99),
+            lateness_max_ms=self.lateness.max_ns / 1e6,
+            lateness_sum_s=self.lateness.sum_ns / SECOND_NS,
+            lateness_at_most=self.lateness.at_most(),
+            gc_collections=self._collector.collections,
+            gc_forced=self._collector.forced,
+            gc_max_ms=self._collector.max_ns / 1e6,
+        )
