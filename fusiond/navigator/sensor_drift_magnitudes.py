@@ -54,8 +54,8 @@ too sure of its course stays so, and slip comes with bends, of which a street ha
 is a choice after results: log likelihoods of estimates 20 s ahead, summed over `drive_0708`,
 `css_164` and four simulated drives, are above those of a full level by 34 with six, 56 with two and
 68 with one. But with two a calibrated `drive_0708` had a false isolation more, just before an
-outage, with one its outages end 5.5 m off, and with either a heading that was lost in silent bends is
-found by no slip."""
+outage, with one its outages end 5.5 m off, and with either a heading that was lost in silent bends
+is found by no slip."""
 FORGETS = 180.0
 """Instants after which old ones are forgotten, half an hour: loads, tyres and roads change."""
 MOVES_M_S = 2.0
