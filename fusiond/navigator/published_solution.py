@@ -10,8 +10,9 @@ class do (fusiond.configuration.plausibility):
 and a road is banked for its bends, by (|a_last| + a) / g at most, as soon as one lasts.
 
 A heading that was claimed and that nothing has shown yet may be the other way round: half a turn is
-five sigma. What it has done to the velocity since the start is as much of the speed, and to the
-position of the way. Of an inertial unit whose bias is n sigma of its data sheet, which its rates
+five sigma, and less once positions have confirmed the way from the start
+(fusiond.navigator.alignment.start_check). What it does to the velocity is as much of the speed, and
+to the position of the way since the last position. Of an inertial unit whose bias is n sigma of its data sheet, which its rates
 have not shown to be the unit's own yet (fusiond.navigator.imu_unit_check), an attitude is known n
 times as poorly.
 """
@@ -28,13 +29,11 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import published_ahead
 from fusiond.navigation.earth import (
     STANDARD_GRAVITY_M_S2,
-    meridian_radius,
-    transverse_radius,
 )
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M, Bound, Mode, Solution
-from fusiond.navigation.strapdown import LAT, LON, NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
-from fusiond.navigator.alignment.start import Start
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
+from fusiond.navigator.alignment.start_check import Unshown, horizontal_distance_m
 
 _SIZE = NAV_SIZE + 3
 SLOW_M_S = 5.0
@@ -52,13 +51,13 @@ def solution_of(
     reason: str,
     bound: Bound,
     limits: Plausibility,
-    unshown: Start | None = None,
+    unshown: Unshown | None = None,
     worse: float = 1.0,
 ) -> Solution:
     """The solution at `t_ns`; where that is later than the estimator's instant, carried ahead by
     holding the rates of the newest sample, for `most_ns` at most. `limits` of the vehicle's class;
-    `unshown`: the start, while nothing has shown the heading that it was claimed to have; `worse`:
-    how many times worse than its data sheet the inertial unit shows to be."""
+    `unshown`: what a claimed heading leaves open that nothing has shown; `worse`: how many times
+    worse than its data sheet the inertial unit shows to be."""
     ahead_ns = min(t_ns - estimator.t_ns, most_ns)
     ahead_s = ahead_ns * 1e-9 if ahead_ns > 0 and imu.end else 0.0
     e, model, errors, out = estimator, estimator.model, estimator.sensor_errors, np.empty(_SIZE)
@@ -115,16 +114,12 @@ def _widen_by_silence(
 
 
 def _widen_by_claim(
-    sd: list[float], place: tuple[float, float], v: tuple[float, float], start: Start
+    sd: list[float], place: tuple[float, float], v: tuple[float, float], unshown: Unshown
 ) -> None:
     """Add to sigma (9,) what a claimed heading leaves open, of a vehicle at `place` (rad) with
     velocity `v`, north and east."""
-    doubt, lat = math.pi / MOST_SIGMAS, start.nav.item(LAT)
-    east = math.remainder(place[1] - start.nav.item(LON), 2.0 * math.pi)
-    way_m = math.hypot(
-        (place[0] - lat) * meridian_radius(lat), east * transverse_radius(lat) * math.cos(lat)
-    )
-    for row, more in enumerate((way_m, math.hypot(*v))):
+    doubt, since = unshown.sd_rad, (unshown.lat_rad, unshown.lon_rad)
+    for row, more in enumerate((horizontal_distance_m(*since, *place), math.hypot(*v))):
         for axis in (3 * row, 3 * row + 1):
             sd[axis] = math.hypot(sd[axis], doubt * more)
     sd[8] = math.hypot(sd[8], doubt)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fusiond.aiding.base import AidingMeasurement
+from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.estimators.base import Estimator
 from fusiond.integrity.catalogue import SENSOR
 from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_elements, wrap_angle
-from fusiond.navigation.strapdown import Q0, VN
+from fusiond.navigation.strapdown import LAT, LON, Q0, VN
 from fusiond.navigator.alignment.heading_at_rest import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
@@ -34,6 +37,27 @@ DETERMINED = 0.5
 COURSE_NS = 1_000_000_000
 
 
+HALF_TURN_SD_RAD = math.pi / 5.0
+"""One sigma of a heading that nothing has shown: an error beyond five sigma is a lie, and it may be
+off by half a turn."""
+
+
+class Unshown(NamedTuple):
+    """One sigma (rad) of a claimed heading that nothing has shown, and the place (rad) since which
+    the position rests on it."""
+
+    sd_rad: float
+    lat_rad: float
+    lon_rad: float
+
+
+def horizontal_distance_m(lat_a: float, lon_a: float, lat_b: float, lon_b: float) -> float:
+    """Distance (m) of two places (rad) that are kilometres apart at most."""
+    north = (lat_b - lat_a) * meridian_radius(lat_a)
+    east = math.remainder(lon_b - lon_a, 2.0 * math.pi) * math.cos(lat_a)
+    return math.hypot(north, east * transverse_radius(lat_a))
+
+
 class StartCheck:
     """Check of a start; `refuted` is the reason why it was wrong."""
 
@@ -50,16 +74,33 @@ class StartCheck:
         hypothesis until the first motion, as is one saved without motion; another saved heading was
         measured before the vehicle was parked. Apparent driving backward is driving forward with a
         reversed IMU until the vehicle drives forward, too."""
-        self.unshown: Start | None = None
-        """The start, until something has shown the heading that it claims."""
+        self.unshown: Unshown | None = None
+        """What the heading leaves open, until something has shown it."""
         self._say()
 
     def _say(self) -> None:
-        self.unshown = self._start if self._unproven else None
+        if not self._unproven:
+            self.unshown = None
+        elif self.unshown is None:
+            lat, lon = self._start.nav[LAT : LON + 1].tolist()
+            self.unshown = Unshown(HALF_TURN_SD_RAD, lat, lon)
         if self._backward:
             self.unconfirmed = reason("backward_or_mounted")
         else:
             self.unconfirmed = reason("not_confirmed_by_motion") if self._unproven else ""
+
+    def located(self, measurement: AidingMeasurement) -> None:
+        """A position was fused. A way from the start that positions confirm shows the heading as
+        well as they are known against that way; what is open of the place begins anew there."""
+        for c in measurement.candidates():
+            if self.unshown is None or not isinstance(c, PositionCandidate):
+                continue
+            start, covariance = self._start.nav, self._start.covariance
+            way_m = horizontal_distance_m(start.item(LAT), start.item(LON), c.lat_rad, c.lon_rad)
+            variance = max(covariance.item(6, 6), covariance.item(7, 7))
+            sd_m = math.sqrt(max(c.sd[:2]) ** 2 + variance)
+            doubt = min(self.unshown.sd_rad, sd_m / max(way_m, 1e-9))
+            self.unshown = Unshown(doubt, c.lat_rad, c.lon_rad)
 
     def refuted(
         self, e: Estimator, diagnosis: Diagnosis, measured: RestEvidence
