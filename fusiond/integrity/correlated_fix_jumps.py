@@ -48,8 +48,8 @@ def renewed_slots(
     if len(slots) != len(step.size):
         return []
     share, p = np.array(place.bias_share), estimator.covariance[PLACE, PLACE]
-    offset = share * estimator.xi[slots] + step.size
-    c = p + step.covariance + np.diag(share**2 * model.noise[2, slots])
+    offset = share @ estimator.xi[slots] + step.size
+    c = p + step.covariance + (share * model.noise[2, slots]) @ share.T
     gained = sum(math.log(sd) for sd in POSITION_SD_M) - 0.5 * math.log(np.linalg.det(c)) - less
     gained -= 0.5 * float(offset @ np.linalg.solve(c, offset))
     return slots if gained > 0.0 else []

@@ -40,13 +40,20 @@ def model_of(config: Config, *extra: Block) -> Model:
     Raises `ConfigError` where those are more states than the kernels hold.
     """
     name, noise = config.estimator.model, imu_noise(config.imu)
+    return fitting(config, extra, lambda blocks: make_model(name, noise, *blocks))
+
+
+def fitting(
+    config: Config, extra: Sequence[Block], make: Callable[[Sequence[Block]], Model]
+) -> Model:
+    """Model that `make` gives of the blocks for which there is room, as `model_of`."""
     try:
-        return make_model(name, noise, *extra)
+        return make(extra)
     except TooManyStatesError as error:
         for unasked in (_skews, _wanders, _unasked, _carriers):
             asked = [block for block in extra if not unasked(config, block)]
             if len(asked) < len(extra):
-                return model_of(config, *asked)
+                return fitting(config, asked, make)
         names = ", ".join(block.name for block in extra)
         raise ConfigError(
             f"estimator.model: {error}; the measurements add {names}: choose a smaller model,"

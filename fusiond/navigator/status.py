@@ -162,8 +162,9 @@ class OutcomeWatch:
             t_ns = entry.key[0]
             if t_ns > self.fused_ns.get(source, -1):
                 self.fused_ns[source] = t_ns
-            if measurement.locates and self._trial.check is not None:
-                self._trial.check.located(measurement)
+            check = self._trial.check
+            if measurement.locates and check is not None and check.unshown is not None:
+                check.located(measurement)
             if measurement.locates and t_ns > self.position_ns:
                 if t_ns - self.position_ns > self._coast_after_ns:
                     self.basis = reason("fixes_back", source=source)

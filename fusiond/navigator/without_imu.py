@@ -44,7 +44,7 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Bound, Mode, Solution
 from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, VD, VE, VN
 from fusiond.navigator.alignment.start import UNKNOWN_HEIGHT_SD_M
-from fusiond.navigator.assembly import estimator_without_imu
+from fusiond.navigator.assembly import estimator_without_imu, fitting
 from fusiond.navigator.imu_screening import BEARABLE_GAP_S
 from fusiond.navigator.mode_reasons import joined, reason
 from fusiond.navigator.published_solution import solution_of
@@ -120,7 +120,10 @@ class WithoutImu:
     @property
     def model(self) -> Model:
         """Error model of a vehicle without an inertial unit."""
-        return constant_velocity(self._config.plausibility.manoeuvre, self._blocks)
+        manoeuvre = self._config.plausibility.manoeuvre
+        return fitting(
+            self._config, self._blocks, lambda blocks: constant_velocity(manoeuvre, blocks)
+        )
 
     @property
     def active(self) -> bool:

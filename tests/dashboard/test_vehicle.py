@@ -179,7 +179,7 @@ def test_an_innovation_that_comes_again_takes_the_place_of_the_first() -> None:
 
 
 def _told_late(vehicle: Vehicle) -> bool:
-    return any("came too late" in step.text for step in vehicle.said("advice") or ())
+    return any("was late" in step.text for step in vehicle.said("advice") or ())
 
 
 def test_an_alarm_ends_a_minute_after_what_it_tells_of() -> None:

@@ -17,7 +17,7 @@ _NMEA = ("decoder", "epochs", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("bcnav", "beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes")
 _SHARED = ("drivers.cycle", "drivers.solution", "drivers.solution_decoder", "drivers.splitter")
-_HUB = ("advice", "history", "hub", "schemas", "vehicle")
+_HUB = ("advice", "history", "vehicles", "schemas", "vehicle")
 
 PARSERS = {
     "splitter": Parser(("drivers.nmea.mixed_framing",), 128),
@@ -42,18 +42,21 @@ PARSERS = {
         ),
         212,
     ),
-    "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
+    "can": Parser(
+        tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "signal_bits", "pairing")), 162
+    ),
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
     "hub": Parser(tuple(f"fusiond.dashboard.{module}" for module in _HUB), 512),
     "log": Parser(tuple(f"fusiond.recording.{m}" for m in ("info", "reader", "records")), 400),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
     "can_log": Parser(
-        tuple(f"fusiond.offline.{m}" for m in ("can_blf", "can_frames", "can_text")), 400
+        tuple(f"fusiond.offline.{m}" for m in ("blf_repair", "can_log_reader", "can_text_repair")),
+        400,
     ),
     "dbc": Parser(("drivers.can.dbc_salvage",), 400),
     "csv": Parser(
-        tuple(f"fusiond.files.{m}" for m in ("csv_tables", "csv_dialect", "tables")), 160
+        tuple(f"fusiond.files.{m}" for m in ("csv_tables", "csv_dialect", "measurement_csv")), 160
     ),
 }
 """By target."""

@@ -68,7 +68,7 @@ def fed(drive: Drive) -> tuple[str | None, list[tuple[str, str]]]:
     navigator = Navigator(CONFIG, on_event=lambda code, text: told.append((code, text)))
     drive.feed(navigator)
     navigator.estimator.xi[navigator.model.slots_of("gyro_bias")[2]] = BIAS_RAD_S
-    return navigator._units.unproven(navigator.estimator), told
+    return navigator._units.unproven(navigator.estimator)[0], told
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -19,7 +19,7 @@ CODE = "".join(
     for path in (
         *sorted(set((_DRIVERS / "nmea").glob("*.py")) - {_DRIVERS / "nmea" / "compass.py"}),
         _DRIVERS / "receiver.py",
-        _DRIVERS / "serial_line.py",
+        _DRIVERS / "reconnecting_line.py",
     )
 )
 
