@@ -12,9 +12,9 @@ and a road is banked for its bends, by (|a_last| + a) / g at most, as soon as on
 A heading that was claimed and that nothing has shown yet may be the other way round: half a turn is
 five sigma, and less once positions have confirmed the way from the start
 (fusiond.navigator.alignment.start_check). What it does to the velocity is as much of the speed, and
-to the position of the way since the last position. Of an inertial unit whose bias is n sigma of its data sheet, which its rates
-have not shown to be the unit's own yet (fusiond.navigator.imu_unit_check), an attitude is known n
-times as poorly.
+to the position of the way since the last position. Of an inertial unit whose bias is n sigma of its
+data sheet, which its rates have not shown to be the unit's own yet
+(fusiond.navigator.imu_unit_check), an attitude is known n times as poorly.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ class StartCheck:
         measured before the vehicle was parked. Apparent driving backward is driving forward with a
         reversed IMU until the vehicle drives forward, too."""
         self.unshown: Unshown | None = None
-        """What the heading leaves open, until something has shown it."""
+        """Doubt that the heading leaves, until something has shown it."""
         self._say()
 
     def _say(self) -> None:
