@@ -33,7 +33,7 @@ from fusiond.navigation.earth import (
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M, Bound, Mode, Solution
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SMOOTH_N, STEP_SMOOTH_RATE_B
-from fusiond.navigator.alignment.start_check import Unshown, horizontal_distance_m
+from fusiond.navigator.alignment.start_check import Unshown
 
 _SIZE = NAV_SIZE + 3
 SLOW_M_S = 5.0
@@ -118,8 +118,8 @@ def _widen_by_claim(
 ) -> None:
     """Add to sigma (9,) what a claimed heading leaves open, of a vehicle at `place` (rad) with
     velocity `v`, north and east."""
-    doubt, since = unshown.sd_rad, (unshown.lat_rad, unshown.lon_rad)
-    for row, more in enumerate((horizontal_distance_m(*since, *place), math.hypot(*v))):
+    doubt = unshown.sd_rad
+    for row, more in enumerate((unshown.way_m(*place), math.hypot(*v))):
         for axis in (3 * row, 3 * row + 1):
             sd[axis] = math.hypot(sd[axis], doubt * more)
     sd[8] = math.hypot(sd[8], doubt)

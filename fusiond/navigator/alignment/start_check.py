@@ -44,11 +44,17 @@ off by half a turn."""
 
 class Unshown(NamedTuple):
     """One sigma (rad) of a claimed heading that nothing has shown, and the place (rad) since which
-    the position rests on it."""
+    the position rests on it, known to `sd_m`."""
 
     sd_rad: float
     lat_rad: float
     lon_rad: float
+    sd_m: float = 0.0
+
+    def way_m(self, lat_rad: float, lon_rad: float) -> float:
+        """Way (m) to a place, beyond three sigma of what is known of where it began."""
+        distance_m = horizontal_distance_m(self.lat_rad, self.lon_rad, lat_rad, lon_rad)
+        return max(0.0, distance_m - 3.0 * self.sd_m)
 
 
 def horizontal_distance_m(lat_a: float, lon_a: float, lat_b: float, lon_b: float) -> float:
@@ -100,7 +106,7 @@ class StartCheck:
             variance = max(covariance.item(6, 6), covariance.item(7, 7))
             sd_m = math.sqrt(max(c.sd[:2]) ** 2 + variance)
             doubt = min(self.unshown.sd_rad, sd_m / max(way_m, 1e-9))
-            self.unshown = Unshown(doubt, c.lat_rad, c.lon_rad)
+            self.unshown = Unshown(doubt, c.lat_rad, c.lon_rad, max(c.sd[:2]))
 
     def refuted(
         self, e: Estimator, diagnosis: Diagnosis, measured: RestEvidence
