@@ -54,6 +54,12 @@ satellite waits, or at once if fewer than `ENOUGH` are left. The epoch's rows go
 the clone is taken after them: so carriers always tell the whole way, and each anchor adds a phase's
 noise.
 
+Epochs are as far apart as the receiver's clock says. Where the instants t' that they are taken for
+are not, e = t' - t, the filter's own way is longer by v e - v(a) e(a). What is known is the change
+of e, most of all where a report has come sooner than any before: e(a) was too late, and e is not,
+
+    z <- z + u . v(a) (e - e(a))
+
 All that is the filter's own, p^(a) and C^, is in its parameters, so that a rewind or another filter
 finds its own; what an epoch leaves to the next, (SLOTS, 9), are the receiver's facts.
 
@@ -84,8 +90,9 @@ SLOTS, COLUMNS = 3 * 64, 9
 """Shape of an epoch's output: one row for each satellite, by its slot."""
 _ALIVE, _CARRIER, _X, _ISSUE, _OFFSET, _V, _LAST = 0, 1, 2, 5, 6, 7, 8
 # Slot 0 is no satellite's: 1 if there is an anchor; when it was (s); sums of d^2 / 2 s^2 and of
-# their degrees of freedom; until when it has walked (s).
-_THERE, _T, _SUM, _COUNT, _WALKED = range(5)
+# their degrees of freedom; until when it has walked (s); how far its instant was ahead of the
+# receiver's clock (s), and the velocity there (north, east, down).
+_THERE, _T, _SUM, _COUNT, _WALKED, AHEAD, V_NED = range(7)
 
 LONGEST_S = 30.0
 """Longest age (s): a line of sight turns by 4 mrad within it, 2 mm for a position error of 0.5 m.
@@ -287,7 +294,7 @@ def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
 
 
 @compiled(
-    "b1(f8[:, ::1], i8[::1], i8, f8, b1, f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])",
+    "b1(f8[:, ::1], i8[::1], i8, f8, f8, b1, f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])",
     allocates=True,
 )
 def go_on(
@@ -295,6 +302,7 @@ def go_on(
     codes: NDArray[np.int64],
     first: int,
     t_s: float,
+    ahead_s: float,
     cloned: bool,
     place: Array,
     anchor: Array,
@@ -302,7 +310,7 @@ def go_on(
     left: Array,
 ) -> bool:
     """Write the output of an epoch at `t_s` after one with output `before`; True if it is an
-    anchor, for a filter that has `cloned` the last one or not.
+    anchor, for a filter that has `cloned` the last one or not. `ahead_s` of the receiver's clock.
 
     `codes` (m,) of its rows, 0 of what was used, or none; the `first` of rates and carriers;
     `place` (3,) of the antenna, and as it is estimated at the `anchor`.
@@ -331,7 +339,7 @@ def go_on(
     holds = waiting == 0 or (age < WAITS_S and alive >= ENOUGH)
     if known and holds and 0.0 <= age < LONGEST_S:
         return False
-    left[0, _THERE], left[0, _T], left[0, _WALKED] = 1.0, t_s, t_s
+    left[0, _THERE], left[0, _T], left[0, _WALKED], left[0, AHEAD] = 1.0, t_s, t_s, ahead_s
     for k in range(values.shape[1]):
         if math.isfinite(values[CARRIER, k]):
             state = left[int(values[SLOT, k])]

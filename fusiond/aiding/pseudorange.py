@@ -63,6 +63,7 @@ from fusiond.aiding.base import (
     level_arm_m,
 )
 from fusiond.aiding.carrier_anchor import (
+    AHEAD,
     BASIC,
     CARRIER,
     COLUMNS,
@@ -74,6 +75,7 @@ from fusiond.aiding.carrier_anchor import (
     SHARED,
     SLOTS,
     SPAN,
+    V_NED,
     VALUES,
     VX,
     X,
@@ -86,6 +88,7 @@ from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, CLOCK_DRIFT, CLOCK_OFFSET
+from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -136,7 +139,8 @@ class PseudorangeMeasurement(AidingMeasurement):
     last (fusiond.aiding.carrier_anchor). `clock` (n,): which
     of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
     satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
-    `clock_reset`: the receiver has set its clock. `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
+    `clock_reset`: the receiver has set its clock, of which `t_ns` is `ahead_s` (s; any constant in
+    it says nothing). `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
     which t is another than that of the epoch before, None for none; `seen`, an empty list, gets z
     and u P u^T of the ranges as the filter first looks at them.
     Rows: the finite ranges in order, then the finite rates (`labels`).
@@ -153,6 +157,7 @@ class PseudorangeMeasurement(AidingMeasurement):
     clock: Indices
     lever: Vector3 = (0.0, 0.0, 0.0)
     clock_reset: bool = False
+    ahead_s: float = 0.0
     before: Array = field(default_factory=nothing_left, repr=False)
     left: Array = field(default_factory=nothing_left, repr=False)
     shape: Array = field(default_factory=lambda: np.eye(3), repr=False)
@@ -252,6 +257,7 @@ class PseudorangeMeasurement(AidingMeasurement):
             self.clock[mask],
             self.lever,
             self.clock_reset,
+            self.ahead_s,
             self.before,
             self.left,
             self.shape,
@@ -307,6 +313,8 @@ class PseudorangeMeasurement(AidingMeasurement):
             self.shape,
             *self.lever,
             self._ranges,
+            # A clock that was set says nothing of the time since the anchor.
+            float(self.before[0, AHEAD]) if self.clock_reset else self.ahead_s,
             self.before,
             r,
             z,
@@ -324,13 +332,15 @@ class PseudorangeMeasurement(AidingMeasurement):
             return None
         anchor, place = state.xi[slots[:3]], np.empty(4)
         cloned = bool((anchor**2).sum() > ON_EARTH_M**2)
+        goes_on = cloned and not self.clock_reset
         of_navigation = np.zeros((4, 9))
         antenna(state.nav, *self.lever, place[:3], of_navigation[:3])
         place[3] = 0.0
         of_rows, t_s = np.array(codes, np.int64), self.t_ns * 1e-9
-        of = self._ranges, t_s, cloned, place, anchor, self.before, self.left
+        of = self._ranges, t_s, self.ahead_s, goes_on, place, anchor, self.before, self.left
         noise = np.empty((4, 4))
         if go_on(self.values, of_rows, *of):
+            self.left[0, V_NED:] = state.nav[VN : VN + 3]
             phase_noise(self.values, place, self.left, noise)
             return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
         if cloned and walk_noise(self.values, place, t_s, self.left, noise):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.carrier_anchor import (
+    AHEAD,
     CARRIER_VARIANCE,
     ON_EARTH_M,
     RANGE,
@@ -16,6 +17,7 @@ from fusiond.aiding.carrier_anchor import (
     RATE_VARIANCE,
     SHARED,
     SPAN,
+    V_NED,
     VX,
     X,
     anchored,
@@ -45,7 +47,7 @@ def _hold(active: NDArray[np.bool_], g: Array) -> None:
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
-    "i8[::1], i8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8, i8, f8[:, ::1], f8[::1],"
+    "i8[::1], i8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8, i8, f8, f8[:, ::1], f8[::1],"
     "f8[::1], f8[:, ::1])"
 )
 def range_rows(
@@ -67,6 +69,7 @@ def range_rows(
     l1: float,
     l2: float,
     rate_row: int,
+    ahead_s: float,
     before: Array,
     r: Array,
     z: Array,
@@ -77,7 +80,8 @@ def range_rows(
 
     Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors, of
     the carriers' anchor and of their clock; none where the model has no such state. `before`
-    (SLOTS, 9): what the last epoch left to this one. `shape` (3, 3) is what a unit of each
+    (SLOTS, 9): what the last epoch left to this one; `ahead_s` of the receiver's clock its instant
+    is (fusiond.aiding.carrier_anchor). `shape` (3, 3) is what a unit of each
     of the displacement's states displaces.
     """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
@@ -109,7 +113,7 @@ def range_rows(
     if cloned:
         ax, ay, az = xi[anchor[0]], xi[anchor[1]], xi[anchor[2]]
         cloned = ax * ax + ay * ay + az * az > ON_EARTH_M * ON_EARTH_M
-    scale = phase_scale(before)
+    scale, late = phase_scale(before), ahead_s - before[0, AHEAD]
 
     range_row = 0
     for i in range(clock.shape[0]):
@@ -148,6 +152,8 @@ def range_rows(
             g = h[rate_row]
             there, grown, r[rate_row] = since_anchor(values, i, before, ax, ay, az, scale)
             z[rate_row] = (distance - there) + xi[carrier[0]] - grown
+            was = before[0, V_NED:]
+            z[rate_row] += late * (u0 * was[0] + u1 * was[1] + u2 * was[2])
             g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
             g[6], g[7], g[8] = -u0, -u1, -u2
             _hold(active, g)

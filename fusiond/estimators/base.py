@@ -162,9 +162,9 @@ class Estimator:
         return False
 
     @property
-    def lost_heading_rad(self) -> float:
-        """One sigma of a heading that was known once; 0 of one that never was."""
-        return 0.0
+    def heading_known(self) -> bool:
+        """True if the heading has been known since the start, of a filter that can lose it."""
+        return False
 
     @property
     def runs(self) -> MeasurementRun | None:

@@ -170,9 +170,9 @@ class InvariantFilter(TiltAxesFilter):
         self._knows[KNOWN] = true
 
     @property
-    def lost_heading_rad(self) -> float:
-        """One sigma of a heading that was known once; 0 of one that never was."""
-        return math.sqrt(self.covariance[PHI + 2, PHI + 2]) if self._known else 0.0
+    def heading_known(self) -> bool:
+        """True if the heading has been known since the start."""
+        return self._known
 
     def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
         """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""

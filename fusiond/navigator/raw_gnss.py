@@ -288,6 +288,7 @@ class RawGnss:
             rows.clock,
             self._section.lever_arm_m,
             measurement.epoch.clock_reset,
+            measurement.t_ns * 1e-9 - t_s,
             measurement.memory.before,
             measurement.memory.left,
             displacement.shape,

@@ -98,9 +98,9 @@ class NavigationStatus:
         if speed > self._max_speed_m_s:
             return reason("too_fast", speed=speed)
         # Two sigma of what an error state bears: what was felt meanwhile lies on an arc.
-        lost = 2.0 * e.lost_heading_rad > BEARABLE_YAW_RAD and speed > COURSE_M_S
-        if lost:
-            return reason("heading_lost", sd=math.degrees(e.lost_heading_rad))
+        variance = e.covariance.item(2, 2)
+        if 4.0 * variance > BEARABLE_YAW_RAD**2 and speed > COURSE_M_S and e.heading_known:
+            return reason("heading_lost", sd=math.degrees(math.sqrt(variance)))
         if not diagnosis.positions_out:
             return None
         if (device := diagnosis.contradicts) is not None:
