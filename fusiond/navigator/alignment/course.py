@@ -180,7 +180,7 @@ def _moved_off(
             Levelled(
                 at_rest, _level_sd(by, (velocity.t_ns - standstill.end_ns) * 1e-9, turned, lat)
             ),
-            by.known.grades(standstill, *bias, g),
+            by.known.unit.grades(standstill, *bias, g),
         ),
     )
 
@@ -301,7 +301,7 @@ def _on_the_move(
     either = ways(imu, m, usable[-1], by.options, by.noise, g, delay_v)
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
-    for worse in () if by.known.judged_at_rest else worse_classes(by.noise):
+    for worse in () if by.known.unit.judged else worse_classes(by.noise):
         beyond = evidence_against(by.noise, worse)
         if best.cost - best.degrees <= beyond:
             break
@@ -309,7 +309,7 @@ def _on_the_move(
         fits = other.fit(backward=False), other.fit(backward=True)
         better = min(fits, key=lambda x: x.cost)
         if best.cost - better.cost > beyond:
-            by.known.noise, either, best = worse, other, better
+            by.known.unit.noise, either, best = worse, other, better
             forward_fit, backward_fit = fits
     rate = either.sensed.rates[-1]
     # Where even the better fit is poor, the sigmas are too small by as much.
@@ -364,7 +364,7 @@ def _build(
 ) -> Start:
     """Start by the antenna's velocity in the body; `rested`: bias, level and grades of a
     standstill."""
-    bias, levelled, grades = rested or (None, None, by.known.unrested_grades)
+    bias, levelled, grades = rested or (None, None, by.known.unit.unrested_grades)
     velocity, sd = velocity_of(candidate)
     velocity = velocity - dcm @ np.cross(rate, candidate.lever)
     force = sensed_motion.samples_at(imu, candidate.t_ns)[3:]

@@ -22,21 +22,19 @@ from fusiond.aiding.initialisation import (
 from fusiond.aiding.rest_evidence import LEAST_SD_M_S, RestEvidence
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
-from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, LONGEST_RUN, Window
+from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
 from fusiond.navigator.alignment.innovation_trend import NO_TREND, Offset
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
-    LEVEL_SD_RAD,
     SLOPE_SD,
     UNKNOWN_HEIGHT_SD_M,
     Place,
     as_geodetic,
     velocity_of,
 )
+from fusiond.navigator.alignment.unit_at_rest import UnitAtRest
 from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
-from fusiond.navigator.unit_grade import AS_ITS_CLASS, Values, graded_at_rest
 
 Array = NDArray[np.float64]
 ANY_TIME_NS = 1 << 62
@@ -58,8 +56,6 @@ SUSPECT_SIGMAS = 5.3
 WAY_SCALE = 0.05
 # One sigma (s) of the delay of a receiver's velocity against its position, which smoothing makes.
 LAG_SD_S = 0.1
-# One sigma of gravity by the ellipsoid: anomalies, and heights that nobody knows.
-GRAVITY_SD = 5e-4
 # Velocities that positions have contradicted so often have to agree with them for so long before
 # they tell a course: who is off by a metre a second then shows it by four sigma of fixes of a
 # metre. One or two are a fix that strays.
@@ -111,12 +107,8 @@ class AlignmentEvidence:
         saved: SavedState | None,
         on_event: Callable[[str, str], None],
     ) -> None:
-        self._options, self._sheet, self._saved = options, noise, saved
-        self.noise = noise
-        """Of the inertial unit: its sheet's, or that of one as bad as its rates at rest."""
-        self._ups: list[Array] = []
-        """Verticals of the quiet windows of a run, in the body."""
-        self._longest_run = 1
+        self._options, self._saved = options, saved
+        self.unit = UnitAtRest(options, noise)
         self._event = on_event
         self.why = ""
         """Reason to wait, beyond those that the aligner finds itself."""
@@ -167,8 +159,10 @@ class AlignmentEvidence:
             self._pending = None
             return
         self._gravity_points_up(latest)
-        if latest.quiet and self._speed <= self._options.rest_speed_m_s:
-            self._judge_sheet(latest)
+        still = latest.quiet and self._speed <= self._options.rest_speed_m_s
+        if still and self.unit.judge(latest):
+            bias = BIAS_SIGMAS * self.unit.noise.rate_bias_initial
+            self.unexplained[self.unexplained < bias] = 0.0
         turning = latest.quiet and self._turns(latest)
         if turning:
             self.unexplained = np.maximum(self.unexplained, np.abs(latest.mean_rate))
@@ -341,58 +335,9 @@ class AlignmentEvidence:
         if self.upside_down:
             self.report("imu_upside_down", reason("imu_upside_down"))
 
-    def _judge_sheet(self, w: Window) -> None:
-        """Take the unit for as bad as the rates about level axes are that gravity does not follow:
-        fusiond.navigator.sensor_ladder."""
-        up = w.mean_force / float(np.linalg.norm(w.mean_force))
-        self._ups = [*self._ups[1 - w.run :], up] if w.run > 1 else [up]
-        if w.run <= self._longest_run or len(self._ups) < w.run:
-            return
-        self._longest_run = min(w.run, LONGEST_RUN - 1)
-        n, o = self._sheet, self._options
-        seconds = (w.run - 1) * o.window_s
-        # A body that turns by w carries the vertical with it, du/dt = u x w.
-        across = w.run_rate - (w.run_rate @ up) * up
-        across = across + np.cross(up, (up - self._ups[0]) / seconds)
-        white = n.rate_noise**2 / (w.run * o.window_s)
-        unseen = EARTH_RATE_RAD_S**2 + 2.0 * (LEVEL_SD_RAD / seconds) ** 2 + white
-        prior = n.rate_bias_initial**2 + n.rate_bias_instability**2
-        size = float(np.linalg.norm(across))
-        grade = worse_than_said(np.array([size, 0.0]), prior, unseen)
-        self.noise = widened(n, grade)
-        if grade > 1.0:
-            self.unexplained[self.unexplained < BIAS_SIGMAS * self.noise.rate_bias_initial] = 0.0
-
-    @property
-    def judged_at_rest(self) -> bool:
-        """True if rates at rest have told whether the unit is as its sheet says."""
-        return self._longest_run > 1
-
-    @property
-    def unrested_grades(self) -> Array:
-        """Grades (13,) of a unit whose errors were not seen at rest."""
-        if self.noise is self._sheet:
-            return AS_ITS_CLASS
-        return grades_of(self.noise, self._sheet, self._options.misalignment_rad)
-
-    def grades(self, s: Standstill, bias: Array, sd: float, g: float) -> Array:
-        """Grades (13,) of the unit (fusiond.navigator.unit_grade), where it has been at rest: by
-        its rate `bias` (3,) and one sigma of that."""
-        if not self._options.graded:
-            return self.unrested_grades
-        n = self.noise
-        rate = n.rate_bias_initial**2 + n.rate_bias_instability**2
-        force = n.force_bias_initial**2 + n.force_bias_instability**2 + (n.force_scale * g) ** 2
-        up = np.array([float(np.linalg.norm(s.mean_force)) - g])
-        unseen = n.force_noise**2 / s.seconds + (GRAVITY_SD * g) ** 2
-        return self.unrested_grades * graded_at_rest(
-            Values(bias, np.full(3, rate), np.full(3, sd**2)),
-            Values(up, np.array([force]), np.array([unseen])),
-        )
-
     def _turns(self, w: Window) -> bool:
         """True if the rate of quiet windows exceeds any bias of the data sheet."""
-        n = self.noise
+        n = self.unit.noise
         prior = n.rate_bias_initial**2 + n.rate_bias_instability**2
         free = n.rate_noise**2 / self._options.window_s + self._options.rate_sd_rad_s**2
         for rate, count in ((w.mean_rate, 1), (w.run_rate, w.run)):

@@ -73,7 +73,7 @@ def _at_standstill(
         bias=bias,
         levelled=Levelled(dcm),
         heading=candidate,
-        grades=by.known.grades(standstill, *bias, gravity(lat, float(place[1][2]))),
+        grades=by.known.unit.grades(standstill, *bias, gravity(lat, float(place[1][2]))),
     )
     return turned_at_rest(by.model, start, place, dcm) if wide else start
 
@@ -154,7 +154,7 @@ def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         "gyrocompass",
         levelled=Levelled(dcm),
         compassed=True,
-        grades=by.known.unrested_grades,
+        grades=by.known.unit.unrested_grades,
     )
 
 

@@ -24,4 +24,4 @@ class Basis(NamedTuple):
     @property
     def noise(self) -> ImuNoise:
         """Of the inertial unit, as far as it has been seen."""
-        return self.known.noise
+        return self.known.unit.noise
