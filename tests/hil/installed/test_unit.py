@@ -188,8 +188,11 @@ def _check_process(pid: int) -> None:
     assert status["Gid"].split() == [str(entry.pw_gid)] * 4
     assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
     program = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-    assert program[0] == str(PREFIX / "bin" / "python")
-    assert program[3] == "fusiond.live"
+    # The interpreter by the name that the installed script has for it.
+    script = (PREFIX / "bin" / "fusiond").read_text().splitlines()[0]
+    assert program[0] == script.removeprefix("#!")
+    assert program[0].startswith(str(PREFIX / "bin" / "python"))
+    assert program[1:4] == ["-P", "-m", "fusiond.live"]
 
 
 def _check_state(stands: dict[str, Any]) -> None:
