@@ -81,9 +81,8 @@ class ImuScreening:
         self._newest: Stamps = np.zeros(1, dtype=np.int64)
         self._ahead_ns = 0
         """Arrival of anything else since which stamps lie ahead, or 0."""
-        self.lags = False
-        """True if the newest sample was too old to navigate by when something else arrived last,
-        and so to start by: a stream whose stamps have gone back."""
+        self._arrived_ns, self._lags = 0, False
+        """Arrival of anything else since `look_behind`, or 0, and what that found."""
         self._troubles: dict[str, _Trouble] = {}
 
     def silence(self, silent_s: float | None) -> str:
@@ -109,8 +108,7 @@ class ImuScreening:
     def arrived(self, seen_ns: int, imu: ImuBuffer) -> bool:
         """Something else has arrived at `seen_ns`; True if stamps lie ahead of that for long: no
         sample can be of an instant that has not come."""
-        if imu.end:
-            self.lags = seen_ns - imu.latest_ns > self._config.gap_s * 1e9
+        self._arrived_ns = seen_ns
         if not imu.end or imu.latest_ns <= seen_ns + AHEAD_NS:
             self._ahead_ns = 0 if imu.end else self._ahead_ns
             return False
@@ -125,6 +123,14 @@ class ImuScreening:
         self._check.restart()
         self._latest_ns = None
         return True
+
+    def look_behind(self, imu: ImuBuffer) -> bool:
+        """Compare the newest sample with what has arrived, once all that has come is in `imu`; True
+        if it is too old to navigate by, and so to start by: its stamps have gone back."""
+        if self._arrived_ns and imu.end:
+            self._lags = self._arrived_ns - imu.latest_ns > self._config.gap_s * 1e9
+            self._arrived_ns = 0
+        return self._lags
 
     def change(self) -> None:
         """Reset for another unit: what was seen of the first says nothing of it."""

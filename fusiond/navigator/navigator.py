@@ -322,7 +322,7 @@ class Navigator:
 
     def _begin(self) -> bool:
         """Start the filter if the alignment is ready; False while it is not."""
-        if self._screening.lags:
+        if self._screening.look_behind(self.imu):
             return False
         start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
         too_old = start is None or self._start_is_too_old()

@@ -209,3 +209,22 @@ def test_nothing_starts_by_samples_that_are_too_old_to_navigate_by() -> None:
     assert events[:2] == ["aligned", "imu_time"]
     assert events.count("aligned") == 2
     assert set(modes) <= {Mode.WAITING, Mode.ALIGNING}
+
+
+def test_a_daemon_of_one_tick_a_second_starts() -> None:
+    """What has arrived since the last tick is younger than the samples of that tick."""
+    d, told = drive(), list[str]()
+    alignment = {**CONFIG["alignment"], "heading": ["gnss_course"]}
+    config = Config.model_validate({**CONFIG, "alignment": alignment})
+    navigator = Navigator(config, on_event=lambda code, _: told.append(code))
+    second, behind = round(RATE_HZ), int(d.times[0])
+    for first in range(second // 4, 40 * second, second):  # fixes come three quarters after a tick
+        rows = slice(first, first + second)
+        now = int(d.times[rows][-1])
+        for m in d.measurements:
+            if behind < m.t_seen_ns <= now:
+                navigator.add(m, m.t_seen_ns, 0.0, m.t_seen_ns)
+        navigator.add_imu(d.times[rows], d.samples[rows])
+        navigator.advance()
+        behind = now
+    assert "aligned" in told
