@@ -63,10 +63,10 @@ def test_stated_sigma_is_honest(name: str, monkeypatch: pytest.MonkeyPatch) -> N
 def test_accelerometer_biases_as_noise_are_honest() -> None:
     """The IMU has the biases of paper 002, of which `ins17` has no states. A degree of attitude,
     velocity and position in [0.7, 1.4], over runs and instants; the covariance analysis of the
-    study expects 0.83 to 0.88, and 60 runs know it to 0.06, one sigma, at one instant. Position
+    study expects 0.83 to 0.88, and 30 runs know it to 0.09, one sigma, at one instant. Position
     within 1.2 of that of `ins23`."""
     models = {name: flight.model(name) for name in ("ins23", "ins17")}
-    runs = [fly(models, 1000.0, 200, False, 37, number) for number in range(60)]
+    runs = [fly(models, 1000.0, 200, False, 37, number) for number in range(30)]
     core = slice(0, 9)
     square = {}
     for name in models:
