@@ -30,8 +30,8 @@ from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import ANTENNA_M, SCENARIOS, random_streams
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.faults.runs import compared
-from fusiond.studies.faults.scoring import QUANTITIES
+from fusiond.studies.faults.error_sigma_score import QUANTITIES
+from fusiond.studies.faults.runs import error_sample
 from fusiond.studies.faults.sensor_data import gnss_fixes
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ class Process:
             return np.zeros(len(QUANTITIES))
         at = replace(said, t_ns=said.t_ns - BEGIN_NS)
         true = self._data.truth.at(np.array([at.t_ns * 1e-9]))
-        return np.array(compared(at, true).ratios)
+        return np.array(error_sample(at, true).ratios)
 
 
 def restarted(old: Process, data: Received, row: int, gap_s: float) -> tuple[Array, Array]:

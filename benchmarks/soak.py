@@ -27,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fusiond.studies.faults.scoring import MOST_SIGMA, NAVIGATING
+from fusiond.studies.faults.error_sigma_score import MOST_SIGMA, NAVIGATING
 from tests.live.rig import Rig, network_of_its_own, rig, under_way
 from tests.live.wire_faults import FAULTS
 

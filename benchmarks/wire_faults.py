@@ -21,7 +21,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fusiond.studies.faults.tables import matrix
+from fusiond.studies.faults.tables import matrix_table
 from tests.live.rig import network_of_its_own
 from tests.live.wire_faults import ALL, FAULTS
 from tests.live.wire_runs import judged, rows, run_row
@@ -68,7 +68,7 @@ def main() -> int:
             if asked.json is not None:
                 document = {"seed": asked.seed, "rows": merged(asked.json, found)}
                 asked.json.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
-    text = matrix(merged(asked.json, found))
+    text = matrix_table(merged(asked.json, found))
     if asked.table is not None:
         asked.table.write_text(text)
     print(text, end="")

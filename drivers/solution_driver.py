@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.decoder_options import SolutionDecoding
-from drivers.nmea.foreign_protocols import named
+from drivers.nmea.foreign_protocols import protocol_sentence
 from drivers.nmea.mixed_framing import StreamSplitter
 from drivers.nmea.reasons import MANY
 from drivers.receiver import ReceiverDriver, ReceiverOptions
@@ -80,7 +80,7 @@ class SolutionDriver(ReceiverDriver):
                 "UBX frames arrive with wrong checksums: check ground, cable length and that "
                 "nobody else reads this port"
             )
-        found = named(bytes(self._foreign))
+        found = protocol_sentence(bytes(self._foreign))
         return "" if f'driver = "{self.kind}"' in found else found
 
     @property

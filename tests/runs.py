@@ -22,7 +22,7 @@ from fusiond.navigation.standstill import Window
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 
 __all__ = [
     "ORIGIN",
@@ -35,7 +35,7 @@ __all__ = [
     "initial_sd",
     "level_nav",
     "make_estimator",
-    "metres",
+    "metres_per_unit",
     "nav_error",
     "random_attitude",
     "rest",

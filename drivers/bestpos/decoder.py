@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from drivers.bestpos.framing import Log, LogSplitter
 from drivers.measurements import Measurement
-from drivers.nmea.reasons import note
+from drivers.nmea.reasons import count_name
 from drivers.plausible import LEAP_SECONDS, within
 from drivers.raw.weeks import utc_as_reported
 from drivers.solution import Solution
@@ -109,7 +109,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
                 self._group(log, found)
             else:
                 self.counters["logs_not_used"] += 1
-                note(self.left_out, name)
+                count_name(self.left_out, name)
                 return
         except BadFieldError:
             self.counters["bad_field"] += 1

@@ -2,7 +2,7 @@
 
 An epoch closes when the time of day changes, when a sentence repeats, when its last one came, or
 on `silence`. Which one is the last is configured, or learned, as is where a receiver pauses inside
-an epoch (drivers.nmea.cycle).
+an epoch (drivers.nmea.sentence_order).
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import (
     Measurement,
 )
-from drivers.nmea.cycle import Cycle
-from drivers.nmea.epochs import (
+from drivers.nmea.epoch_assembly import (
     FORMATTERS,
     MAX_CYCLE,
     TALKERS,
     Epoch,
     time_of_day_ns,
 )
+from drivers.nmea.epoch_to_measurement import EpochConverter
 from drivers.nmea.fields import BadFieldError
-from drivers.nmea.judge import EpochJudge
 from drivers.nmea.mixed_framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.reasons import (
     ATTITUDES,
@@ -32,13 +31,14 @@ from drivers.nmea.reasons import (
     POSITIONS,
     Received,
     cautions,
+    count_name,
     no_fix,
-    note,
     nothing_verified,
-    own_name,
+    proprietary_name,
 )
+from drivers.nmea.sentence_order import SentenceOrder
 from drivers.nmea.time import (
-    one_time,
+    same_printed_time,
     time_step_ns,
 )
 
@@ -77,10 +77,10 @@ class NmeaDecoder:
         self.received = Received()
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
-        self._judge = EpochJudge(source, self._decoding, self.counters, self.received)
+        self._judge = EpochConverter(source, self._decoding, self.counters, self.received)
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
-        self._cycle = Cycle()
+        self._cycle = SentenceOrder()
         self._closed: Epoch | None = None
         """The epoch before."""
         self._closed_by = ""
@@ -155,24 +155,26 @@ class NmeaDecoder:
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
             own = sentence.talker == "P" or sentence.address in (*OWN_SENTENCES, *ATTITUDES)
-            name = own_name(sentence.address, sentence.fields) if own else sentence.formatter
-            note(self.received.unused, name)
+            name = (
+                proprietary_name(sentence.address, sentence.fields) if own else sentence.formatter
+            )
+            count_name(self.received.unused, name)
             if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ
-                note(self.received.talkers, sentence.address[:2])
+                count_name(self.received.talkers, sentence.address[:2])
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
             if sentence.formatter in POSITIONS:
-                note(self.received.talkers, sentence.talker)
+                count_name(self.received.talkers, sentence.talker)
             else:
-                note(self.received.unused, sentence.formatter)
+                count_name(self.received.unused, sentence.formatter)
             return
         try:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
             self.counters["bad_field"] += 1
             return
-        note(self.received.used, sentence.formatter)
+        count_name(self.received.used, sentence.formatter)
         if sentence.formatter == "GGA" and sentence.fields[5:6] not in ((), ("",), ("0",)):
             self.gga = sentence.raw
 
@@ -243,7 +245,7 @@ class NmeaDecoder:
         if epoch.time_of_day_ns is None:
             return True
         step_ns = time_step_ns(sentence)
-        return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
+        return same_printed_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
     def _given_already(self, time_ns: int, sentence: Sentence) -> bool:
         """True if a better sentence gave the position at this instant: many bursts end with GLL,

@@ -62,7 +62,7 @@ def _plan(table: Mapping[str, object]) -> list[tuple[str, Convert | None]]:
 _PLANS: dict[str, list[tuple[str, Convert | None]]] = {}
 
 
-def typed(formatter: str, printed: Sequence[str]) -> Fields:
+def typed_fields(formatter: str, printed: Sequence[str]) -> Fields:
     """The fields of a sentence. ValueError for one that is not of its type."""
     plan = _PLANS.get(formatter)
     if plan is None:
@@ -87,7 +87,7 @@ MINUTE_M = 1852.0
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
 
 
-class Printed(NamedTuple):
+class PrintedPosition(NamedTuple):
     """Latitude and longitude (deg) of a sentence, and one step of their last digits (m), that of
     the longitude at the equator."""
 
@@ -149,7 +149,7 @@ def step(printed: str) -> float:
     return 10.0 ** -len(printed.partition(".")[2])
 
 
-def position(fields: Fields, first: int = 1) -> Printed | None:
+def position(fields: Fields, first: int = 1) -> PrintedPosition | None:
     """Position from the fields `lat`, `NS`, `lon`, `EW`, consecutive from number `first` on."""
     lat, lon = number(fields, "lat"), number(fields, "lon")
     if lat is None or lon is None:
@@ -160,4 +160,4 @@ def position(fields: Fields, first: int = 1) -> Printed | None:
         raise BadFieldError(f"not a position: {printed}")
     if abs(lat) > 90.0 or abs(lon) > 180.0:
         raise BadFieldError(f"no such place: {lat} {lon}")
-    return Printed(lat, lon, MINUTE_M * step(parts[0]), MINUTE_M * step(parts[2]))
+    return PrintedPosition(lat, lon, MINUTE_M * step(parts[0]), MINUTE_M * step(parts[2]))

@@ -181,7 +181,7 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
 )
 
 
-def named(data: bytes) -> str:
+def protocol_sentence(data: bytes) -> str:
     """Sentence on the protocol of these bytes; "" if unknown."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 
-from drivers.nmea.foreign_protocols import named
+from drivers.nmea.foreign_protocols import protocol_sentence
 
 REFUSALS = {
     "no_fix": "the receiver has no fix",
@@ -105,13 +105,13 @@ class Received:
     """Invalid printed date of RMC."""
 
 
-def note(names: Counter[str], name: str) -> None:
+def count_name(names: Counter[str], name: str) -> None:
     """Count a name; of a stream of nonsense the first few."""
     if name in names or len(names) < MOST_NAMES:
         names[name] += 1
 
 
-def own_name(address: str, fields: Sequence[str]) -> str:
+def proprietary_name(address: str, fields: Sequence[str]) -> str:
     """Name of a maker's own sentence by its address, and by its kind if the first field states
     it."""
     kind = fields[0] if fields else ""
@@ -152,7 +152,7 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
             f"{counters['ubx_damaged']} UBX frames arrive with wrong checksums: check ground, "
             "cable length and that nobody else reads this port"
         )
-    return named(unread)
+    return protocol_sentence(unread)
 
 
 def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:

@@ -50,7 +50,7 @@ def parse_time_of_day(text: str) -> int | None:
     return (hour * 3600 + minute * 60 + second) * SECOND_NS + fraction_ns
 
 
-def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
+def same_printed_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
     """True if two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
     it to two."""
     if a_step_ns == b_step_ns:

@@ -22,7 +22,7 @@ from drivers.byte_budget import ByteBudget
 from drivers.detached_call import aside
 from drivers.network_port import connect
 from drivers.nmea.mixed_framing import Frame, StreamSplitter
-from drivers.ntrip.reply import CasterRefusedError, CasterReply, request
+from drivers.ntrip.protocol import CasterRefusedError, CasterReply, mountpoint_request
 from drivers.port import READ_BYTES
 
 PASSWORD_VARIABLE = "FUSIOND_NTRIP_PASSWORD"
@@ -182,7 +182,7 @@ class NtripClient:
         try:
             password = os.environ.get(PASSWORD_VARIABLE, "")
             o = self._options
-            writer.write(request(host, port, o.mountpoint, o.user, password))
+            writer.write(mountpoint_request(host, port, o.mountpoint, o.user, password))
             self._counters["ntrip_connected"] += 1
             if o.send_gga:
                 upward = asyncio.create_task(self._send_positions(writer))

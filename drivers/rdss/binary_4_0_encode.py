@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from drivers.rdss.framing import checksum, whole_frame
+from drivers.rdss.framing import checksum, encode_frame
 from drivers.rdss.messages import (
     CARD_FAULTS,
     FORBIDDEN,
@@ -246,4 +246,4 @@ def _encode(m: Message) -> bytes:
 
 def encode(message: Message) -> bytes:
     """The frame that says `message`. EncodeError if 4.0 cannot say it or it must not be sent."""
-    return whole_frame(_encode, message)
+    return encode_frame(_encode, message)

@@ -21,7 +21,7 @@ def checksum(data: bytes | bytearray | memoryview) -> int:
     return reduce(xor, data, 0)
 
 
-def whole_frame(say: Callable[[Message], bytes], message: Message) -> bytes:
+def encode_frame(say: Callable[[Message], bytes], message: Message) -> bytes:
     """The frame that says `message`. EncodeError where a value of it does not fit its field."""
     try:
         return say(message)

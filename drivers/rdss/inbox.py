@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from drivers.rdss.envelope import (
-    RECEIPT,
-    TEXT,
-    CutError,
-    DamagedError,
-    Envelope,
-    Receipted,
-    VersionError,
-    opened,
-    read_receipt,
-    read_text,
-)
 from drivers.rdss.mail import Fault, FleetFix, Kind, MessageReceived
 from drivers.rdss.messages import Fix, Text
-from drivers.rdss.report import PositionReport, decode_report
-from drivers.rdss.session import Session
+from drivers.rdss.position_report_coding import PositionReport, decode_report
+from drivers.rdss.request_cycle_state import RequestCycleState
 from drivers.rdss.state_tables import MailReady
-from drivers.rdss.text_coding import Wording, plain_text
+from drivers.rdss.text_coding import EncodedText, printable_text
+from drivers.rdss.vehicle_message_envelope import (
+    RECEIPT,
+    TEXT,
+    Envelope,
+    EnvelopeDamagedError,
+    EnvelopeLengthError,
+    EnvelopeVersionError,
+    Receipt,
+    decode_receipt_body,
+    decode_text_body,
+    envelope_from_text,
+)
 
 MOST_REMEMBERED = 128
 """Texts that asked for a receipt: two hours of a card that is sent one a minute (our choice)."""
@@ -33,7 +33,7 @@ class Inbox:
     """Inbox; it passes on all messages, damaged ones too. `seen` are the texts that requested a
     receipt, to recognise repetitions."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RequestCycleState) -> None:
         self._session = session
         self.seen: OrderedDict[Seen, None] = OrderedDict()
 
@@ -41,7 +41,7 @@ class Inbox:
         """Mail from a message of the terminal."""
         session = self._session
         session.counters["messages_received"] += 1
-        wording = Wording(message.payload, message.encoding, message.odd)
+        wording = EncodedText(message.payload, message.encoding, message.odd)
         card = session.identity.user if session.identity is not None else 0
         receiver = message.user or card
         fault: Fault = ""
@@ -53,18 +53,18 @@ class Inbox:
         else:
             envelope, fault = _opened(wording)
         kind: Kind = "text"
-        text = None if fault in ("cut", "damaged", "version") else plain_text(wording)
+        text = None if fault in ("cut", "damaged", "version") else printable_text(wording)
         report: PositionReport | None = None
         number: int | None = None
         repeated = False
         if envelope is not None:
             if envelope.kind == TEXT:
-                number, data = read_text(envelope.body)
-                text = plain_text(Wording(data, "mixed"))
-                repeated = self._asks(message.sender, Receipted(number, envelope.crc), t_ns)
+                number, data = decode_text_body(envelope.body)
+                text = printable_text(EncodedText(data, "mixed"))
+                repeated = self._asks(message.sender, Receipt(number, envelope.crc), t_ns)
             elif envelope.kind == RECEIPT:
                 kind, text = "receipt", None
-                receipted = read_receipt(envelope.body)
+                receipted = decode_receipt_body(envelope.body)
                 number = receipted.number
                 session.outbox.receipt(message.sender, receipted)
             else:
@@ -112,7 +112,7 @@ class Inbox:
             )
         )
 
-    def _asks(self, sender: int, receipted: Receipted, t_ns: int) -> bool:
+    def _asks(self, sender: int, receipted: Receipt, t_ns: int) -> bool:
         """Queue the receipt for a text; whether the text came before."""
         session = self._session
         if session.options.transmit:
@@ -128,13 +128,13 @@ class Inbox:
         return repeated
 
 
-def _opened(wording: Wording) -> tuple[Envelope | None, Fault]:
+def _opened(wording: EncodedText) -> tuple[Envelope | None, Fault]:
     """Envelope, or the name of its fault."""
     try:
-        return opened(wording), ""
-    except CutError:
+        return envelope_from_text(wording), ""
+    except EnvelopeLengthError:
         return None, "cut"
-    except DamagedError:
+    except EnvelopeDamagedError:
         return None, "damaged"
-    except VersionError:
+    except EnvelopeVersionError:
         return None, "version"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal
 
 from drivers.immutable import immutable
-from drivers.rdss.report import PositionReport
+from drivers.rdss.position_report_coding import PositionReport
 
 TextEncoding = Literal["chinese", "code", "mixed"]
 """Encodings: Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes.

@@ -25,7 +25,7 @@ from drivers.rdss.messages import (
     Text,
     Unknown,
 )
-from drivers.rdss.session import Session
+from drivers.rdss.request_cycle_state import RequestCycleState
 from drivers.rdss.state_tables import (
     ALWAYS,
     BEAM_POLL_NS,
@@ -46,10 +46,10 @@ from drivers.rdss.state_tables import (
 )
 
 
-class Replies:
-    """Effect of messages on a `Session`; the counters are listed at `Terminal`."""
+class MessageEffects:
+    """Effect of messages on a `RequestCycleState`; the counters are listed at `Terminal`."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RequestCycleState) -> None:
         self._session = session
         self.inbox = Inbox(session)
         self._fraction = FractionReader(session.options.t_fraction)

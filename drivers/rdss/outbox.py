@@ -11,20 +11,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from drivers.rdss.envelope import (
-    RECEIPT,
-    TEXT,
-    Carriage,
-    Receipted,
-    carried,
-    crc_of,
-    receipt_body,
-    sealed,
-    text_body,
-)
 from drivers.rdss.mail import Kind, MessageRefusedError, Stage
 from drivers.rdss.messages import Outcome
-from drivers.rdss.report import (
+from drivers.rdss.position_report_coding import (
     REPORT,
     SHORT_REPORT,
     PositionReport,
@@ -32,7 +21,18 @@ from drivers.rdss.report import (
     encode_short,
 )
 from drivers.rdss.state_tables import GIVE_UP_NS
-from drivers.rdss.text_coding import Wording, level_bits, worded
+from drivers.rdss.text_coding import EncodedText, card_level_bits, encode_shortest
+from drivers.rdss.vehicle_message_envelope import (
+    RECEIPT,
+    TEXT,
+    Carriage,
+    Receipt,
+    encode_envelope,
+    encode_receipt_body,
+    encode_text_body,
+    envelope_crc,
+    envelope_to_text,
+)
 
 MOST_WAITING = 32
 """Half an hour of a card of 60 s; who queues more gets a refusal (our choice)."""
@@ -65,10 +65,10 @@ class Outgoing:
     key: str
     receiver: int
     kind: Kind
-    wordings: tuple[Wording, ...]
+    wordings: tuple[EncodedText, ...]
     created_ns: int
     text: str | None = None
-    receipted: Receipted | None = None
+    receipted: Receipt | None = None
     attempts: int = 0
     refusals: int = 0
     stage: Stage = "queued"
@@ -77,7 +77,7 @@ class Outgoing:
 
 
 @dataclass(slots=True)
-class Change:
+class StageChange:
     """A message has come to another stage, or is queued again: as it was then."""
 
     message: Outgoing
@@ -92,7 +92,7 @@ class Outbox:
     counters: Counter[str]
     expiry_ns: int
     waiting: list[Outgoing] = field(default_factory=list)
-    changes: list[Change] = field(default_factory=list)
+    changes: list[StageChange] = field(default_factory=list)
     number: int = 0
     carriage: Carriage = "binary"
     """Encoding of texts with a receipt, and of receipts."""
@@ -120,18 +120,18 @@ class Outbox:
     def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
         """Queue a report in place of one that waits. Raises `MessageRefusedError`."""
         try:
-            full = sealed(REPORT, encode_report(report))
-            short = sealed(SHORT_REPORT, encode_short(report))
+            full = encode_envelope(REPORT, encode_report(report))
+            short = encode_envelope(SHORT_REPORT, encode_short(report))
         except ValueError as error:
             raise MessageRefusedError("message_unsayable", str(error)) from None
-        wordings = carried(full, self.carriage), carried(short, self.carriage)
+        wordings = envelope_to_text(full, self.carriage), envelope_to_text(short, self.carriage)
         self._look_at(wordings[-1])
         for older in [m for m in self.waiting if m.kind == "report" and m.receiver == receiver]:
             if older is not self.in_flight:
                 self._end(older, "superseded", "a newer report is due")
         self._queue(Outgoing(key, receiver, "report", wordings, t_ns))
 
-    def post_receipt(self, receiver: int, receipted: Receipted, t_ns: int) -> None:
+    def post_receipt(self, receiver: int, receipted: Receipt, t_ns: int) -> None:
         """Queue the receipt for a message that came; the same one again waits once."""
         key = f"receipt-{receiver}-{receipted.number}-{receipted.crc:04x}"
         if any(m.key == key for m in self.waiting):
@@ -140,10 +140,12 @@ class Outbox:
         if sum(m.kind == "receipt" for m in self.waiting) >= MOST_WAITING:
             self.counters["receipt_queue_full"] += 1
             return
-        if self.comm_level is not None and not level_bits(self.comm_level):
+        if self.comm_level is not None and not card_level_bits(self.comm_level):
             self.counters["receipt_forbidden"] += 1
             return
-        wording = carried(sealed(RECEIPT, receipt_body(receipted)), self.carriage)
+        wording = envelope_to_text(
+            encode_envelope(RECEIPT, encode_receipt_body(receipted)), self.carriage
+        )
         self._queue(Outgoing(key, receiver, "receipt", (wording,), t_ns))
 
     def restore(self, messages: Sequence[Outgoing], number: int) -> None:
@@ -153,19 +155,19 @@ class Outbox:
         for message in self.waiting:
             self._report(message, message.stage, "kept over a restart")
 
-    def _worded(self, text: str, receipt: bool) -> tuple[Wording, Receipted | None]:
+    def _worded(self, text: str, receipt: bool) -> tuple[EncodedText, Receipt | None]:
         if not receipt:
-            return worded(text), None
+            return encode_shortest(text), None
         number = self.number % 0xFFFF + 1
-        envelope = sealed(TEXT, text_body(number, text.encode("gb18030")))
+        envelope = encode_envelope(TEXT, encode_text_body(number, text.encode("gb18030")))
         self.number = number
-        return carried(envelope, self.carriage), Receipted(number, crc_of(envelope))
+        return envelope_to_text(envelope, self.carriage), Receipt(number, envelope_crc(envelope))
 
-    def _look_at(self, wording: Wording) -> None:
+    def _look_at(self, wording: EncodedText) -> None:
         """Refuse a message that the known card can never send."""
         if self.comm_level is None:
             return
-        most = level_bits(self.comm_level)
+        most = card_level_bits(self.comm_level)
         if not most:
             text = f"the card's communication level, {self.comm_level}, allows no message"
             raise MessageRefusedError("message_forbidden", text)
@@ -190,9 +192,9 @@ class Outbox:
         """Next instant of work: a message, a receipt that did not come, an end."""
         return min((min(m.not_before_ns, self._end_ns(m)) for m in self.waiting), default=None)
 
-    def wording(self, message: Outgoing) -> Wording | None:
+    def wording(self, message: Outgoing) -> EncodedText | None:
         """Wording for this card; None ends the message."""
-        most = level_bits(self.comm_level or 0)
+        most = card_level_bits(self.comm_level or 0)
         for wording in message.wordings:
             if wording.bits <= most:
                 return wording
@@ -257,7 +259,7 @@ class Outbox:
         else:
             self._report(message, "queued", "no feedback: it may have left")
 
-    def receipt(self, sender: int, receipted: Receipted) -> None:
+    def receipt(self, sender: int, receipted: Receipt) -> None:
         """Note a receipt from this card."""
         for message in self.waiting:
             if message.receiver == sender and message.receipted == receipted:
@@ -297,15 +299,15 @@ class Outbox:
 
     def _report(self, message: Outgoing, stage: Stage, why: str) -> None:
         message.why = why
-        self.changes.append(Change(message, stage, why))
+        self.changes.append(StageChange(message, stage, why))
 
-    def take_changes(self) -> Iterator[Change]:
+    def take_changes(self) -> Iterator[StageChange]:
         """Changes since the last call."""
         changes, self.changes = self.changes, []
         return iter(changes)
 
 
-class Turns:
+class StrideScheduler:
     """Order of fixes and messageswhere both wait: messages have `share`.
 
     Stride scheduling (Waldspurger and Weihl, MIT/LCS/TM-528, 1995): each turn costs its class the

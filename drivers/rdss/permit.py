@@ -84,7 +84,7 @@ class TransmitPermit:
         return self._inbound_changed
 
 
-class Pace:
+class TransmissionSpacing:
     """The spacing of transmissions, requests and messages alike: the card's service frequency, from
     the last byte of the one before.
 

@@ -13,7 +13,7 @@ the actions they return, and `next_deadline_ns`, when to call `tick` next. Only 
 What is never sent: a lift of radio silence, an emergency request; a request or a message while
 another is in flight, earlier than the card's service frequency after the one before, while the
 terminal has said that it is suppressed or silent, or at all without the option `transmit`. Where a
-request and a message both wait, `outbox.Turns` says which goes.
+request and a message both wait, `outbox.StrideScheduler` says which goes.
 Figures: PROTOCOLS 1.1 and 1.5.
 """
 
@@ -22,11 +22,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.rdss.deadlines import Deadlines
-from drivers.rdss.height import HeightSource
+from drivers.rdss.deadline_actions import DeadlineActions
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import MessageRefusedError
-from drivers.rdss.message_effects import Replies
+from drivers.rdss.message_effects import MessageEffects
 from drivers.rdss.messages import (
     BeamPower,
     Family,
@@ -38,8 +37,9 @@ from drivers.rdss.messages import (
     Text,
 )
 from drivers.rdss.outbox import Outbox
-from drivers.rdss.report import PositionReport
-from drivers.rdss.session import Session
+from drivers.rdss.position_report_coding import PositionReport
+from drivers.rdss.request_cycle_state import RequestCycleState
+from drivers.rdss.request_height import HeightSource
 from drivers.rdss.state_tables import (
     DETAIL,
     IN_FLIGHT,
@@ -73,11 +73,11 @@ class Terminal:
     def __init__(self, options: TerminalOptions, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self._options = options
-        self._session = Session(options, self.counters)
-        self._replies = Replies(self._session)
+        self._session = RequestCycleState(options, self.counters)
+        self._replies = MessageEffects(self._session)
         self.height = HeightSource(options)
         self._t_ns = 0
-        self._deadlines = Deadlines(options, self._session, self.height, self.counters)
+        self._deadlines = DeadlineActions(options, self._session, self.height, self.counters)
 
     # ------------------------------------------------------------------ inputs
 

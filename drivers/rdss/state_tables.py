@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from drivers.rdss.envelope import Carriage
 from drivers.rdss.fraction import FractionUnit
 from drivers.rdss.mail import Mail
 from drivers.rdss.messages import Family, Fix, Outcome
+from drivers.rdss.vehicle_message_envelope import Carriage
 
 SECOND = 1_000_000_000
 PROBE_BAUDS = (115200, 19200, 9600)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from drivers.rdss.framing import checksum, whole_frame
+from drivers.rdss.framing import checksum, encode_frame
 from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     FORBIDDEN,
@@ -200,4 +200,4 @@ def _encode(m: Message) -> bytes:
 
 def encode(message: Message) -> bytes:
     """The sentence that says `message`. EncodeError if 2.1 cannot say it or it must not be sent."""
-    return whole_frame(_encode, message)
+    return encode_frame(_encode, message)

@@ -23,7 +23,7 @@ LEVEL_BITS = (0, *map(min, PLAIN_BITS, ENCRYPTED_BITS))
 MIXED = b"\xa4"
 
 
-class Wording(NamedTuple):
+class EncodedText(NamedTuple):
     """Payload for TXSQ and CCTXA; `odd` as in `TextRequest`."""
 
     payload: bytes
@@ -38,36 +38,36 @@ class Wording(NamedTuple):
         return 8 * len(self.payload) - 4 * self.odd
 
 
-def level_bits(comm_level: int) -> int:
+def card_level_bits(comm_level: int) -> int:
     """Most bits of one message of a card of this level."""
     return LEVEL_BITS[min(comm_level, len(LEVEL_BITS) - 1)]
 
 
-def worded(text: str) -> Wording:
+def encode_shortest(text: str) -> EncodedText:
     """A text in the encoding that takes least. ValueError for what GB 18030 cannot say."""
     if text and text.isascii() and text.isdigit():
-        return digits(text)
+        return encode_digits(text)
     try:
         chinese = text.encode("gb2312")
     except UnicodeEncodeError:
-        return mixed(text.encode("gb18030"))
+        return encode_bytes(text.encode("gb18030"))
     if text and len(chinese) == 2 * len(text):
-        return Wording(chinese, "chinese")
-    return mixed(chinese)
+        return EncodedText(chinese, "chinese")
+    return encode_bytes(chinese)
 
 
-def mixed(data: bytes) -> Wording:
+def encode_bytes(data: bytes) -> EncodedText:
     """Any bytes."""
-    return Wording(MIXED + data, "mixed")
+    return EncodedText(MIXED + data, "mixed")
 
 
-def digits(text: str) -> Wording:
+def encode_digits(text: str) -> EncodedText:
     """Decimal digits, two a byte."""
     odd = len(text) % 2 == 1
-    return Wording(bytes.fromhex(text + "0" * odd), "code", odd)
+    return EncodedText(bytes.fromhex(text + "0" * odd), "code", odd)
 
 
-def plain_text(wording: Wording) -> str | None:
+def printable_text(wording: EncodedText) -> str | None:
     """Readable text; None for bytes that are no text. Control characters are left out."""
     if wording.encoding == "code":
         text = wording.payload.hex().upper()

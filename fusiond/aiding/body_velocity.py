@@ -11,9 +11,9 @@ vehicle's by the mounting m:
 m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
 seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the share p of a
 step q that its rounding takes off are estimated where the model has their blocks
-(fusiond.models.vehicle). c is what share of a typed drift counts, as the vehicle has shown
-(fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors computed minus
-true, parameters true minus estimated, and e_i the axis's unit vector:
+(fusiond.models.vehicle_parameter_blocks). c is what share of a typed drift counts, as the vehicle
+has shown (fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors
+computed minus true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
@@ -54,7 +54,7 @@ from fusiond.aiding.initialisation import STEADY, SpeedCandidate
 from fusiond.aiding.preintegrated_measurement import add_of_force, turning
 from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.model import Model
-from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
+from fusiond.models.vehicle_parameter_blocks import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR

@@ -2,8 +2,8 @@
 
 A row is named by its log, the digest of the configuration and the version of fusiond: a batch with
 another configuration adds rows to the same file, and one that has its rows already does nothing.
-`ended` is that of `fusiond.workers.outcome`, or `not navigated`; `reason` says more. Rows hold
-nothing that depends on how many workers there were or how long they took.
+`ended` is that of `fusiond.workers.runner_interface`, or `not navigated`; `reason` says more. Rows
+hold nothing that depends on how many workers there were or how long they took.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 
 from fusiond.batch.log_row import drive_row
 from fusiond.configuration.load import config_digest, load_config
-from fusiond.files.parquet_rows import Row, RowFile
-from fusiond.workers.outcome import Outcome, Runner
+from fusiond.files.resumable_parquet import ResumableRows, Row
+from fusiond.workers.runner_interface import Outcome, Runner
 
 _NAME = ("log", "config_digest", "version")
 
@@ -37,7 +37,7 @@ def run_batch(
     digest, release = config_digest(load_config(config_path)), version("fusiond")
     wanted = {str(log.resolve()): log for log in logs}
     ended: Counter[str] = Counter()
-    with RowFile(out) as file:
+    with ResumableRows(out) as file:
         known = {tuple(row.get(name) for name in _NAME) for row in file.rows}
         todo = [name for name in wanted if (name, digest, release) not in known]
         ended["there"] = len(wanted) - len(todo)

@@ -18,7 +18,7 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.measurement_csv import read_solution, read_truth
-from fusiond.files.parquet_rows import Row, flat
+from fusiond.files.resumable_parquet import Row, flattened
 from fusiond.offline.compare import NothingToCompareError, compare
 from fusiond.offline.measurement_files import READERS
 from fusiond.offline.process import process
@@ -66,7 +66,7 @@ def _recording(config_path: Path, files: list[Path]) -> Row:
     summary = replay(files, ReplayOptions(config=config_path))
     problems = [*summary.pop("problems"), *summary.pop("driver_faults")]
     figures = {k: v for k, v in summary.items() if k not in _NOT_OF_THE_DRIVE}
-    row = flat({"modes": figures.pop("modes"), **figures})
+    row = flattened({"modes": figures.pop("modes"), **figures})
     return row | ({"problems": "\n".join(map(str, problems))} if problems else {})
 
 
@@ -89,14 +89,14 @@ def _tables(config: Config, folder: Path) -> Row:
         except NothingToCompareError as error:
             return row | {"not_compared": str(error)}
     said = {k: v for k, v in errors.items() if not k.startswith(("expected_", "t_"))}
-    return row | flat({"error": said})
+    return row | flattened({"error": said})
 
 
 def _processed(result: dict[str, Any]) -> Row:
     """Figures of a run of `process`."""
     rows = result["solution_rows"]
     files = result["files"]
-    return flat(
+    return flattened(
         {
             "samples": files["imu"]["rows"],
             "rejected_rows": sum(sum(f["rejected"].values()) for f in files.values()),

@@ -21,12 +21,12 @@ import typer
 from fusiond.commands import (
     batch,
     configure,
+    daemon,
     dashboard,
-    live,
+    models_and_studies,
     offline,
     recordings,
     reporting,
-    research,
 )
 from fusiond.commands.status import status
 
@@ -48,11 +48,16 @@ def _root(
 
 # In the order of `--help`.
 COMMANDS = (
-    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor, status),
+    *(daemon.run, daemon.demo, dashboard.dashboard, daemon.check, daemon.doctor, status),
     *(recordings.replay, reporting.report),
     *(offline.process, offline.calibrate, offline.simulate, offline.compare),
     batch.batch,
-    *(research.schema, research.study, research.model, research.bench),
+    *(
+        models_and_studies.schema,
+        models_and_studies.study,
+        models_and_studies.model,
+        models_and_studies.bench,
+    ),
 )
 
 

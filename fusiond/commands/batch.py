@@ -20,7 +20,7 @@ from fusiond.commands.shared import (
 )
 
 if TYPE_CHECKING:
-    from fusiond.workers.outcome import Runner
+    from fusiond.workers.runner_interface import Runner
 
 Workers = Annotated[
     int | None, typer.Option(min=1, help="Processes; as many as there are processors by default.")
@@ -40,13 +40,13 @@ def runner_of(
 ) -> Iterator[Runner]:
     """Runner on local processes or on a cluster; exit 69 where none is available."""
     from fusiond.workers.cluster import Cluster, ClusterError  # noqa: PLC0415
-    from fusiond.workers.pool import Pool, PoolError, processors  # noqa: PLC0415
+    from fusiond.workers.pool import Pool, PoolError, processor_count  # noqa: PLC0415
 
     if workers is not None and cluster is not None:
         raise typer.BadParameter("--workers or --cluster: a cluster has its own workers")
     try:
         if cluster is None:
-            with Pool(workers or processors(), timeout_s) as pool:
+            with Pool(workers or processor_count(), timeout_s) as pool:
                 yield pool
             return
         with Cluster(cluster, timeout_s) as dask:
@@ -69,7 +69,7 @@ def row_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_UNAVAILABLE) from error
 
 
-def counted(ended: Mapping[str, int]) -> str:
+def outcome_counts(ended: Mapping[str, int]) -> str:
     """Count of rows by outcome."""
     return ", ".join(f"{count} {how}" for how, count in ended.items() if count) or "no rows"
 
@@ -96,6 +96,6 @@ def batch(
         progress_bar("drives") as bar,
     ):
         ended = run_batch(config, logs, out, runner, bar or (lambda done, total: None))
-    typer.echo(f"{out}: {counted(ended)}")
+    typer.echo(f"{out}: {outcome_counts(ended)}")
     if not ended.get("done") and not ended["there"]:
         raise typer.Exit(EXIT_DATA)

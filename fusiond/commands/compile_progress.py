@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO
 
-from fusiond.commands.shared import draws, freeze_imports
-from fusiond.workers.forked import Forked
+from fusiond.commands.shared import can_draw, freeze_imports
+from fusiond.workers.forked import ForkedJobs
 
 # A line of a log every so often, where a terminal's is written anew at each kernel.
 LINE_EVERY_S = 5.0
@@ -47,7 +47,7 @@ def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> 
     total = len(missing)
     progress(0, total)
     if kernels_can_be_kept():
-        with Forked(missing, load_compiler) as compiling:
+        with ForkedJobs(missing, load_compiler) as compiling:
             for done in compiling:
                 progress(done, total)
         for load in missing:
@@ -68,7 +68,7 @@ class Progress:
         from fusiond.live.service_manager import ServiceManager  # noqa: PLC0415
 
         self._out = out
-        self._draws = draws(out)
+        self._draws = can_draw(out)
         self._service = ServiceManager()
         self._started_s = time.monotonic()
         self._reported_s = -LINE_EVERY_S

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, freeze_imports, load
+from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, freeze_imports, load_or_exit
 
 if TYPE_CHECKING:
     from fusiond.dashboard.broker import Access
@@ -82,7 +82,7 @@ def _of(path: Path) -> Access:
     from fusiond.dashboard.broker import Access  # noqa: PLC0415
     from fusiond.outputs import broker_access  # noqa: PLC0415
 
-    options = load(path).mqtt
+    options = load_or_exit(path).mqtt
     with config_errors():
         password, tls = broker_access.password(options), broker_access.tls_context(options)
     return Access(options.host, options.port, options.username, password, tls)

@@ -19,7 +19,7 @@ from fusiond.commands.shared import (
     JsonPath,
     config_errors,
     data_errors,
-    load,
+    load_or_exit,
     progress_bar,
     spinner,
     write_json,
@@ -91,7 +91,7 @@ def process(
         raise typer.BadParameter("Give --imu or --can")
     if smooth and out is None:
         raise typer.BadParameter("--smooth: name a file to write with --out")
-    settings = load(config)
+    settings = load_or_exit(config)
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.process import process as run_process  # noqa: PLC0415
@@ -123,11 +123,11 @@ def _missing_packages() -> Iterator[None]:
 def _recording(logs: list[Path]) -> Pass:
     """A pass through the daemon's recording."""
     from fusiond.recording.reader import Log  # noqa: PLC0415
-    from fusiond.replay.calibration_replay import watched  # noqa: PLC0415
+    from fusiond.replay.replay_for_calibration import replay_for_calibration  # noqa: PLC0415
 
     # Its events are those of the drive, which has been: the report shows them.
     logging.getLogger("fusiond").addHandler(logging.NullHandler())
-    return lambda config, look: watched(Log(logs), config, look)
+    return lambda config, look: replay_for_calibration(Log(logs), config, look)
 
 
 def calibrate(
@@ -148,7 +148,7 @@ def calibrate(
     measurements = [_measurement_argument(text) for text in aid or []]
     if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and measurements):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
-    settings = load(config)
+    settings = load_or_exit(config)
     from fusiond.commands.recordings import log_errors  # noqa: PLC0415
 
     with compiling():

@@ -200,10 +200,10 @@ def export(
 def _export_measurements(recording: Log, folder: Path, out: Path, to: str) -> dict[str, int]:
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
     from fusiond.replay.csv_export import write_tables  # noqa: PLC0415
-    from fusiond.replay.replay_config import config_of  # noqa: PLC0415
+    from fusiond.replay.replay_config import replay_config  # noqa: PLC0415
     from fusiond.replay.rosbag_export import write_rosbag  # noqa: PLC0415
 
-    config = config_of(recording.about, folder)
+    config = replay_config(recording.about, folder)
     if to == "csv":
         return write_tables(recording, config, out)
     try:

@@ -54,7 +54,7 @@ def config_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_CONFIG) from error
 
 
-def load(path: Path) -> Config:
+def load_or_exit(path: Path) -> Config:
     """The configuration at `path`."""
     from fusiond.configuration.load import load_config  # noqa: PLC0415
 
@@ -85,14 +85,14 @@ def freeze_imports() -> None:
     gc.set_threshold(COLLECT_AFTER)
 
 
-def draws(stream: TextIO) -> bool:
+def can_draw(stream: TextIO) -> bool:
     """True if `stream` is a terminal that supports drawing."""
     return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def spinner(text: str) -> AbstractContextManager[object]:
     """Show a spinner on a terminal, nothing in a pipe."""
-    if not draws(sys.stderr):
+    if not can_draw(sys.stderr):
         return nullcontext()
     from rich.console import Console  # noqa: PLC0415
 
@@ -102,7 +102,7 @@ def spinner(text: str) -> AbstractContextManager[object]:
 @contextmanager
 def progress_bar(text: str) -> Iterator[Callable[[int, int], None] | None]:
     """A bar on a terminal, called with (done, total); nothing in a pipe."""
-    if not draws(sys.stderr):
+    if not can_draw(sys.stderr):
         yield None
         return
     from rich.console import Console  # noqa: PLC0415
@@ -113,12 +113,12 @@ def progress_bar(text: str) -> Iterator[Callable[[int, int], None] | None]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def plain(value: object) -> object:
+def to_json_types(value: object) -> object:
     """Convert a value to JSON types: nan and inf become null, paths text."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_types(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_types(item) for item in value]
     if isinstance(value, float):
         return value if isfinite(value) else None
     if value is None or isinstance(value, str | bool | int):
@@ -130,7 +130,7 @@ def write_json(value: object, path: str | None) -> None:
     """Write JSON to a file, to standard output for "-", nowhere for None."""
     if path is None:
         return
-    text = json.dumps(plain(value), indent=2, allow_nan=False)
+    text = json.dumps(to_json_types(value), indent=2, allow_nan=False)
     if path == "-":
         typer.echo(text)
         return

@@ -18,7 +18,7 @@ from fusiond.commands.shared import (
     EXIT_UNAVAILABLE,
     JsonPath,
     config_errors,
-    load,
+    load_or_exit,
     parse_mqtt,
     write_json,
 )
@@ -82,7 +82,7 @@ def status(
 
     access = None
     if config is not None:
-        settings = load(config)
+        settings = load_or_exit(config)
         access, vehicle = settings.mqtt, vehicle or settings.vehicle
         if not access.enabled:
             typer.echo(
@@ -94,8 +94,8 @@ def status(
         host, port = parse_mqtt(mqtt)
     try:
         with config_errors():
-            name, messages = chosen(
-                asyncio.run(ask(host, port, access, vehicle, wait)), vehicle, wait
+            name, messages = selected_vehicle(
+                asyncio.run(retained_messages(host, port, access, vehicle, wait)), vehicle, wait
             )
     except UnansweredError as error:
         write_json({"state": error.state, "why": str(error)}, json_path)
@@ -103,15 +103,15 @@ def status(
         raise typer.Exit(EXIT_UNAVAILABLE) from error
     answer = {"state": "online", "vehicle": name, **messages.topics}
     if json_path != "-":
-        from fusiond.commands.status_report import page  # noqa: PLC0415
+        from fusiond.commands.status_report import status_page  # noqa: PLC0415
 
-        typer.echo("\n".join(page(answer)))
+        typer.echo("\n".join(status_page(answer)))
     write_json(answer, json_path)
     if answer["status"]["mode"] not in USABLE:
         raise typer.Exit(EXIT_NO_SOLUTION)
 
 
-async def ask(
+async def retained_messages(
     host: str, port: int, access: Mqtt | None, vehicle: str | None, wait_s: float
 ) -> dict[str, VehicleMessages]:
     """Retained messages of each vehicle, or of `vehicle`, after at most `wait_s`.
@@ -179,7 +179,7 @@ def _receive(messages: VehicleMessages, topic: str, payload: bytes, retained: bo
         messages.live |= topic in _ASKED and not retained
 
 
-def chosen(
+def selected_vehicle(
     vehicles: dict[str, VehicleMessages], vehicle: str | None, wait_s: float
 ) -> tuple[str, VehicleMessages]:
     """Select the requested vehicle, if it answers. Raises `UnansweredError`."""

@@ -11,7 +11,7 @@ _SHOWN_REASONS = 2
 _UNKNOWN = "-"
 
 
-def page(answer: dict[str, Any]) -> list[str]:
+def status_page(answer: dict[str, Any]) -> list[str]:
     """Lines for people. `answer` has the messages by topic, `status` at least."""
     status = answer["status"]
     health, nav = answer.get("health"), answer.get("nav")
@@ -139,7 +139,7 @@ def _sources(
                 verdicts.get(name, {}).get("verdict") or source["verdict"] or _UNKNOWN,
             )
         )
-    head, *lines = columns(rows)
+    head, *lines = aligned_columns(rows)
     yield head
     for line, source in zip(lines, sources.values(), strict=True):
         yield line
@@ -185,7 +185,7 @@ def _time(seconds: float | None) -> str:
     return f"{seconds * 1e3:.0f} ms" if seconds < 1.0 else duration(seconds)
 
 
-def columns(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+def aligned_columns(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
     """Align rows of cells into columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

@@ -17,7 +17,7 @@ from fusiond.configuration.aiding import CompassAiding, GnssAiding, RawAiding, R
 from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 
 LONGEST_M: dict[VehicleClass, float] = {
     "road": 20.0,
@@ -151,7 +151,7 @@ def _compass(config: Config) -> Iterator[str]:
     for name, section in config.aiding.items():
         if isinstance(section, CompassAiding) and section.declination_deg is None:
             yield (
-                f"aiding.{name}: no magnetic model is installed: {install('compass')}, or "
+                f"aiding.{name}: no magnetic model is installed: {install_command('compass')}, or "
                 "give declination_deg"
             )
 

@@ -16,12 +16,12 @@ from pydantic import (
 
 from fusiond.configuration.aiding import Probability, Section
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 
 
 def _has_wavelets() -> None:
     if find_spec("pywt") is None:
-        raise ValueError(f"the filter multiscale needs PyWavelets: {install('studies')}")
+        raise ValueError(f"the filter multiscale needs PyWavelets: {install_command('studies')}")
 
 
 def _orthonormal(wavelet: str) -> str:

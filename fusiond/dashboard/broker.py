@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import aiomqtt
 
-from fusiond.dashboard.schemas import topics
+from fusiond.dashboard.message_parser import topic_parsers
 from fusiond.dashboard.vehicles import LARGEST_BYTES, Hub
 from fusiond.outputs.oversized_packets import SOCKET_OPTIONS, limit
 
@@ -59,7 +59,7 @@ class Broker:
             try:
                 async with self._client() as client:
                     named = {"fleet": "fleet/+"}  # of each card one
-                    shown = ("online", *(named.get(topic, topic) for topic in topics()))
+                    shown = ("online", *(named.get(topic, topic) for topic in topic_parsers()))
                     await client.subscribe([(f"{BASE}/+/{topic}", 0) for topic in shown])
                     self._hub.linked("up")
                     await self._serve(client)

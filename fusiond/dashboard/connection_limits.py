@@ -4,7 +4,7 @@ uvicorn waits indefinitely for a request, and for a browser to read its reply: a
 clients would hold all descriptors of the process. A connection therefore has a deadline for its
 request, and for each next piece of a reply. At the limit the connection that has waited longest
 without a request makes room; without one the newcomer is refused. A WebSocket has its own deadlines
-(`fusiond.dashboard.viewer`).
+(`fusiond.dashboard.browser_connection`).
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ WINDOW_S = 60.0
 """Length of the window; six ticks in a thousand at 100 Hz are more than an accident in it."""
 
 
-class Recent:
+class CounterWindow:
     """Counters `names` of one topic over the last minute. A counter that falls shows a restart of
     the daemon."""
 

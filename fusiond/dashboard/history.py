@@ -63,7 +63,7 @@ def _figure(value: float | None) -> float:
         return math.nan
 
 
-class Ring(_Columns):
+class LatestRows(_Columns):
     """The last `most` rows."""
 
     def __init__(self, most: int, kinds: str) -> None:
@@ -85,7 +85,7 @@ class Ring(_Columns):
         return self._newer(count, (place % self._most for place in places))
 
 
-class Keyed(_Columns):
+class LatestRowsByKey(_Columns):
     """The last `most` rows, of each key the last one."""
 
     def __init__(self, most: int, kinds: str) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from fusiond.dashboard.broker import Access, Broker
 from fusiond.dashboard.vehicles import Hub
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 
 PMTILES = b"PMTiles\x03"
 """Header of a file of version 3."""
@@ -86,8 +86,10 @@ def _run(
     if page_address.base_map is not None:
         check_map(page_address.base_map)
     if importlib.util.find_spec("uvicorn") is None or importlib.util.find_spec("starlette") is None:
-        raise DashboardError(f"the dashboard's packages are not installed: {install('dashboard')}")
-    listener = listening(page_address)
+        raise DashboardError(
+            f"the dashboard's packages are not installed: {install_command('dashboard')}"
+        )
+    listener = listening_socket(page_address)
     port = listener.getsockname()[1]
     host = f"[{page_address.host}]" if ":" in page_address.host else page_address.host
     report(
@@ -109,7 +111,7 @@ def check_map(path: Path) -> None:
         raise DashboardError(f"{path}: no PMTiles file of version 3")
 
 
-def listening(page_address: PageAddress) -> socket.socket:
+def listening_socket(page_address: PageAddress) -> socket.socket:
     """Open a listening socket. Raises `DashboardError` where that fails."""
     try:
         family, _, _, _, address = socket.getaddrinfo(

@@ -14,8 +14,8 @@ from statistics import median
 from typing import Any
 
 from fusiond.dashboard.advice import advice
-from fusiond.dashboard.counter_window import Recent
-from fusiond.dashboard.history import Keyed, Ring
+from fusiond.dashboard.counter_window import CounterWindow
+from fusiond.dashboard.history import LatestRows, LatestRowsByKey
 
 Said = Mapping[str, Any]
 
@@ -59,11 +59,14 @@ class Vehicle:
         self.received_s = float("-inf")
         """Instant of its last message; a retained message does not count."""
         self._latest: dict[str, LatestMessage] = {}
-        self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
-        self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
+        self._rows = {kind: LatestRows(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
+        self._innovations = LatestRowsByKey(MOST_INNOVATIONS, "doodd")
         self._next_row_s = float("-inf")
         self._received: dict[str, int] = {}
-        self._recent = {"health": Recent("ticks", "overruns"), "status": Recent("mqtt_taken_over")}
+        self._recent = {
+            "health": CounterWindow("ticks", "overruns"),
+            "status": CounterWindow("mqtt_taken_over"),
+        }
         self._lately: dict[str, Said] = {}
 
     def receive(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
@@ -100,7 +103,10 @@ class Vehicle:
             for topic, latest in self._latest.items()
             if latest.number > count
         }
-        kinds: dict[str, Ring | Keyed] = {**self._rows, "innovation": self._innovations}
+        kinds: dict[str, LatestRows | LatestRowsByKey] = {
+            **self._rows,
+            "innovation": self._innovations,
+        }
         newer = {kind: kept.newer(count) for kind, kept in kinds.items()}
         return {"messages": messages, "rows": {kind: rows for kind, rows in newer.items() if rows}}
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from fusiond.dashboard.schemas import RefusedError, topics
+from fusiond.dashboard.message_parser import RefusedError, topic_parsers
 from fusiond.dashboard.vehicle import Vehicle
 
 LARGEST_BYTES = 65536
@@ -58,7 +58,7 @@ class Hub:
         self.link = Link("connecting", "", now_s())
         self.vehicles: dict[str, Vehicle] = {}
         self.counters: Counter[str] = Counter()
-        self._topics = topics()
+        self._topics = topic_parsers()
         self._refused_last = ""
         self.send_command: Callable[[str, str, str], None] | None = None
         """Send a command (vehicle, name, id); None where commands are not possible."""

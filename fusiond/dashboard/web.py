@@ -20,8 +20,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from fusiond.dashboard.browser_connection import MOST_VIEWERS, BrowserConnection
 from fusiond.dashboard.vehicles import Hub
-from fusiond.dashboard.viewer import MOST_VIEWERS, Viewer
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 HEADERS = (
@@ -44,7 +44,7 @@ def application(
     """The application. `loopback`: bound to it, so that no other name for us is right; `base_map`:
     a PMTiles file, of which the page asks ranges."""
     static = str(files("fusiond.dashboard").joinpath("static"))
-    viewers: set[Viewer] = set()
+    viewers: set[BrowserConnection] = set()
 
     async def index(request: Request) -> FileResponse:
         return FileResponse(f"{static}/index.html")
@@ -60,7 +60,7 @@ def application(
             await socket.close(1013, "too many viewers")
             return
         await socket.accept()
-        viewer = Viewer(hub, socket, token)
+        viewer = BrowserConnection(hub, socket, token)
         viewers.add(viewer)
         try:
             await viewer.serve()

@@ -17,7 +17,7 @@ import subprocess
 import sys
 from types import TracebackType
 
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 
 _ATTEMPTS = 5
 """Attempts to find a free port; another process may take one before the broker does."""
@@ -33,7 +33,7 @@ class DemoBroker:
 
     def __init__(self) -> None:
         if importlib.util.find_spec("amqtt") is None:
-            raise DemoError(f"the demo's MQTT broker is not installed: {install('demo')}")
+            raise DemoError(f"the demo's MQTT broker is not installed: {install_command('demo')}")
         self._process = subprocess.Popen(
             [sys.executable, "-m", "fusiond.demo.broker"],
             stdin=subprocess.PIPE,

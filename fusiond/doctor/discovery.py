@@ -30,7 +30,7 @@ from drivers.rate_search import BAUDS, LISTEN_NS
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.reconnecting_line import SerialLine
 from drivers.sbf.framing import BlockSplitter
-from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
+from fusiond.doctor.shipped_dbc_options import KNOWN_DEVICES
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
 SOUND_ITEMS = 3

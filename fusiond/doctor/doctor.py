@@ -27,7 +27,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.findings import finding
-from fusiond.doctor.measurement_statistics import KEPT, Values
+from fusiond.doctor.measurement_statistics import KEPT, MeasurementStatistics
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
 
@@ -54,11 +54,11 @@ _CHECKSUMS = "wrong checksums against"
 
 
 @dataclass(slots=True)
-class Kind:
+class Arrivals:
     """Arrivals of one kind of measurement: monotonic ns, s from validity to arrival, and what they
     say."""
 
-    values: Values
+    values: MeasurementStatistics
     seen_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
     age_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
     count: int = 0
@@ -81,7 +81,7 @@ class ObservedSource:
         self._clock = clock
         make = driver_entry_points()[driver_name].load()
         self.driver: Driver = make(name, options, self._emit, clock.now_ns)
-        self.kinds: dict[str, Kind] = {}
+        self.kinds: dict[str, Arrivals] = {}
         self.imu: deque[tuple[float, ...]] = deque(maxlen=KEPT)
         self.events: list[str] = []
 
@@ -91,7 +91,9 @@ class ObservedSource:
             return
         if isinstance(item, Mail):
             return  # whom it is for will have it from the daemon; its counters are told
-        kind = self.kinds.setdefault(type(item).__name__, Kind(Values(type(item))))
+        kind = self.kinds.setdefault(
+            type(item).__name__, Arrivals(MeasurementStatistics(type(item)))
+        )
         kind.count += 1
         kind.values.add(item)
         kind.seen_ns.append(item.t_seen_ns)
@@ -194,7 +196,7 @@ def _source(
     return report
 
 
-def _kind_line(name: str, kind: Kind) -> str:
+def _kind_line(name: str, kind: Arrivals) -> str:
     rate = "" if kind.rate_hz is None else f", {kind.rate_hz:.2f} Hz"
     age = ""
     if kind.age_s:

@@ -95,7 +95,7 @@ QUANTITIES: Mapping[type, tuple[Quantity, ...]] = {
 }
 
 
-class Values:
+class MeasurementStatistics:
     """Values of one kind of measurement."""
 
     def __init__(self, kind: type) -> None:

@@ -44,7 +44,7 @@ from fusiond.estimators.fault_prescreen import judge_what_waits
 from fusiond.estimators.fault_sizes import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
 from fusiond.estimators.fault_update import keep_fed_back, rows_of_fault
 from fusiond.models.model import Model
-from fusiond.models.vehicle import MOUNTING
+from fusiond.models.vehicle_parameter_blocks import MOUNTING
 
 Array = NDArray[np.float64]
 

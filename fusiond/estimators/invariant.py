@@ -81,7 +81,7 @@ from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.blocks import CARRIER_ANCHOR
 from fusiond.models.model import Model
-from fusiond.models.vehicle import MOUNTING
+from fusiond.models.vehicle_parameter_blocks import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.models.model import Model
-from fusiond.models.vehicle import ANTENNA_LEVER, FIX_TIME
+from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER, FIX_TIME
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DR, PHI
 from fusiond.navigation.rotation import dcm_elements

@@ -101,12 +101,12 @@ FEWEST_ZEROS = 10
 """
 
 
-def counted(refused: Mapping[str, int]) -> list[Rejection]:
+def rejections_from_counts(refused: Mapping[str, int]) -> list[Rejection]:
     """Rejections of bytes, frames and sentences without line numbers, from counts by reason."""
     return [Rejection(0, name, f"{n} times", n) for name, n in refused.items() if n]
 
 
-def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
+def rejection_counts(rejected: Iterable[Rejection]) -> dict[str, int]:
     """Number of rows rejected, by reason."""
     found = Counter[str]()
     for each in rejected:
@@ -118,7 +118,7 @@ def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dic
     """Summary of a file: rows used, rejected by reason, the first of them in words."""
     return {
         "rows": rows,
-        "rejected": counts(rejected),
+        "rejected": rejection_counts(rejected),
         "first_rejected": [str(rejection) for rejection in rejected[:first]],
     }
 

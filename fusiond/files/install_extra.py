@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, requires
 from importlib.util import find_spec
 
 
-def install(extra: str) -> str:
+def install_command(extra: str) -> str:
     """Command that installs `extra`, from fusiond's metadata. A Debian package lacks pip; the
     system's is used."""
     try:

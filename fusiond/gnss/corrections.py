@@ -35,7 +35,7 @@ MESSAGES: dict[System, tuple[str, ...]] = {"G": ("lnav",), "E": ("inav",), "C": 
 """Messages that corrections are of."""
 
 
-class Applied(NamedTuple):
+class CorrectedEphemeris(NamedTuple):
     """Ephemeris of a satellite with its correction (14,), as `elements_row` takes them, the `bias`
     (m) of each signal, and one sigma of its ranges (m)."""
 
@@ -75,7 +75,7 @@ class Corrections:
         holds = (_holds(p, week, tow_s) for p in (orbit, clock, bias))
         return orbit.issue if all(holds) else None
 
-    def applied(self, ephemeris: Ephemeris, week: int, tow_s: float) -> Applied:
+    def applied(self, ephemeris: Ephemeris, week: int, tow_s: float) -> CorrectedEphemeris:
         """The correction that has an `issue`, to that ephemeris."""
         parts = self._parts[ephemeris.system, ephemeris.prn]
         orbit, clock, bias = parts["orbit"], parts["clock"], parts["bias"]
@@ -89,7 +89,7 @@ class Corrections:
         age = max(abs(_age_s(orbit, week, tow_s)), abs(_age_s(clock, week, tow_s)))
         sigma = (sigma**2 + (AGEING_M_S * age) ** 2) ** 0.5
         biases = dict(zip(bias.signals, bias.values, strict=True))
-        return Applied(ephemeris, columns, biases, sigma)
+        return CorrectedEphemeris(ephemeris, columns, biases, sigma)
 
 
 def issue_of(ephemeris: Ephemeris) -> int:

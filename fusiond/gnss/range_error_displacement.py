@@ -18,7 +18,7 @@ that looks like a displacement: all of it with four satellites, whose geometry m
 and little with thirty.
 
 Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
-satellites' levels (fusiond.gnss.satellite_biases) do not know of their errors, V_k,
+satellites' levels (fusiond.gnss.range_bias_filter) do not know of their errors, V_k,
 
     K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
 

@@ -19,7 +19,7 @@ state of a filter; 0.3 of s_I stand for what differs from satellite to satellite
 a and b are those of `RangeNoise` until the codes of satellites with two carriers have shown what
 this receiver's are (`fusiond.gnss.carrier_phase`).
 
-Which signals of a satellite serve: `fusiond.gnss.plan`.
+Which signals of a satellite serve: `fusiond.gnss.signal_choice`.
 
 Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`, `multipath` (the
 code has gone from its carrier); of carriers, which then wait for a new anchor, `lock_lost`,
@@ -45,12 +45,20 @@ from drivers.raw.messages import (
 from fusiond.gnss import carrier_phase as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.orbit import WEEK_S
-from fusiond.gnss.plan import Plan, Planner, RangeNoise, RangeOptions
+from fusiond.gnss.signal_choice import RangeNoise, RangeOptions, SignalChoice, SignalChooser
 from fusiond.gnss.store import EphemerisStore
 
 Array = npt.NDArray[np.float64]
 
-__all__ = ["Followed", "Picked", "RangeModel", "RangeNoise", "RangeOptions", "Rows", "nothing_kept"]
+__all__ = [
+    "ChosenSignals",
+    "RangeModel",
+    "RangeNoise",
+    "RangeOptions",
+    "Rows",
+    "TrackedSignals",
+    "initial_carriers",
+]
 
 PLAN_HOLDS_S = 10.0
 """Time after which ephemerides are chosen again, and by which one may exceed its validity."""
@@ -145,32 +153,32 @@ class Rows:
         return self.only(np.array([s not in satellites for s in self.satellites], bool))
 
 
-class Picked(NamedTuple):
+class ChosenSignals(NamedTuple):
     """Chosen signals of an epoch, (n, 7) as measured, and the second ones (n, 5), NaN where
     absent."""
 
-    plan: Plan
+    plan: SignalChoice
     week: int
     tow_s: float
     measured: Array
     second: Array
 
 
-class Followed(NamedTuple):
+class TrackedSignals(NamedTuple):
     """Picked signals with the results of their carriers (n, 6).
 
     Everything that needs no receiver: those results after the epochs before, the factors on the
     model's sigmas of codes, the carriers without a result, with the reason, and which codes (n,)
     have gone from their carriers; None: none."""
 
-    picked: Picked
+    picked: ChosenSignals
     carriers: Array
     code_scale: float
     slips: tuple[tuple[str, str], ...]
     multipath: npt.NDArray[np.bool_] | None = None
 
 
-def nothing_kept() -> Array:
+def initial_carriers() -> Array:
     """Carriers before the first epoch."""
     return np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
@@ -181,10 +189,10 @@ class RangeModel:
     def __init__(self, store: EphemerisStore, options: RangeOptions | None = None) -> None:
         self.store = store
         self.options = options or RangeOptions()
-        self._planner = Planner(store, self.options)
+        self._planner = SignalChooser(store, self.options)
         self._noise = self.options.noise.array()
-        self._plan: Plan | None = None
-        self._kept = nothing_kept()
+        self._plan: SignalChoice | None = None
+        self._kept = initial_carriers()
 
     def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
         """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
@@ -194,11 +202,11 @@ class RangeModel:
         """
         return self.evaluate(self.followed(epoch), receiver)
 
-    def followed(self, epoch: RawGnssEpoch) -> Followed:
+    def followed(self, epoch: RawGnssEpoch) -> TrackedSignals:
         """Epoch followed from earlier ones."""
         return self.follow(self.pick(epoch), self._kept)
 
-    def pick(self, epoch: RawGnssEpoch) -> Picked:
+    def pick(self, epoch: RawGnssEpoch) -> ChosenSignals:
         """Choose the signals that serve."""
         keys = list(map(_KEY, epoch.signals))
         now = epoch.week * WEEK_S + epoch.tow_s
@@ -218,9 +226,9 @@ class RangeModel:
         second[plan.second_rows] = _packed(
             plan.second_doubles, map(_SECOND, [signals[k] for k in plan.seconds]), ca.SECOND_COLUMNS
         )
-        return Picked(plan, epoch.week, epoch.tow_s, measured, second)
+        return ChosenSignals(plan, epoch.week, epoch.tow_s, measured, second)
 
-    def follow(self, picked: Picked, kept: Array) -> Followed:
+    def follow(self, picked: ChosenSignals, kept: Array) -> TrackedSignals:
         """Update the state `kept` of earlier epochs by an epoch, in place."""
         plan = picked.plan
         carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
@@ -239,9 +247,9 @@ class RangeModel:
             multipath = refused == ca.MULTIPATH
         if jumped:
             slips += (("", "clock_jump"),)
-        return Followed(picked, carriers, scale, slips, multipath)
+        return TrackedSignals(picked, carriers, scale, slips, multipath)
 
-    def evaluate(self, followed: Followed, receiver: Array) -> Rows:
+    def evaluate(self, followed: TrackedSignals, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
         picked, options = followed.picked, self.options
         plan = picked.plan

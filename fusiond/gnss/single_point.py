@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from drivers.raw.messages import SYSTEMS, RawGnssEpoch
 from fusiond.gnss.ecef import ned_axes, to_geodetic
-from fusiond.gnss.ranges import Followed, RangeModel, Rows
+from fusiond.gnss.ranges import RangeModel, Rows, TrackedSignals
 from fusiond.navigation.chi_square import quantile
 
 Array = npt.NDArray[np.float64]
@@ -117,13 +117,13 @@ class _Fit(NamedTuple):
 
 
 def single_point(
-    model: RangeModel, epoch: RawGnssEpoch | Followed, guess: Array | None = None
+    model: RangeModel, epoch: RawGnssEpoch | TrackedSignals, guess: Array | None = None
 ) -> SinglePoint | str:
     """Solve one epoch; `too_few`, `geometry` or `diverged` names why there is none.
 
     `guess` (3,) ECEF m: where the receiver is about.
     """
-    followed = epoch if isinstance(epoch, Followed) else model.followed(epoch)
+    followed = epoch if isinstance(epoch, TrackedSignals) else model.followed(epoch)
     position = np.zeros(3) if guess is None else np.array(guess, float)
     out: list[str] = []
     while True:
@@ -159,7 +159,9 @@ def single_point(
     )
 
 
-def _fit(model: RangeModel, followed: Followed, position: Array, out: list[str]) -> _Fit | str:
+def _fit(
+    model: RangeModel, followed: TrackedSignals, position: Array, out: list[str]
+) -> _Fit | str:
     """Gauss-Newton from `position`, without the satellites in `out`."""
     for _ in range(MAX_ITERATIONS):
         rows = model.evaluate(followed, position)

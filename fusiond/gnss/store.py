@@ -26,7 +26,7 @@ from drivers.raw.messages import (
     System,
 )
 from fusiond.gnss.corrections import MESSAGES as CORRECTED
-from fusiond.gnss.corrections import Applied, Corrections, issue_of
+from fusiond.gnss.corrections import CorrectedEphemeris, Corrections, issue_of
 from fusiond.gnss.group_delay import GroupDelay, group_delay
 from fusiond.gnss.orbit import WEEK_S, Orbits, gps_time
 
@@ -124,7 +124,9 @@ class EphemerisStore:
         sent = self._delays.get((ephemeris.system, ephemeris.prn))
         return group_delay(ephemeris, signal, sent)
 
-    def corrected(self, system: System, prn: int, week: int, tow_s: float) -> Applied | None:
+    def corrected(
+        self, system: System, prn: int, week: int, tow_s: float
+    ) -> CorrectedEphemeris | None:
         """The ephemeris with the correction that holds at a GPS time; None where there is none."""
         issue = self.corrections.issue(system, prn, week, tow_s)
         if issue is None:

@@ -54,7 +54,7 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.integrity.series_states import LASTS_S
 from fusiond.models.model import Model
-from fusiond.models.vehicle import FIX_TIME, MOUNTING, VELOCITY_TIME
+from fusiond.models.vehicle_parameter_blocks import FIX_TIME, MOUNTING, VELOCITY_TIME
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 
 DEG = math.degrees(1.0)

@@ -57,7 +57,7 @@ from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
 from fusiond.recording.state_digest import state_digest
-from fusiond.workers.forked import Forked
+from fusiond.workers.forked import ForkedJobs
 
 log = logging.getLogger("fusiond")
 
@@ -298,7 +298,7 @@ def run_daemon(
     share_one_heap()
     widen_descriptor_table()
 
-    async def main(compiling: Forked | None) -> None:
+    async def main(compiling: ForkedJobs | None) -> None:
         if isinstance(written, StandardErrorHandler):
             written.begin_thread()
         stop, again = asyncio.Event(), asyncio.Event()
@@ -329,7 +329,7 @@ def run_daemon(
                 load()
             missing = ()
         # The children are forked while nothing else runs in this process.
-        with Forked(missing, load_compiler) if missing else nullcontext() as compiling:
+        with ForkedJobs(missing, load_compiler) if missing else nullcontext() as compiling:
             asyncio.run(main(compiling))
     except ConfigError as error:
         log.error("%s: %s", config_path, error)

@@ -24,7 +24,7 @@ from fusiond.outputs.commands import Command, CommandRefusedError
 from fusiond.outputs.messages.health import SchedulerStatus
 from fusiond.outputs.messages.status import DaemonState, status_message
 from fusiond.outputs.topics import STATUS
-from fusiond.workers.forked import Forked
+from fusiond.workers.forked import ForkedJobs
 
 log = logging.getLogger("fusiond")
 
@@ -76,7 +76,7 @@ class Front:
         else:
             self.service.status(text)
 
-    async def wait_for(self, compiling: Forked, stop: asyncio.Event) -> None:
+    async def wait_for(self, compiling: ForkedJobs, stop: asyncio.Event) -> None:
         """Report the progress of compilation over MQTT, journal and service manager, until it is
         complete or `stop` is set."""
         self.output_tasks.start({n: o for n, o in self.outputs.items() if n == "mqtt"})

@@ -19,7 +19,7 @@ from drivers.rdss.mail import (
     MessageRefusedError,
     MessageStage,
 )
-from drivers.rdss.report import DAY_S, PositionReport
+from drivers.rdss.position_report_coding import DAY_S, PositionReport
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.tick import SECOND_NS, Every

@@ -10,12 +10,12 @@ from typing import Annotated
 from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from drivers.rdss.envelope import Receipted, opened, read_text
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import Kind, Stage, TextEncoding
 from drivers.rdss.messages import FieldError
 from drivers.rdss.outbox import Outbox, Outgoing
-from drivers.rdss.text_coding import Wording, plain_text
+from drivers.rdss.text_coding import EncodedText, printable_text
+from drivers.rdss.vehicle_message_envelope import Receipt, decode_text_body, envelope_from_text
 from fusiond.outputs.messages.short_message import ShortMessage
 
 SECOND_NS = 1_000_000_000
@@ -25,7 +25,7 @@ Natural = Annotated[int, Field(ge=0, le=2**62)]
 
 @dataclass(frozen=True, slots=True)
 class KeptWording:
-    """`Wording` with its bytes in hex."""
+    """`EncodedText` with its bytes in hex."""
 
     payload: Hex
     encoding: TextEncoding
@@ -105,7 +105,9 @@ def _kept(m: Outgoing, t_ns: int) -> KeptMessage:
 
 def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
     """Restore waits for receipts, each at most as long as a new one."""
-    wordings = tuple(Wording(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings)
+    wordings = tuple(
+        EncodedText(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings
+    )
     return Outgoing(
         kept.key,
         kept.receiver,
@@ -113,18 +115,18 @@ def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
         wordings,
         t_ns - round(kept.age_s * SECOND_NS),
         _text(wordings[0]) if kept.kind == "text" else None,
-        None if kept.receipted is None else Receipted(*kept.receipted),
+        None if kept.receipted is None else Receipt(*kept.receipted),
         kept.attempts,
         kept.refusals,
         "queued",
     )
 
 
-def _text(wording: Wording) -> str | None:
+def _text(wording: EncodedText) -> str | None:
     try:
-        envelope = opened(wording)
+        envelope = envelope_from_text(wording)
     except FieldError:
         return None
     if envelope is None:
-        return plain_text(wording)
-    return plain_text(Wording(read_text(envelope.body)[1], "mixed"))
+        return printable_text(wording)
+    return printable_text(EncodedText(decode_text_body(envelope.body)[1], "mixed"))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.models.blocks import Block
-from fusiond.models.vehicle import FIX_TIME
+from fusiond.models.vehicle_parameter_blocks import FIX_TIME
 from fusiond.navigation.error_model import (
     CORE_SIZE,
     FORCE_ERROR,

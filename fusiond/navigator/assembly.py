@@ -22,7 +22,7 @@ from fusiond.integrity.source_monitors import Verdicts
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
+from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
 from fusiond.navigation.crosstalk_noise import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from fusiond.models.blocks import Block
 from fusiond.models.model import Model
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     AXLE_LEVER,
     BAROMETER_AIRFLOW,

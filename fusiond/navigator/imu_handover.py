@@ -9,7 +9,7 @@ import numpy as np
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
-from fusiond.models.vehicle import MOUNTING
+from fusiond.models.vehicle_parameter_blocks import MOUNTING
 from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
 from fusiond.navigator.timeline import Timeline
 

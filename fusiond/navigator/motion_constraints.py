@@ -12,7 +12,12 @@ from fusiond.aiding.standstill import Rest, ZeroAngularRateUpdate, ZeroVelocityU
 from fusiond.configuration.constraints import Constraints, NonHolonomic
 from fusiond.configuration.si_units import DEG, quiet_limits
 from fusiond.models.blocks import Block, ImuNoise
-from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
+from fusiond.models.vehicle_parameter_blocks import (
+    SIDE_DRIFT,
+    axle_lever_block,
+    drift_block,
+    mounting_block,
+)
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
 from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
@@ -34,11 +39,11 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
         return []
     found = []
     if options.mounting_sd_deg:
-        found.append(mounting(options.mounting_sd_deg * DEG))
+        found.append(mounting_block(options.mounting_sd_deg * DEG))
     if options.lever_arm_sd_m:
-        found.append(axle_lever(options.lever_arm_sd_m))
+        found.append(axle_lever_block(options.lever_arm_sd_m))
     if options.drift_sd_m_s:
-        found.append(drift(SIDE_DRIFT, options.drift_sd_m_s, options.drift_s))
+        found.append(drift_block(SIDE_DRIFT, options.drift_sd_m_s, options.drift_s))
     return found
 
 

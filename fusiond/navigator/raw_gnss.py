@@ -28,6 +28,7 @@ from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.gnss.best_four_satellites import best_four
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.orbit import WEEK_S
+from fusiond.gnss.range_bias_filter import RangeBiases, subtract_biases
 from fusiond.gnss.range_error_displacement import Displacement
 from fusiond.gnss.range_kernel import (
     CARRIER_VARIANCE,
@@ -36,14 +37,13 @@ from fusiond.gnss.range_kernel import (
     VARIANCE,
 )
 from fusiond.gnss.ranges import (
-    Followed,
-    Picked,
+    ChosenSignals,
     RangeModel,
     RangeOptions,
     Rows,
-    nothing_kept,
+    TrackedSignals,
+    initial_carriers,
 )
-from fusiond.gnss.satellite_biases import Levels, take_off
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
 from fusiond.navigator.raw_sky import REASONS, Sky, sky_of
@@ -61,7 +61,7 @@ class _Corrected(NamedTuple):
     """Corrected epoch for a vehicle near `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
 
     place: tuple[float, float, float]
-    followed: Followed
+    followed: TrackedSignals
     guess: Array
     rows: Rows
     measurement: PseudorangeMeasurement
@@ -77,11 +77,11 @@ class _Memory:
     counted: bool = False
     left: Array = field(default_factory=nothing_left)
     before: Array = field(default_factory=nothing_left)
-    followed: Followed | None = None
+    followed: TrackedSignals | None = None
     after: Array | None = None
-    kept: Array = field(default_factory=nothing_kept)
+    kept: Array = field(default_factory=initial_carriers)
     displacement: Displacement | None = None
-    levels: Levels | None = None
+    levels: RangeBiases | None = None
 
     def is_after(self, before: _Memory) -> bool:
         """True if the epoch was followed from that one."""
@@ -102,7 +102,7 @@ class RawEpochMeasurement(AidingMeasurement):
 
     receiver: RawGnss
     epoch: RawGnssEpoch
-    picked: Picked
+    picked: ChosenSignals
     memory: _Memory = field(default_factory=_Memory)
 
     @property
@@ -188,7 +188,7 @@ class RawGnss:
         ) = None
         self._counted_ns = -1
         self.recent: list[RawEpochMeasurement] = []
-        self._forgotten: tuple[Displacement | None, Levels | None] = None, None
+        self._forgotten: tuple[Displacement | None, RangeBiases | None] = None, None
         """Levels of the last sky before the recent epochs."""
         self.refused: Counter[str] = Counter()
 
@@ -213,7 +213,7 @@ class RawGnss:
         del self.recent[: len(forgotten)]
         return measurement
 
-    def followed(self, measurement: RawEpochMeasurement) -> Followed:
+    def followed(self, measurement: RawEpochMeasurement) -> TrackedSignals:
         """Epoch followed through all earlier ones, in any order of arrival: a delayed epoch changes
         later ones."""
         recent = self.recent
@@ -239,10 +239,10 @@ class RawGnss:
         assert found is not None
         return found
 
-    def _follow(self, measurement: RawEpochMeasurement, before: _Memory | None) -> Followed:
+    def _follow(self, measurement: RawEpochMeasurement, before: _Memory | None) -> TrackedSignals:
         memory = measurement.memory
         memory.after = None if before is None else before.kept
-        memory.kept = nothing_kept() if before is None else before.kept.copy()
+        memory.kept = initial_carriers() if before is None else before.kept.copy()
         memory.before = nothing_left() if before is None else before.left
         memory.followed = found = self._model.follow(measurement.picked, memory.kept)
         return found
@@ -264,7 +264,7 @@ class RawGnss:
         return candidates
 
     def correct(
-        self, measurement: RawEpochMeasurement, followed: Followed, guess: Array
+        self, measurement: RawEpochMeasurement, followed: TrackedSignals, guess: Array
     ) -> tuple[Rows, PseudorangeMeasurement]:
         """Rows of an epoch for a vehicle near `guess` (ECEF, m), and their measurement."""
         rows = self._model.evaluate(followed, guess)
@@ -273,7 +273,7 @@ class RawGnss:
             rows = rows.without([s for s in rows.satellites if s not in chosen])
         t_s = measurement.epoch.week * WEEK_S + measurement.epoch.tow_s
         before, last = self._sky_before(measurement)
-        levels = take_off(last, rows, t_s)
+        levels = subtract_biases(last, rows, t_s)
         scale, values = self._section.sigma_scale**2, rows.values[:RANGE_VALUES]
         if scale != 1.0:
             values = values.copy()
@@ -299,7 +299,7 @@ class RawGnss:
 
     def _sky_before(
         self, measurement: RawEpochMeasurement
-    ) -> tuple[Displacement | None, Levels | None]:
+    ) -> tuple[Displacement | None, RangeBiases | None]:
         """Displacement and levels of the last epoch before one that had satellites."""
         at = bisect_left(self.recent, measurement.t_ns, key=_instant)
         for k in range(at - 1, -1, -1):
@@ -312,7 +312,7 @@ class RawGnss:
         self,
         measurement: RawEpochMeasurement,
         rows: Rows,
-        levels: Levels,
+        levels: RangeBiases,
         before: Displacement | None,
     ) -> tuple[Displacement, tuple[Array, Array] | None]:
         """Displacement by an epoch's sky, and the part carried over from the epoch before; None:

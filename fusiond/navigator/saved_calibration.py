@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass
 from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.models.model import Model
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     AXLE_LEVER,
     BAROMETER_AIRFLOW,

@@ -39,7 +39,7 @@ from fusiond.aiding.base import speed_of
 from fusiond.aiding.compass import DISTURBANCE
 from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
-from fusiond.models.vehicle import SIDE_DRIFT, WHEEL_DRIFT
+from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
 from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import DEG, PER_ROOT_HOUR, imu_noise
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     AXLE_LEVER,
     BAROMETER_AIRFLOW,

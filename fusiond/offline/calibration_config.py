@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fusiond.configuration.aiding import Aiding, GnssAiding, WheelAiding, lever_sd_m
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import DEG
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     AXLE_LEVER,
     FIX_TIME,

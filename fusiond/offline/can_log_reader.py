@@ -23,7 +23,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from drivers.can.python_can_import import can, with_mf4
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 from fusiond.offline.blf_repair import DAY_S, Containers
 from fusiond.offline.can_text_repair import (
     HEADER_ENDS,
@@ -236,7 +236,7 @@ def _mf4(
     log: _Log, lost: Refusals, stack: contextlib.ExitStack, on_zone: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
     if importlib.util.find_spec("asammdf") is None:
-        raise MissingPackageError(f"MF4 logs need the package asammdf: {install('mf4')}")
+        raise MissingPackageError(f"MF4 logs need the package asammdf: {install_command('mf4')}")
     with_mf4()
     log.path.open("rb").close()
     failure = ""

@@ -41,7 +41,7 @@ from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock, Slew
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.csv_tables import Rejection, TableError, rejections_from_counts
 from fusiond.files.measurement_csv import ImuTable
 from fusiond.offline.can_log_reader import Refusals, channels, messages
 from fusiond.offline.measurement_files import Arrival
@@ -174,7 +174,9 @@ class _Replay:
         self._shift()
         rejected, imu = {"can": refusals.all()}, self._imu_table()
         for name, driver in self._drivers.items():
-            odd = counted({n: c for n, c in driver.counters.items() if n in REFUSALS})
+            odd = rejections_from_counts(
+                {n: c for n, c in driver.counters.items() if n in REFUSALS}
+            )
             if isinstance(driver, CanImuDriver):
                 imu.rejected.extend(odd)
             else:

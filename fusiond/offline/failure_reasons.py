@@ -12,7 +12,7 @@ from drivers.immutable import immutable
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import sensor_to_body
-from fusiond.files.csv_tables import Rejection, counts
+from fusiond.files.csv_tables import Rejection, rejection_counts
 from fusiond.files.measurement_csv import ImuTable
 from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import magnitudes, squares
@@ -35,7 +35,7 @@ class FileRead:
     @property
     def refused(self) -> int:
         """Rows that are not used."""
-        return sum(counts(self.rejected).values())
+        return sum(rejection_counts(self.rejected).values())
 
     @property
     def rows(self) -> int:
@@ -126,7 +126,7 @@ def _measurements(
 
 
 def _refused_rows(name: str, file: FileRead) -> str:
-    by_reason = Counter(counts(file.rejected))
+    by_reason = Counter(rejection_counts(file.rejected))
     times = sum(by_reason[reason] for reason in _TIMES)
     if times > file.refused / 2:
         return f"{name}: its times run backwards in {times} of {file.rows} rows"

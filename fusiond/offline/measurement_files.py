@@ -37,8 +37,7 @@ from fusiond.configuration.aiding import (
     WheelAiding,
 )
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError, counted
-from fusiond.files.file_kind import kind_of
+from fusiond.files.csv_tables import Rejection, TableError, rejections_from_counts
 from fusiond.files.log_bytes import log_bytes
 from fusiond.files.measurement_csv import (
     ImuTable,
@@ -49,6 +48,7 @@ from fusiond.files.measurement_csv import (
     read_rdss,
     read_wheel,
 )
+from fusiond.files.mistaken_log_kind import mistaken_log_kind
 from fusiond.offline.nmea_file import EARLIEST_DATE, Receiver, read_nmea, receiver_of
 
 Array = NDArray[np.float64]
@@ -304,8 +304,8 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
         )
     if not epochs:
         nothing = "no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)"
-        raise TableError(f"{path}: {kind_of(log.data) or nothing}")
-    refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
+        raise TableError(f"{path}: {mistaken_log_kind(log.data) or nothing}")
+    refused = [r for r in rejections_from_counts(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     known = (Arrival(first_ns, event) for event in broadcast)
     return [*known, *corrected, *epochs], [*log.notes, *refused]

@@ -32,13 +32,13 @@ from drivers.measurements import (
 from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS
-from drivers.nmea.epochs import TALKERS
+from drivers.nmea.epoch_assembly import TALKERS
 from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError, counted
-from fusiond.files.file_kind import kind_of
+from fusiond.files.csv_tables import Rejection, TableError, rejections_from_counts
 from fusiond.files.log_bytes import log_bytes
+from fusiond.files.mistaken_log_kind import mistaken_log_kind
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.week_rollover import rollover_of
 
@@ -133,7 +133,7 @@ def read_nmea(
     found += epochs.spread(untimed)
     refused["untimed"] += 0 if epochs.times else len(untimed)
     if not found:
-        raise TableError(f"{path}: {_why_nothing(decoder, refused, kind_of(log.data))}")
+        raise TableError(f"{path}: {_why_nothing(decoder, refused, mistaken_log_kind(log.data))}")
     add_ns, said = rollover_of([utc_ns for utc_ns, _ in found], imu_s)
     of_week = imu_s is None
     in_order = sorted(found, key=lambda each: each[0])
@@ -141,7 +141,11 @@ def read_nmea(
     cautions = decoder.cautions
     cautions.pop("compass_left_out", None)  # it is heard here, or counted
     notes = [Rejection(0, *note, 0) for note in (*cautions.items(), *said)]
-    return received, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
+    return received, [
+        *log.notes,
+        *notes,
+        *(r for r in rejections_from_counts(refused) if _is_refusal(r.reason)),
+    ]
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:

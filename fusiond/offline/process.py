@@ -23,7 +23,7 @@ from drivers.raw.messages import RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
-from fusiond.files.csv_tables import counts
+from fusiond.files.csv_tables import rejection_counts
 from fusiond.files.measurement_csv import ImuTable
 from fusiond.files.solution_csv import STATUS
 from fusiond.integrity.catalogue import Kind
@@ -192,7 +192,7 @@ def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, 
 def _account(file: FileRead) -> dict[str, Any]:
     return {
         "rows": file.rows,
-        "rejected": counts(file.rejected),
+        "rejected": rejection_counts(file.rejected),
         "first_rejected": [str(r) for r in file.rejected[:_SHOWN]],
     }
 

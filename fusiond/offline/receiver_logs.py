@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from drivers.bestpos.decoder import BestposDecoder
 from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
-from drivers.nmea.foreign_protocols import named
+from drivers.nmea.foreign_protocols import protocol_sentence
 from drivers.raw.messages import (
     Bdgim,
     Correction,
@@ -41,11 +41,16 @@ from drivers.solution import REFUSALS
 from drivers.ubx.decoder import UbxDecoder
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
-from fusiond.files.file_kind import kind_of
-from fusiond.files.install_extra import install
+from fusiond.files.csv_tables import (
+    MissingPackageError,
+    Rejection,
+    TableError,
+    rejections_from_counts,
+)
+from fusiond.files.install_extra import install_command
 from fusiond.files.log_bytes import log_bytes
 from fusiond.files.measurement_csv import ImuTable
+from fusiond.files.mistaken_log_kind import mistaken_log_kind
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.measurement_files import SECONDS_OF_WEEK, Arrival
 from fusiond.offline.nmea_file import EARLIEST_DATE
@@ -124,10 +129,11 @@ def read_solutions(
     if not rows:
         if why := REFUSALS.get(decoder.refusal):
             raise TableError(f"{path}: no fix: {why}")
-        raise TableError(f"{path}: {kind_of(log.data) or named(log.data) or f'no {_NAMES[kind]}'}")
+        other = mistaken_log_kind(log.data) or protocol_sentence(log.data)
+        raise TableError(f"{path}: {other or f'no {_NAMES[kind]}'}")
     refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
     notes = [Rejection(0, *note, 0) for note in decoder.cautions.items()]
-    return rows, [*log.notes, *notes, *counted({**refused, "undated": undated})]
+    return rows, [*log.notes, *notes, *rejections_from_counts({**refused, "undated": undated})]
 
 
 def is_of_week(imu: ImuTable) -> bool:
@@ -163,7 +169,7 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
     except ImportError as error:
         raise MissingPackageError(
             f"{path}: RINEX packed by Hatanaka's or another way needs the package hatanaka: "
-            f"{install('rinex')}"
+            f"{install_command('rinex')}"
         ) from error
     try:
         with warnings.catch_warnings(record=True) as doubts:
@@ -215,7 +221,7 @@ def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
         for name, n in counters.items()
         if name not in taken and not name.startswith("measured_")
     }
-    return rows, counted(refused)
+    return rows, rejections_from_counts(refused)
 
 
 def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:

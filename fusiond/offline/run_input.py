@@ -20,7 +20,7 @@ from drivers.raw.messages import (
 )
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError, counts
+from fusiond.files.csv_tables import Rejection, TableError, rejection_counts
 from fusiond.files.measurement_csv import ImuTable, read_imu
 from fusiond.offline.failure_reasons import FileRead
 from fusiond.offline.measurement_files import (
@@ -74,7 +74,11 @@ def read_recorded(
         files["imu"] = _imu_read(imu)
         for name, rejected in log.rejected.items():
             rows = [row for row in arrivals if row.measurement.source == name]
-            used = log.frames - sum(counts(rejected).values()) if name == "can" else len(rows)
+            used = (
+                log.frames - sum(rejection_counts(rejected).values())
+                if name == "can"
+                else len(rows)
+            )
             if used or rejected:
                 files[name] = FileRead(_span_s(rows), max(0, used), rejected, name != "can")
     else:

@@ -46,7 +46,7 @@ _ATTITUDE = (
 _WHEEL = ("t_s", "t_arrival_s", "speed_m_s", "sd_m_s", "unsigned")
 
 
-def arrivals(
+def replay_measurements(
     recording: Log,
     config: Config,
     on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None],
@@ -62,7 +62,7 @@ def write_tables(recording: Log, config: Config, folder: Path) -> dict[str, int]
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as files:
         tables = _Tables(folder, recording.about.epoch_ns, files)
-        arrivals(recording, config, tables.add)
+        replay_measurements(recording, config, tables.add)
         return tables.rows
 
 

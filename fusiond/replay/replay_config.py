@@ -16,7 +16,7 @@ from fusiond.recording.log_metadata import CONFIG, dbc_name
 from fusiond.recording.reader import About
 
 
-def config_of(
+def replay_config(
     about: About, folder: Path, other: Path | None = None, settings: Sequence[str] = ()
 ) -> Config:
     """Configuration of the log or of the file `other`, with `KEY=VALUE` settings.

@@ -20,10 +20,10 @@ from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
-from fusiond.replay.csv_export import arrivals
+from fusiond.replay.csv_export import replay_measurements
 
 _TO_ROS = np.array([1.0, -1.0, -1.0])
 
@@ -32,7 +32,7 @@ def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]
     """Write a bag into `folder`, which must not exist; the messages by topic. Raises
     `MissingPackageError`, OSError."""
     if importlib.util.find_spec("rosbags") is None:
-        raise MissingPackageError(f"rosbag2 needs the package rosbags: {install('ros')}")
+        raise MissingPackageError(f"rosbag2 needs the package rosbags: {install_command('ros')}")
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an extra
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -56,7 +56,7 @@ def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]
                 bag.write(samples, t_ns, store.serialize_cdr(imu, made.imu_type))
                 counts["/imu"] += 1
 
-        arrivals(recording, config, add)
+        replay_measurements(recording, config, add)
     return counts
 
 

@@ -27,7 +27,7 @@ from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.reader import Log
 from fusiond.replay.replay import Replay, ReplayedTick
-from fusiond.replay.replay_config import config_of
+from fusiond.replay.replay_config import replay_config
 
 SOLUTION, EVENTS = "solution.csv", "events.csv"
 ROWS = 4096
@@ -55,7 +55,7 @@ def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
     recording = Log(paths)
     with TemporaryDirectory(prefix="fusiond-replay-") as folder, contextlib.ExitStack() as stack:
         same = wish.config is None and not wish.settings
-        config = config_of(recording.about, Path(folder), wish.config, wish.settings)
+        config = replay_config(recording.about, Path(folder), wish.config, wish.settings)
         out = None if wish.out is None else stack.enter_context(_Files(wish.out, recording))
         run = _Run(recording, config, same, out)
         began = time.process_time()

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fusiond.files.csv_tables import Floats, TableError
-from fusiond.files.parquet_rows import Row, read_rows
+from fusiond.files.resumable_parquet import Row, read_rows
 from fusiond.report.page import page
 from fusiond.report.page_items import Grid, Item, Plot, Section, Sentence, Series, Table
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from drivers.can.bus import Interface
 from fusiond.configuration.draft import Draft, DraftSource, toml
 from fusiond.files.csv_tables import MissingPackageError
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import ANTENNA_M, CAR_IMU, REAR_AXLE_M, SCENARIOS
@@ -45,7 +45,7 @@ def bus_here() -> tuple[Interface, str]:
     if find_spec("msgpack") is None:  # python-can's multicast packs with it
         raise MissingPackageError(
             f"{VCAN} is not up (ip link add {VCAN} type vcan; ip link set {VCAN} up), and the bus "
-            f"over UDP needs msgpack: {install('demo')}"
+            f"over UDP needs msgpack: {install_command('demo')}"
         )
     return "udp_multicast", MULTICAST
 

@@ -49,8 +49,8 @@ AS_TAKEN: dict[str, Any] = {
     "wet_delay_sd_m": 0.12,
     "signal_in_space_sd_m": 0.6,
 }
-"""Sky whose errors match the daemon's assumptions (`fusiond.gnss.plan`): orbits, clocks, and
-residuals of ionosphere and troposphere models: half of what is broadcast, and 0.3 of that from
+"""Sky whose errors match the daemon's assumptions (`fusiond.gnss.signal_choice`): orbits, clocks,
+and residuals of ionosphere and troposphere models: half of what is broadcast, and 0.3 of that from
 satellite to satellite. That of `Scenario` is better, but for models that are a third off."""
 NO_SCALES = {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}
 """Inertial unit without scale factor errors, for which the papers' models have no states."""

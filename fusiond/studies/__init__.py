@@ -20,9 +20,9 @@ STUDIES = {
     "consistency": "fusiond.studies.consistency_verdict_errors",
     "reduced-order": "fusiond.studies.reduced_order.study",
     "protection": "fusiond.studies.protection",
-    "vehicle": "fusiond.studies.vehicle.study",
+    "vehicle": "fusiond.studies.vehicle_parameters.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
-    "drives": "fusiond.studies.random_drives",
+    "drives": "fusiond.studies.random_drives_study",
     "papers": "fusiond.studies.paper_models_nees",
 }
 

@@ -19,7 +19,7 @@ from scipy.stats import beta, binomtest
 from fusiond.integrity.consistency import FEWEST, LAGS, ConsistencyOptions, judge
 from fusiond.studies.figure_file import save_figure
 from fusiond.studies.monte_carlo import Progress, step_counter
-from fusiond.studies.single_axis_ins import Aided, Fault, innovations
+from fusiond.studies.single_axis_ins import AidedAxis, Fault, innovations
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -41,7 +41,7 @@ PAPER = {
     "rho_interval": [-0.2772, 0.2772],
     "claim": "all inside",
 }
-SOURCES = (Aided("gnss", 1.0, 1.5), Aided("rdss", 1.5, 20.0))
+SOURCES = (AidedAxis("gnss", 1.0, 1.5), AidedAxis("rdss", 1.5, 20.0))
 MATCHED = Fault("none")
 FAULTS = (
     MATCHED,
@@ -96,7 +96,7 @@ def _largest_lag_p(rho: Array, k: int, m: int) -> Array:
     return np.asarray(1.0 - (1.0 - each.min(axis=-1)) ** LAGS)
 
 
-def held(outside: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
+def verdicts_with_hysteresis(outside: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
     """Verdict with hysteresis (runs, epochs), consistent at first, as in the monitor."""
     state = np.zeros(len(outside), dtype=bool)
     count = np.zeros(len(outside), dtype=int)
@@ -153,7 +153,7 @@ def _noticed(verdicts: Ints, k: int) -> dict[str, Any]:
     """Epochs from the onset to a change of the held verdict, over runs consistent at the onset; and
     the verdicts of windows behind the onset.
     """
-    verdict = held(verdicts > 0, k // 2)
+    verdict = verdicts_with_hysteresis(verdicts > 0, k // 2)
     first = SETTLED - (k + LAGS - 1)  # index of the window that ends with the first faulty epoch
     good = ~verdict[:, first - 1]
     after = verdict[good, first:]
@@ -172,7 +172,7 @@ def _noticed(verdicts: Ints, k: int) -> dict[str, Any]:
 
 
 def _quiet(
-    source: Aided, runs: int, alpha: float, rng: np.random.Generator
+    source: AidedAxis, runs: int, alpha: float, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Rate of false verdicts per 1,000 epochs of a matched filter, without and with hysteresis."""
     nu = innovations(source, MATCHED, runs, SETTLED + WATCHED, 0, rng)
@@ -180,7 +180,9 @@ def _quiet(
     for k in WINDOWS:
         outside = window_verdicts(*window_statistics(nu, k), 2, k, alpha) > 0
         turns = [
-            1000.0 * float((np.diff(held(outside, h).astype(int), axis=1) > 0).sum()) / outside.size
+            1000.0
+            * float((np.diff(verdicts_with_hysteresis(outside, h).astype(int), axis=1) > 0).sum())
+            / outside.size
             for h in (1, k // 2)
         ]
         rows.append({"source": source.name, "k": k, "at_once": turns[0], "held": turns[1]})

@@ -45,7 +45,13 @@ from fusiond.studies.reduced_order.report import (
     sigma_cells,
     sigmas,
 )
-from fusiond.studies.reduced_order.runs import Flown, live, monte_carlo, nees, started
+from fusiond.studies.reduced_order.runs import (
+    FilterRun,
+    fly_on_timeline,
+    monte_carlo,
+    nees,
+    started_filter,
+)
 
 Array = NDArray[np.float64]
 
@@ -108,7 +114,7 @@ def run_study(
     return result
 
 
-def _figures(of: Flown, counted: NDArray[np.bool_], spent: Cost) -> dict[str, Any]:
+def _figures(of: FilterRun, counted: NDArray[np.bool_], spent: Cost) -> dict[str, Any]:
     error, believed = of.error[:, counted, :CORE_SIZE], of.believed[:, counted]
     believed = believed[..., :CORE_SIZE, :CORE_SIZE]
     true = _second_moment(error).mean(axis=0)
@@ -147,12 +153,12 @@ def _integration(of: Model, seconds: float) -> dict[str, float]:
     errors, sd = [], []
     for rate in (flight.IMU.rate_hz, FINE_RATE_HZ):
         path = flight.truth(seconds, rate)
-        estimator = started(of, nav[0])
+        estimator = started_filter(of, nav[0])
         given = (
             flight.measured(scene, true._replace(nav=nav[k + 1]), np.zeros(scene.rows))
             for k, scene in enumerate(flight.scenes(seconds))
         )
-        for _ in live([estimator], np.hstack([path.gyro, path.accel]), given, rate):
+        for _ in fly_on_timeline([estimator], np.hstack([path.gyro, path.accel]), given, rate):
             pass
         errors.append(nav_error(estimator.nav, nav[-1]))
         sd.append(np.sqrt(np.diag(estimator.covariance)[:CORE_SIZE]))

@@ -1,9 +1,9 @@
 """Parallel Monte Carlo runs with progress, and the bounds of their mean NEES.
 
 A run draws from a generator of its own, made of the study's seed and the run's number, so that no
-result depends on who ran what, in which order, and on how many processes. `of_run` makes it by a
-spawn key, as numpy means it. The papers' studies mix [seed, number] instead, which keeps runs as
-far apart (numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0]
+result depends on who ran what, in which order, and on how many processes. `run_generator` makes it
+by a spawn key, as numpy means it. The papers' studies mix [seed, number] instead, which keeps runs
+as far apart (numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0]
 are one stream. None of them has two such lists, and their printed figures stand.
 """
 
@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from fusiond.workers.outcome import Outcome, Runner
+from fusiond.workers.runner_interface import Outcome, Runner
 
 if TYPE_CHECKING:
-    from fusiond.studies.stored_runs import KeptRuns
+    from fusiond.studies.stored_runs import StoredRuns
 
 TAIL = (1.0 - 0.95) / 2.0
 """Share of either side outside a 95 % interval."""
@@ -41,8 +41,9 @@ class RunsLostError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
-    """A run without a result: its number, how it ended and why (`fusiond.workers.outcome`)."""
+class LostRun:
+    """A run without a result: its number, how it ended and why
+    (`fusiond.workers.runner_interface`)."""
 
     number: int
     ended: str
@@ -52,15 +53,15 @@ class Lost:
 @dataclass(frozen=True, slots=True)
 class _Given:
     runner: Runner
-    kept: KeptRuns | None
-    lost: list[Lost] = field(default_factory=list)
+    kept: StoredRuns | None
+    lost: list[LostRun] = field(default_factory=list)
 
 
 _GIVEN: ContextVar[_Given | None] = ContextVar("runner of Monte Carlo runs", default=None)
 
 
 @contextmanager
-def runs_on(runner: Runner, kept: KeptRuns | None = None) -> Iterator[list[Lost]]:
+def runner_context(runner: Runner, kept: StoredRuns | None = None) -> Iterator[list[LostRun]]:
     """Context in which runs are made by `runner`, except those in `kept`, where new ones are added;
     the lost runs."""
     given = _Given(runner, kept)
@@ -84,20 +85,20 @@ def step_counter(progress: Progress | None, total: int) -> Callable[[], None]:
     return step
 
 
-def on_processes(
+def map_runs(
     work: Callable[[int], R], runs: int, progress: Callable[[], None] | None = None
 ) -> list[R]:
-    """`work` of 0 to `runs` - 1, in order: by the workers of `runs_on`, else in this process.
+    """`work` of 0 to `runs` - 1 in order, by workers of `runner_context`, else in this process.
 
     Workers leave out the runs that they lost. Raises `RunsLostError` if fewer than two are left.
     """
-    return over(work, range(runs), progress)
+    return map_items(work, range(runs), progress)
 
 
-def over(
+def map_items(
     work: Callable[[T], R], items: Sequence[T], progress: Callable[[], None] | None = None
 ) -> list[R]:
-    """`work` of each item, as `on_processes`."""
+    """`work` of each item, as `map_runs`."""
     given = _GIVEN.get()
     found: dict[int, R] = {}
     if given is None:
@@ -111,7 +112,7 @@ def over(
         if outcome.ended == "done":
             found[outcome.index] = outcome.result  # type: ignore[assignment]  # None may be an R
         else:
-            given.lost.append(Lost(outcome.index, outcome.ended, outcome.reason))
+            given.lost.append(LostRun(outcome.index, outcome.ended, outcome.reason))
         if progress is not None:
             progress()
     if len(found) < min(2, len(items)):
@@ -137,7 +138,7 @@ def _outcomes(given: _Given, work: Callable[[T], R], items: Sequence[T]) -> Iter
         yield numbered
 
 
-def of_run(seed: int, number: int) -> np.random.SeedSequence:
+def run_generator(seed: int, number: int) -> np.random.SeedSequence:
     """Random generator of run `number`: child `number` of the seed's sequence, without the others
     having been made."""
     return np.random.SeedSequence(seed, spawn_key=(number,))

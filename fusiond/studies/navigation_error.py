@@ -25,7 +25,7 @@ def true_nav(truth: Truth, t_s: Array) -> Array:
     return np.column_stack([states.position, states.v_ned, q])
 
 
-def metres(lat: float, height: float) -> Array:
+def metres_per_unit(lat: float, height: float) -> Array:
     """Metres north, east, down for a unit of latitude, longitude (rad) and height (m)."""
     east = (transverse_radius(lat) + height) * math.cos(lat)
     return np.array([meridian_radius(lat) + height, east, -1.0])
@@ -60,5 +60,5 @@ def with_error(true: Array, error: Array) -> Array:
     nav = true.copy()
     rotate_quaternion(nav[6:], -float(error[0]), -float(error[1]), -float(error[2]), True)
     nav[3:6] += error[3:6]
-    nav[:3] += error[6:9] / metres(float(true[0]), float(true[2]))
+    nav[:3] += error[6:9] / metres_per_unit(float(true[0]), float(true[2]))
     return nav

@@ -37,7 +37,7 @@ from fusiond.simulation.papers import NO_SCALES, PAPERS, WHITE, configured, leve
 from fusiond.simulation.scenarios import Scenario
 from fusiond.studies.federated import without_imu
 from fusiond.studies.figure_file import save_figure
-from fusiond.studies.monte_carlo import Progress, of_run, on_processes, step_counter
+from fusiond.studies.monte_carlo import Progress, map_runs, run_generator, step_counter
 from fusiond.studies.navigation_error import nav_error, true_nav
 
 DEFAULT_RUNS = 12
@@ -139,11 +139,11 @@ class _Watch:
             self.squares[name].append((float(own @ own), float(stated @ stated)))
 
 
-def flown(case: str, seed: int, number: int) -> dict[str, float]:
+def run_case(case: str, seed: int, number: int) -> dict[str, float]:
     """Run `number` of a case of `CASES`: by group mean NEES a degree, RMS error and RMS sigma."""
     of = CASES[case]
     config, scenario = of.made()
-    draws = int(of_run(seed, number).generate_state(1)[0])
+    draws = int(run_generator(seed, number).generate_state(1)[0])
     watch = _Watch(scenario, of.seconds)
     with TemporaryDirectory(prefix="fusiond-study-") as folder:
         devices = PAPERS[of.paper].devices
@@ -207,9 +207,9 @@ def run_study(
     found: dict[str, Any] = {}
     for name in cases:
         work: Callable[[int], dict[str, float]] = (
-            partial(without_imu_run, seed) if name == WITHOUT_IMU else partial(flown, name, seed)
+            partial(without_imu_run, seed) if name == WITHOUT_IMU else partial(run_case, name, seed)
         )
-        rows = on_processes(work, count, advance)
+        rows = map_runs(work, count, advance)
         of = CASES.get(name)
         found[name] = {
             "with": "fixes and RDSS, federated, correlated" if of is None else of.label,

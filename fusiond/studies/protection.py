@@ -43,7 +43,7 @@ from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.studies.faults.runs import VEHICLE
 from fusiond.studies.faults.sensor_data import DURATION_S, Drive, Recording, gnss_fixes
 from fusiond.studies.figure_file import save_figure
-from fusiond.studies.monte_carlo import Progress, on_processes, step_counter
+from fusiond.studies.monte_carlo import Progress, map_runs, step_counter
 from fusiond.studies.navigation_error import nav_error, true_nav
 
 Array = NDArray[np.float64]
@@ -190,12 +190,12 @@ def run_study(
     spent = 0.0
     correlation = []
     for case in CASES:
-        drives = on_processes(partial(_of_seed, case, True, seed), count, step)
+        drives = map_runs(partial(_of_seed, case, True, seed), count, step)
         cases[case.name] = _figures(case, drives)
         if case is NO_FAULT:
             spent = sum(float(d["cpu_s"][0]) for d in drives)
             correlation = [correlation_s(d["ratio"]) for d in drives]
-    without = on_processes(partial(_of_seed, NO_FAULT, False, seed), count, step)
+    without = map_runs(partial(_of_seed, NO_FAULT, False, seed), count, step)
     return {
         "study": "protection",
         "runs": count,

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Aided:
+class AidedAxis:
     """A level INS axis aided by positions of `sigma_m` every `period_s`."""
 
     name: str
@@ -47,7 +47,7 @@ class Fault:
     delay_s: float = 0.0
 
 
-def _discrete(source: Aided) -> tuple[Array, Array]:
+def _discrete(source: AidedAxis) -> tuple[Array, Array]:
     """Transition and process noise (3, 3) of one axis over one period."""
     t, v, a = (
         source.period_s,
@@ -79,7 +79,7 @@ def town_drive(t_s: Array) -> Array:
 
 
 def innovations(
-    source: Aided, fault: Fault, runs: int, epochs: int, onset: int, rng: np.random.Generator
+    source: AidedAxis, fault: Fault, runs: int, epochs: int, onset: int, rng: np.random.Generator
 ) -> Array:
     """Whitened innovations (runs, epochs, 2) of the settled filter; the fault holds from
     `onset`."""

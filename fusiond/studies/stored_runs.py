@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from fusiond.files.csv_tables import TableError
-from fusiond.files.parquet_rows import Row, RowFile, flat
-from fusiond.workers.outcome import Outcome
+from fusiond.files.resumable_parquet import ResumableRows, Row, flattened
+from fusiond.workers.runner_interface import Outcome
 
 NAME = ("study", "part", "config_digest", "version", "seed", "run")
 AS_IT_IS = 3
@@ -47,26 +47,26 @@ _PLAIN = {
 }
 
 
-class KeptRuns:
+class StoredRuns:
     """Stored and added runs of `study` with `seed` in `file`."""
 
-    def __init__(self, file: RowFile, study: str, seed: int) -> None:
+    def __init__(self, file: ResumableRows, study: str, seed: int) -> None:
         self._file = file
         self._named: Row = {"study": study, "version": version("fusiond"), "seed": seed}
         self.there = 0
         self.ended: dict[str, int] = {}
 
-    def of(self, work: Callable[[Any], Any]) -> KeptPart:
+    def of(self, work: Callable[[Any], Any]) -> StoredPart:
         """Stored runs of `work`."""
-        digest = hashlib.sha256(described(work).encode()).hexdigest()[:12]
+        digest = hashlib.sha256(stable_text(work).encode()).hexdigest()[:12]
         named = self._named | {"part": _part(work), "config_digest": digest}
-        return KeptPart(self, self._file, {name: named[name] for name in NAME[:-1]})
+        return StoredPart(self, self._file, {name: named[name] for name in NAME[:-1]})
 
 
-class KeptPart:
+class StoredPart:
     """The runs of one function."""
 
-    def __init__(self, kept: KeptRuns, file: RowFile, named: Row) -> None:
+    def __init__(self, kept: StoredRuns, file: ResumableRows, named: Row) -> None:
         self._kept, self._file, self._named = kept, file, named
 
     def known(self, runs: int) -> dict[int, Outcome[Any]]:
@@ -88,17 +88,17 @@ class KeptPart:
         self._file.add(row)
 
 
-def described(value: Any) -> str:
+def stable_text(value: Any) -> str:
     """Text that is equal for equal values in every process, and different otherwise."""
     if isinstance(value, partial):
-        return described((value.func, value.args, value.keywords))
+        return stable_text((value.func, value.args, value.keywords))
     if is_dataclass(value) and not isinstance(value, type):
         value_of = {f.name: getattr(value, f.name) for f in fields(value)}
-        return f"{type(value).__qualname__}{described(value_of)}"
+        return f"{type(value).__qualname__}{stable_text(value_of)}"
     if isinstance(value, Mapping):
-        return f"({','.join(f'{described(k)}:{described(v)}' for k, v in value.items())})"
+        return f"({','.join(f'{stable_text(k)}:{stable_text(v)}' for k, v in value.items())})"
     if isinstance(value, list | tuple):
-        return f"({','.join(map(described, value))})"
+        return f"({','.join(map(stable_text, value))})"
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}{hashlib.sha256(value.tobytes()).hexdigest()}"
     if callable(value):
@@ -117,9 +117,9 @@ def _part(work: Callable[[Any], Any]) -> str:
 
 def _figures(result: Any) -> Row:
     if isinstance(result, dict) and all(isinstance(v, str | int | float) for v in result.values()):
-        return flat(result)
+        return flattened(result)
     packed = base64.b64encode(zlib.compress(pickle.dumps(result, protocol=5))).decode("ascii")
-    return flat(_reported(result)) | {"result": packed}
+    return flattened(_reported(result)) | {"result": packed}
 
 
 def _reported(value: Any) -> Any:

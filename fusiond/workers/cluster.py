@@ -13,8 +13,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from fusiond.workers.outcome import Outcome, R, T
 from fusiond.workers.pool import Pool
+from fusiond.workers.runner_interface import Outcome, R, T
 
 CONNECT_S = 10.0
 """Dask's own default is as long."""

@@ -41,7 +41,7 @@ _PR_SET_PDEATHSIG = 1
 _DONE, _LAST = b".", b"!"
 
 
-class Forked:
+class ForkedJobs:
     """`jobs` at work in other processes; iterate for the number that is done, to the end. `prepare`
     loads what all jobs need, once."""
 
@@ -54,7 +54,7 @@ class Forked:
         self._pid = _fork(lambda: _Jobs(jobs, share, write).work(prepare))
         os.close(write)
 
-    def __enter__(self) -> Forked:
+    def __enter__(self) -> ForkedJobs:
         return self
 
     def __exit__(

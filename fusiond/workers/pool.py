@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from fusiond.workers.outcome import Ended, Outcome, R, T
 from fusiond.workers.process import STARTED
+from fusiond.workers.runner_interface import Ended, Outcome, R, T
 
 ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -38,7 +38,7 @@ class PoolError(Exception):
     """No worker can be started."""
 
 
-def processors() -> int:
+def processor_count() -> int:
     """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0))
 

@@ -17,7 +17,7 @@ from queue import SimpleQueue
 STARTED = "begun"
 
 
-def serve(descriptor: int) -> None:
+def serve_items(descriptor: int) -> None:
     """Serve items until the pipe is closed, then exit at once, even during a run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started us
     connection = Connection(descriptor)

@@ -14,7 +14,7 @@ from fusiond.configuration.si_units import imu_noise
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     BAROMETER_AIRFLOW,
     BAROMETER_OFFSET,
@@ -26,14 +26,14 @@ from fusiond.models.vehicle import (
     WHEEL_LATENCY,
     WHEEL_ROUNDING,
     WHEEL_SCALE,
-    antenna_lever,
-    axle_lever,
-    drift,
+    antenna_lever_block,
+    axle_lever_block,
+    drift_block,
     fix_markov_block,
-    mounting,
-    time_offset,
-    wheel_rounding,
-    wheel_scale,
+    mounting_block,
+    time_offset_block,
+    wheel_rounding_block,
+    wheel_scale_block,
 )
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, dcm_from_rpy
@@ -61,16 +61,16 @@ def measurement_model(name: str) -> Model:
 
 
 VEHICLE = (
-    mounting(0.1),
-    axle_lever(1.0),
-    drift(SIDE_DRIFT, 0.1, 5.0),
-    drift(WHEEL_DRIFT, 0.1, 1.0),
-    wheel_scale(WHEEL_SCALE, 0.02),
-    time_offset(WHEEL_LATENCY, 0.2),
-    time_offset(FIX_TIME, 0.1),
-    time_offset(VELOCITY_TIME, 0.1),
-    antenna_lever(ANTENNA_LEVER, 0.3),
-    wheel_rounding(WHEEL_ROUNDING, 0.25),
+    mounting_block(0.1),
+    axle_lever_block(1.0),
+    drift_block(SIDE_DRIFT, 0.1, 5.0),
+    drift_block(WHEEL_DRIFT, 0.1, 1.0),
+    wheel_scale_block(WHEEL_SCALE, 0.02),
+    time_offset_block(WHEEL_LATENCY, 0.2),
+    time_offset_block(FIX_TIME, 0.1),
+    time_offset_block(VELOCITY_TIME, 0.1),
+    antenna_lever_block(ANTENNA_LEVER, 0.3),
+    wheel_rounding_block(WHEEL_ROUNDING, 0.25),
 )
 # What the filter holds of them: mounting pitch and yaw, lever, two drifts, scale, latency, two
 # offsets in time, lever of the antenna, rounding.

@@ -20,7 +20,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     FIX_TIME,
     VELOCITY_TIME,
@@ -28,9 +28,9 @@ from fusiond.models.vehicle import (
     WHEEL_LATENCY,
     WHEEL_ROUNDING,
     WHEEL_SCALE,
-    barometer_airflow,
-    barometer_offset,
-    barometer_scale,
+    barometer_airflow_block,
+    barometer_offset_block,
+    barometer_scale_block,
 )
 from tests import runs
 from tests.aiding.measurement_bench import (
@@ -186,9 +186,9 @@ def test_height_jacobian_and_planar() -> None:
 
 def test_barometer_jacobian_and_what_explains_it() -> None:
     blocks = (
-        barometer_offset(AIR[0], 100.0, 0.15),
-        barometer_scale(AIR[1], 0.04),
-        barometer_airflow(AIR[2], 0.1),
+        barometer_offset_block(AIR[0], 100.0, 0.15),
+        barometer_scale_block(AIR[1], 0.04),
+        barometer_airflow_block(AIR[2], 0.1),
     )
     model = make_model("ins15", imu_noise(Imu()), *blocks)
     measurement = BarometerMeasurement(*SOURCE, 120.0, 5.0, *AIR)

@@ -17,7 +17,7 @@ from fusiond.aiding.body_velocity import NonHolonomicConstraint, WheelSpeedMeasu
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.standstill import ZeroAngularRateUpdate, ZeroVelocityUpdate
 from fusiond.aiding.velocity import AVERAGED, VelocityMeasurement
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     FIX_TIME,
     VELOCITY_TIME,
@@ -68,7 +68,7 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     arm = dcm @ np.add(LEVER, rest)
     moved = np.array(VELOCITY) + dcm @ np.cross(RATE_SENSED, np.add(LEVER, rest))
     moved = moved * late + 0.5 * np.array(ACCELERATION) * late**2
-    antenna = nav[:3] + (arm + moved) / runs.metres(*nav[[0, 2]])
+    antenna = nav[:3] + (arm + moved) / runs.metres_per_unit(*nav[[0, 2]])
     lat, lon, height = (float(x) for x in antenna)
     fix = PositionMeasurement(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
     fix = replace(fix, time=FIX_TIME, rest=ANTENNA_LEVER)
@@ -105,7 +105,7 @@ def test_innovation_is_zero_where_the_measurement_is_true() -> None:
     nav = runs.level_nav(RPY, VELOCITY)
     dcm = Rotation.from_euler("ZYX", RPY[::-1]).as_matrix()
     state = state_of(model, nav, np.zeros(model.size))
-    antenna = nav[:3] + (dcm @ LEVER) / runs.metres(*nav[[0, 2]])
+    antenna = nav[:3] + (dcm @ LEVER) / runs.metres_per_unit(*nav[[0, 2]])
     lat, lon, height = (float(x) for x in antenna)
     fix = PositionMeasurement(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
     assert innovation_of(fix, state).z == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
@@ -130,7 +130,7 @@ def test_position_across_the_date_line() -> None:
         *SOURCE, float(nav[0]), -math.pi + 1e-7, 40.0, (1.0, 1.0, 1.0), (0.0,) * 3
     )
     z = innovation_of(fix, state_of(model, nav, np.zeros(model.size))).z
-    assert z[1] == pytest.approx(-2e-7 * runs.metres(*nav[[0, 2]])[1], rel=1e-6)
+    assert z[1] == pytest.approx(-2e-7 * runs.metres_per_unit(*nav[[0, 2]])[1], rel=1e-6)
 
 
 def test_rdss_rows_are_whitened_by_the_covariance_of_the_fix() -> None:
@@ -144,7 +144,7 @@ def test_rdss_rows_are_whitened_by_the_covariance_of_the_fix() -> None:
     assert whiten.T @ whiten == pytest.approx(np.linalg.inv(cov), rel=1e-9)
     assert r == pytest.approx([1.0, 1.0])
     lever = state.dcm @ LEVER
-    metres = np.array([-1e-6, 2e-6]) * runs.metres(*nav[[0, 2]])[:2] + lever[:2]
+    metres = np.array([-1e-6, 2e-6]) * runs.metres_per_unit(*nav[[0, 2]])[:2] + lever[:2]
     assert z == pytest.approx(whiten @ metres, rel=1e-6)
     timed = innovation_of(replace(rdss_measurement(nav), sd_time_s=0.5), state).h[:, 6:8]
     v = np.array(VELOCITY[:2])

@@ -156,7 +156,7 @@ def test_a_true_star_tracker_has_no_innovation() -> None:
 def _moved(nav: Array, seconds: float) -> Array:
     """Straight on with the turn of RATE, for so short a time that nothing bends."""
     after = nav.copy()
-    after[:3] += nav[3:6] * seconds / runs.metres(float(nav[0]), float(nav[2]))
+    after[:3] += nav[3:6] * seconds / runs.metres_per_unit(float(nav[0]), float(nav[2]))
     turned = dcm_from_quaternion(nav[6:]) @ Rotation.from_rotvec(RATE * seconds).as_matrix()
     after[6:] = np.roll(Rotation.from_matrix(turned).as_quat(), 1)
     return after

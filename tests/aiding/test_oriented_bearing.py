@@ -63,7 +63,7 @@ def test_slopes_are_those_of_the_angles() -> None:
     h = asked(measurement, base).h
     # No attitude is estimated, and a velocity turns nothing.
     assert not h[:, :6].any()
-    metres = runs.metres(base.nav[LAT], base.nav[LAT + 2])
+    metres = runs.metres_per_unit(base.nav[LAT], base.nav[LAT + 2])
     for axis in range(3):
         ends = []
         for d in (-0.5, 0.5):

@@ -15,15 +15,15 @@ from fusiond.aiding.compass import CompassMeasurement, deviation, disturbance
 from fusiond.aiding.headings_without_imu import HOLDS_NS, HeadingHistory, KnownHeading
 from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.constant_velocity import constant_velocity
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     WHEEL_DRIFT,
     WHEEL_LATENCY,
     WHEEL_ROUNDING,
     WHEEL_SCALE,
-    drift,
-    time_offset,
-    wheel_rounding,
-    wheel_scale,
+    drift_block,
+    time_offset_block,
+    wheel_rounding_block,
+    wheel_scale_block,
 )
 from fusiond.navigation.strapdown import STEP_SIZE
 from tests import runs
@@ -33,10 +33,10 @@ YAW_RAD = 0.7
 FORWARD = np.array([math.cos(YAW_RAD), math.sin(YAW_RAD), 0.0])
 SD_M_S = 0.2
 BLOCKS = (
-    wheel_scale(WHEEL_SCALE, 0.02),
-    drift(WHEEL_DRIFT, 0.1, 1.0),
-    time_offset(WHEEL_LATENCY, 0.2),
-    wheel_rounding(WHEEL_ROUNDING, 0.3),
+    wheel_scale_block(WHEEL_SCALE, 0.02),
+    drift_block(WHEEL_DRIFT, 0.1, 1.0),
+    time_offset_block(WHEEL_LATENCY, 0.2),
+    wheel_rounding_block(WHEEL_ROUNDING, 0.3),
     deviation("iron", 0.05),
     disturbance("bridges", 0.03, 20.0),
 )

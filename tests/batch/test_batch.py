@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from fusiond.batch.log_row import drive_row
 from fusiond.commands.app import app
-from fusiond.files.parquet_rows import Row, read_rows
+from fusiond.files.resumable_parquet import Row, read_rows
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 

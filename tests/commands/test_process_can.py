@@ -17,7 +17,7 @@ from fusiond.files.measurement_csv import read_gnss, read_solution
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 from tests.places import DATA, REPOSITORY
-from tests.runs import metres
+from tests.runs import metres_per_unit
 
 CONFIG = REPOSITORY / "config" / "css_164.toml"
 LOG = DATA / "css_164" / "can.log.gz"
@@ -58,7 +58,7 @@ def distance_m(solution: Path) -> float:
     """From the track's fix at the end of the part, horizontally."""
     table, track = read_solution(solution), read_gnss(DATA / "css_164" / "gnss.csv")
     t_s = UNTIL_S - 2.0
-    north, east, _ = metres(float(table.lat_rad[-1]), 100.0)
+    north, east, _ = metres_per_unit(float(table.lat_rad[-1]), 100.0)
     here = [np.interp(t_s, table.t_s, x) for x in (table.lat_rad, table.lon_rad)]
     there = [np.interp(t_s - RECORDER_S, track.t_s, x) for x in (track.lat_rad, track.lon_rad)]
     return float(np.hypot((here[0] - there[0]) * north, (here[1] - there[1]) * east))

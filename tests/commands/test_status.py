@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from fusiond.commands.app import app
-from fusiond.commands.status_report import duration, page
+from fusiond.commands.status_report import duration, status_page
 from fusiond.configuration.schema import Mqtt
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.mqtt import MqttPublisher
@@ -160,7 +160,7 @@ def test_a_daemon_that_knows_nothing_yet() -> None:
         "recording": "off",
         "uptime_s": 0.4,
     }
-    lines = page({"vehicle": "truck", "status": status, "nav": unknown})
+    lines = status_page({"vehicle": "truck", "status": status, "nav": unknown})
     assert "up 0.4 s" in lines[0]
     assert lines[1].startswith("WAITING for a time not known before UTC is")
     assert "position    none yet" in lines

@@ -12,7 +12,7 @@ from typing import Any
 import websockets
 from websockets.asyncio.client import ClientConnection, connect
 
-from fusiond.dashboard.serve import PageAddress, listening, serve
+from fusiond.dashboard.serve import PageAddress, listening_socket, serve
 from fusiond.dashboard.vehicles import Hub
 from fusiond.outputs.topics import TOPICS
 from tests.outputs.messages_examples import EXAMPLES
@@ -44,7 +44,7 @@ async def at_work(
 ) -> AsyncIterator[str]:
     """Its address as HOST:PORT."""
     serving = PageAddress(port=0, token=token, base_map=base_map)
-    listener = listening(serving)
+    listener = listening_socket(serving)
     stop = asyncio.Event()
     task = asyncio.create_task(serve(hub, source, serving, listener, stop))
     try:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.dashboard.history import Keyed, Ring
+from fusiond.dashboard.history import LatestRows, LatestRowsByKey
 from fusiond.dashboard.vehicle import MOST_INNOVATIONS
 
 FIGURES = st.none() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False)
@@ -21,7 +21,7 @@ ROWS = st.lists(st.tuples(FIGURES, st.none() | st.text(), FIGURES), max_size=40)
 def test_a_ring_has_the_last_rows_as_they_came(
     rows: list[tuple[Any, ...]], most: int, count: int
 ) -> None:
-    ring = Ring(most, "dod")
+    ring = LatestRows(most, "dod")
     for number, row in enumerate(rows, start=1):
         ring.add(number, row)
     assert len(ring) == min(most, len(rows))
@@ -31,7 +31,7 @@ def test_a_ring_has_the_last_rows_as_they_came(
 
 @given(st.lists(st.tuples(st.integers(0, 9), FIGURES), max_size=60), st.integers(0, 60))
 def test_of_each_key_there_is_the_newest_row(puts: list[tuple[int, Any]], count: int) -> None:
-    most, kept = 6, Keyed(6, "od")
+    most, kept = 6, LatestRowsByKey(6, "od")
     expected: dict[int, tuple[int, list[Any]]] = {}
     for number, (key, value) in enumerate(puts, start=1):
         assert kept.get(key) == (expected[key][1] if key in expected else None)
@@ -45,14 +45,14 @@ def test_of_each_key_there_is_the_newest_row(puts: list[tuple[int, Any]], count:
 
 @pytest.mark.parametrize("value", [10**400, -(10**400), math.nan])
 def test_integers_beyond_doubles_become_nan(value: float) -> None:
-    ring = Ring(3, "d")
+    ring = LatestRows(3, "d")
     ring.add(1, [value])
     assert ring.newer(0) == [[None]]
 
 
 def test_ten_minutes_of_innovations_take_three_megabytes() -> None:
     """Each with texts and floats of its own, as messages bring them; lists took 6 MB."""
-    kept = Keyed(MOST_INNOVATIONS, "doodd")
+    kept = LatestRowsByKey(MOST_INNOVATIONS, "doodd")
     tracemalloc.start()
     try:
         for k in range(MOST_INNOVATIONS + 5000):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.dashboard import viewer
+from fusiond.dashboard import browser_connection
 from fusiond.dashboard.broker import Access, Broker
 from fusiond.dashboard.player import Player
 from fusiond.dashboard.vehicles import GIVES_WAY_S, LARGEST_BYTES, MOST_VEHICLES, Hub
@@ -95,7 +95,7 @@ async def test_a_command_needs_the_token_and_gets_the_daemons_answer(tmp_path: P
             ):
                 await daemon.publish(f"{BASE}/status", payload("status"), qos=1, retain=True)
                 await page.until(lambda p: "status" in p.latest)
-                assert page.hello["commands"] == list(viewer.COMMANDS)
+                assert page.hello["commands"] == list(browser_connection.COMMANDS)
                 for wrong in ({}, {"token": "s3cret-tokem"}, {"token": 5}, {"token": None}):
                     answer = await page.ask(command="request_fix", **wrong)
                     assert answer == {"ok": False, "text": "refused: wrong token"}
@@ -195,7 +195,7 @@ async def test_a_slow_browser_gets_the_newest_and_holds_up_nobody() -> None:
 
 async def test_more_browsers_than_there_is_room_for_are_refused() -> None:
     async with at_work(make_hub()) as address:
-        pages = [browsing(address) for _ in range(viewer.MOST_VIEWERS)]
+        pages = [browsing(address) for _ in range(browser_connection.MOST_VIEWERS)]
         for page in pages:
             await page.__aenter__()
         assert await refused(address) == 403

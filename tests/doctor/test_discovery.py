@@ -28,7 +28,7 @@ from fusiond.doctor.discovery import (
     down_axis,
     round_rate,
 )
-from fusiond.doctor.shipped_dbc_devices import KNOWN_DEVICES
+from fusiond.doctor.shipped_dbc_options import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.scenarios import SCENARIOS

@@ -27,7 +27,7 @@ from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.mixed_framing import NmeaSplitter, StreamSplitter
 from drivers.ntrip import client
-from drivers.ntrip.reply import CasterRefusedError, CasterReply
+from drivers.ntrip.protocol import CasterRefusedError, CasterReply
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDecoder
 from drivers.rdss import binary_4_0, text_2_1

@@ -24,7 +24,7 @@ from drivers.base import Backoff
 from drivers.measurements import DeviceEvent
 from drivers.nmea.driver import NmeaDriver, NmeaOptions
 from drivers.ntrip.client import NtripClient, NtripOptions
-from drivers.ntrip.reply import HEADER_BYTES, CasterRefusedError, CasterReply
+from drivers.ntrip.protocol import HEADER_BYTES, CasterRefusedError, CasterReply
 from drivers.raw.driver import GnssOptions
 from tests.broker import free_port
 from tests.drivers.at_work import at_work

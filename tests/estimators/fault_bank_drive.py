@@ -61,7 +61,7 @@ def measurements(
         place += b * {"position": 1.0, "position_drift": since_s}.get(fault, 0.0)
         speed += b * {"velocity": 1.0, "velocity_drift": since_s}.get(fault, 0.0)
     lat, lon, up = states.position[0] + np.array([1.0, 1.0, -1.0]) * place * np.abs(
-        1.0 / runs.metres(states.position[0, 0], states.position[0, 2])
+        1.0 / runs.metres_per_unit(states.position[0, 0], states.position[0, 2])
     )
     v = tuple((states.v_ned[0] + speed).tolist())
     lever, gate = (0.0, 0.0, 0.0), 1.0 - 1e-12

@@ -62,7 +62,8 @@ def drawn_measurements(
     for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
         lat, lon, height = (
             float(x)
-            for x in p + rng.standard_normal(3) * sd / runs.metres(float(p[0]), float(p[2]))
+            for x in p
+            + rng.standard_normal(3) * sd / runs.metres_per_unit(float(p[0]), float(p[2]))
         )
         t_ns = round(t * 1e9)
         if planar:

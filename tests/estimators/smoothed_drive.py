@@ -25,7 +25,7 @@ from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.smoothing.backward import Smoothed, Smoother
 from fusiond.estimators.smoothing.node import Nodes
 from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes_of
-from fusiond.models import vehicle
+from fusiond.models import vehicle_parameter_blocks as vehicle
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -48,13 +48,13 @@ SD, SD_V, LEVER, WHEEL, AXLE = (
     (-1.2, 0.0, 0.4),
 )
 UNKNOWN: tuple[Block, ...] = (
-    vehicle.time_offset(vehicle.FIX_TIME, 0.1),
-    vehicle.time_offset(vehicle.VELOCITY_TIME, 0.1),
-    vehicle.mounting(np.radians(2.0)),
-    vehicle.axle_lever(0.5),
-    vehicle.drift(vehicle.SIDE_DRIFT, 0.1, 5.0),
-    vehicle.drift(vehicle.WHEEL_DRIFT, 0.1, 1.0),
-    vehicle.wheel_scale(vehicle.WHEEL_SCALE, 0.02),
+    vehicle.time_offset_block(vehicle.FIX_TIME, 0.1),
+    vehicle.time_offset_block(vehicle.VELOCITY_TIME, 0.1),
+    vehicle.mounting_block(np.radians(2.0)),
+    vehicle.axle_lever_block(0.5),
+    vehicle.drift_block(vehicle.SIDE_DRIFT, 0.1, 5.0),
+    vehicle.drift_block(vehicle.WHEEL_DRIFT, 0.1, 1.0),
+    vehicle.wheel_scale_block(vehicle.WHEEL_SCALE, 0.02),
     position_bias(BIAS_BLOCK, 15.0, 600.0),
 )
 """What an owner cannot measure; without it the measurements have white errors alone."""
@@ -112,10 +112,19 @@ def nominal_measurements(holding: bool = False) -> tuple[Late, ...]:
             continue
         t_ns = round(t * 1e9)
         fix = PositionMeasurement(
-            *("gnss", t_ns, GATE, lat, lon, height, SD, LEVER), time=vehicle.FIX_TIME
+            *("gnss", t_ns, GATE, lat, lon, height, SD, LEVER),
+            time=vehicle.FIX_TIME,
         )
         v = VelocityMeasurement(
-            *("gnss_velocity", t_ns, GATE, (0.0, 0.0, 0.0), SD_V, LEVER, vehicle.VELOCITY_TIME)
+            *(
+                "gnss_velocity",
+                t_ns,
+                GATE,
+                (0.0, 0.0, 0.0),
+                SD_V,
+                LEVER,
+                vehicle.VELOCITY_TIME,
+            )
         )
         found += [Late(t, fix), Late(t, v)]
     for t in np.arange(3.111, SECONDS - 1.0, 5.0):

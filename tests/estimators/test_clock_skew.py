@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.models.vehicle import CLOCK_SKEW, CLOCK_SKEW_SD, FIX_TIME, VELOCITY_TIME
+from fusiond.models.vehicle_parameter_blocks import (
+    CLOCK_SKEW,
+    CLOCK_SKEW_SD,
+    FIX_TIME,
+    VELOCITY_TIME,
+)
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
-from fusiond.studies.faults.scenes import CODE, RTK, Vehicle, scene
 from fusiond.studies.faults.sensor_data import Recording
-from fusiond.studies.faults.solution_errors import against
+from fusiond.studies.faults.sharpness_service_drives import CODE, RTK, Vehicle, scene
+from fusiond.studies.faults.solution_errors import errors_against
 
 SKEW = 250e-6
 """As of the unit of drive_0708: 0.1 s in 400 s."""
@@ -61,7 +66,7 @@ def test_fixes_of_a_fast_clock_are_followed_and_nobody_is_accused(skew: float) -
             seen_states.append((e.xi.item(slot), np.sqrt(variance), e.xi.item(offset)))
 
     ticks = np.arange(1.0, 10.0 * LENGTH_S - 5.0) * 0.1
-    run = against(on.config, by_its_clock, on.truth.at(ticks), None, watch)
+    run = errors_against(on.config, by_its_clock, on.truth.at(ticks), None, watch)
     found, sd, offset_s = seen_states[-1]
     assert found == pytest.approx(skew, abs=4.0 * sd)
     assert sd < 0.7 * CLOCK_SKEW_SD

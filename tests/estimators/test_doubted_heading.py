@@ -22,7 +22,7 @@ from tests.runs import (
     filled_buffer,
     imu_run,
     initial_sd,
-    metres,
+    metres_per_unit,
     nav_error,
     sample_times,
     true_nav,
@@ -70,7 +70,7 @@ def nees_of_tilt_and_force(kind: type[KalmanEstimator], seed: int) -> float:
         t_ns = round(float(t_s) * 1e9)
         estimator.propagate(buffer, t_ns)
         true = true_nav(truth(), np.array([estimator.t_ns * 1e-9]))[0]
-        to_m = metres(float(true[0]), float(true[2]))
+        to_m = metres_per_unit(float(true[0]), float(true[2]))
         place = true[:3] + FIX_SD_M * rng.standard_normal(3) / to_m
         v = true[3:6] + VELOCITY_SD_M_S * rng.standard_normal(3)
         lat, lon, height = place.tolist()

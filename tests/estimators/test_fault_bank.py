@@ -13,7 +13,7 @@ from fusiond.estimators.fault_bank import J_AT, N_AT, ONSET, RESTARTS
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import FIX_TIME, VELOCITY_TIME, time_offset
+from fusiond.models.vehicle_parameter_blocks import FIX_TIME, VELOCITY_TIME, time_offset_block
 from tests import runs
 from tests.estimators.fault_bank_drive import (
     IMU,
@@ -205,7 +205,7 @@ def test_each_kind_says_what_it_is() -> None:
 def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
     """Fixes that are stamped too late from the start on, against ones that are not."""
     tau_s = 0.02
-    blocks = (time_offset(FIX_TIME, 0.1), time_offset(VELOCITY_TIME, 0.1))
+    blocks = (time_offset_block(FIX_TIME, 0.1), time_offset_block(VELOCITY_TIME, 0.1))
     model = make_model("ins15", imu_noise(IMU), *blocks)
     kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
     truth = runs.town_truth(30.0, IMU.rate_hz)

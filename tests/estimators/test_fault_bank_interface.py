@@ -118,7 +118,7 @@ def test_a_receiver_that_is_off_moves_the_state_as_its_hypothesis_says(
             n, e, d = velocity.v_ned
             velocity = replace(velocity, v_ned=(n + off, e, d))
         else:
-            by = off / float(runs.metres(position.lat_rad, position.height_m or 0.0)[0])
+            by = off / float(runs.metres_per_unit(position.lat_rad, position.height_m or 0.0)[0])
             position = replace(position, lat_rad=position.lat_rad + by)
         shifted.append([position, velocity])
     town_drive.run(right, buffer, measurements)

@@ -42,7 +42,7 @@ from fusiond.estimators.published_state import MOVING, moving, opened_variances
 from fusiond.estimators.tilt_axes_update import turn_covariance
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import MOUNTING, mounting
+from fusiond.models.vehicle_parameter_blocks import MOUNTING, mounting_block
 from fusiond.navigation.rotation import quaternion_from_rpy
 from tests.estimators.test_fault_bank import IMU, LAST_NS, MODEL, imu_noise, run
 
@@ -146,7 +146,7 @@ def test_what_is_published_by_the_receivers_clock_is_wider_by_what_a_fault_does_
 def test_what_the_unit_has_been_found_to_have_turned_is_open() -> None:
     """All of it, and no more than chance of what the mounting has from the start; on a slope a turn
     about the vertical axis is one of roll, in a bank of pitch."""
-    model = make_model("ins15", imu_noise(IMU), mounting(math.radians(5.0)))
+    model = make_model("ins15", imu_noise(IMU), mounting_block(math.radians(5.0)))
     kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
     made = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds))
     tilted = quaternion_from_rpy(math.radians(10.0), math.radians(6.0), 0.3)

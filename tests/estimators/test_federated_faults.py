@@ -114,7 +114,7 @@ def test_no_reset_keeps_a_faulty_filter_out_of_the_others() -> None:
         nav = runs.true_nav(study.truth(), np.zeros(1))[0]
         e.initialise(0, 0, nav, np.zeros(model.size), np.diag(sd**2))
         measurements = study.fixes(np.random.default_rng(1), "")[:6]
-        moved = np.array([value, 0.0, 0.0]) / runs.metres(float(nav[0]), float(nav[2]))
+        moved = np.array([value, 0.0, 0.0]) / runs.metres_per_unit(float(nav[0]), float(nav[2]))
         for measurement in measurements:
             lat = measurement.lat_rad + (float(moved[0]) if measurement.source == "first" else 0.0)
             fix = study.PositionMeasurement(
@@ -223,7 +223,9 @@ def _fixes(truth: Truth, rng: np.random.Generator) -> list[Measurement]:
         p = truth.at(np.array([t])).position[0]
         north = 50.0 if source == "gnss_b" and FAULT_S <= t < END_S else 0.0
         error = rng.standard_normal(3) * 2.0 + [north, 0.0, 0.0]
-        lat, lon, up = (float(x) for x in p + error / runs.metres(float(p[0]), float(p[2])))
+        lat, lon, up = (
+            float(x) for x in p + error / runs.metres_per_unit(float(p[0]), float(p[2]))
+        )
         at = round(t * 1e9)
         sd = (2.0, 2.0, 2.0)
         found.append(PositionFix(source, at, MonotonicStamp(at), lat, lon, up, sd_ned_m=sd))

@@ -13,7 +13,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.invariant import InvariantFilter, Turning
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import mounting
+from fusiond.models.vehicle_parameter_blocks import mounting_block
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
@@ -31,7 +31,7 @@ PLACE = np.array([12.0, 4.5, 0.3])
 
 
 def _filter() -> InvariantFilter:
-    found = InvariantFilter(make_model("ins15", imu_noise(Imu()), mounting(0.1)), 1.0)
+    found = InvariantFilter(make_model("ins15", imu_noise(Imu()), mounting_block(0.1)), 1.0)
     n = found.model.size
     nav = runs.level_nav((0.03, -0.05, 2.1), (9.0, -11.0, 0.6))
     found.initialise(0, 0, nav, np.zeros(n), np.diag(found.model.initial**2))

@@ -13,7 +13,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import mounting
+from fusiond.models.vehicle_parameter_blocks import mounting_block
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.simulation.imu_truth import Truth
@@ -46,7 +46,7 @@ def _tilt_nees(seed: int) -> float:
     sensed = imu_output(IMU, truth.gyro, truth.accel, rng)
     imu = ImuBuffer(RATE_HZ, SECONDS + 2.0, np.eye(3), 0.0, 0.5)
     imu.append(runs.sample_times(truth), np.hstack([sensed.gyro, sensed.accel]))
-    model = make_model("ins21", imu_noise(IMU), mounting(3.0 * DEG))
+    model = make_model("ins21", imu_noise(IMU), mounting_block(3.0 * DEG))
     nav = true_nav(truth, np.array([0.0]))[0]
     c = dcm_from_quaternion(nav[6:])
     # True minus estimated: what a level attitude and sensors without errors are taken to be off by.

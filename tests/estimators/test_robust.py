@@ -36,7 +36,7 @@ def _loss(t: Array) -> Array:
 
 def _fix(north_m: float, east_m: float, robust: bool = True) -> PositionMeasurement:
     lat, lon, height = runs.ORIGIN
-    north, east, _ = runs.metres(lat, height)
+    north, east, _ = runs.metres_per_unit(lat, height)
     place = lat + north_m / north, lon + east_m / east, height - 2.0
     return PositionMeasurement("gnss", 0, 1.0 - 1e-9, *place, SD, LEVER, robust=robust)
 

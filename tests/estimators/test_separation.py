@@ -33,7 +33,7 @@ def fix(
 ) -> PositionMeasurement:
     sd = SD[source]
     noise = rng.standard_normal(3) * sd + (off_m, 0.0, 0.0)
-    lat, lon, up = (float(x) for x in place + noise / runs.metres(place[0], place[2]))
+    lat, lon, up = (float(x) for x in place + noise / runs.metres_per_unit(place[0], place[2]))
     return PositionMeasurement(source, t_ns, 1 - 1e-9, lat, lon, up, (sd, sd, sd), (0.0, 0.0, -1.0))
 
 

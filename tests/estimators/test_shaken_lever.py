@@ -14,7 +14,12 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import ANTENNA_LEVER, AXLE_LEVER, antenna_lever, axle_lever
+from fusiond.models.vehicle_parameter_blocks import (
+    ANTENNA_LEVER,
+    AXLE_LEVER,
+    antenna_lever_block,
+    axle_lever_block,
+)
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import Leg, follow
@@ -26,7 +31,7 @@ IMU = Imu(sensor_class="mems", rate_hz=RATE_HZ)
 SHAKEN_RAD_S = 1.0 * DEG
 """Of a sample: an engine and a road, ten times as much as the sheet says."""
 NOISE = replace(imu_noise(IMU), rate_noise=SHAKEN_RAD_S / math.sqrt(RATE_HZ))
-MODEL = make_model("ins15", NOISE, antenna_lever(ANTENNA_LEVER, 1.0), axle_lever(1.0))
+MODEL = make_model("ins15", NOISE, antenna_lever_block(ANTENNA_LEVER, 1.0), axle_lever_block(1.0))
 VELOCITY_SD_M_S, SLIP_SD_M_S = (0.05,) * 3, 0.02
 ARM = (0.0, 0.0, 0.0)
 LEVER, AXLE_M = np.array([1.2, -0.5, -1.5]), -1.5

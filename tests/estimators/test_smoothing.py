@@ -18,7 +18,7 @@ from fusiond.estimators.smoothing.node_recorder import NEVER, TapedKalman, nodes
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.models.vehicle import ANTENNA_LEVER, antenna_lever
+from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER, antenna_lever_block
 from fusiond.navigation.imu_buffer import ImuBuffer
 from tests.estimators import smoothed_drive, town_drive
 from tests.estimators.monte_carlo import interval
@@ -140,7 +140,7 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
             ]
             for epoch in measurements
         ]
-        unknown = [antenna_lever(ANTENNA_LEVER, 1.0)]
+        unknown = [antenna_lever_block(ANTENNA_LEVER, 1.0)]
     model = make_model(name, imu_noise(town_drive.IMU), *unknown)
     estimator = Logging(model, town_drive.IMU.gap_s)
     sd = model.initial.copy()

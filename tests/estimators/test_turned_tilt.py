@@ -36,7 +36,7 @@ from fusiond.navigation.strapdown import STEP_RESTS_S, STEP_SIZE, strapdown_step
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 from tests import runs
 from tests.estimators.monte_carlo import interval
 
@@ -84,7 +84,7 @@ def _nees(kind: type[KalmanEstimator], number: int) -> tuple[float, float]:
     true = truth.at(t_s, REST)
     for k, t_ns in enumerate(np.rint(t_s * 1e9).astype(np.int64).tolist()):
         filter_.propagate(imu, t_ns)
-        to_metres = metres(float(true.position[k, 0]), float(true.position[k, 2]))
+        to_metres = metres_per_unit(float(true.position[k, 0]), float(true.position[k, 2]))
         lat, lon, height = true.position[k] + rng.standard_normal(3) * FIX_SD_M / to_metres
         north, east, down = true.v_ned[k] + rng.standard_normal(3) * VELOCITY_SD_M_S
         sd_v, sd_p = (VELOCITY_SD_M_S,) * 3, (FIX_SD_M,) * 3

@@ -25,7 +25,12 @@ from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.estimators.unknown_lever_arm import antenna_slots, keep_antenna
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.models.vehicle import ANTENNA_LEVER, FIX_TIME, antenna_lever, time_offset
+from fusiond.models.vehicle_parameter_blocks import (
+    ANTENNA_LEVER,
+    FIX_TIME,
+    antenna_lever_block,
+    time_offset_block,
+)
 from fusiond.navigation.error_model import DR, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, quaternion_from_rpy
@@ -33,7 +38,7 @@ from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 from tests import runs
 from tests.estimators.monte_carlo import interval
 
@@ -48,8 +53,8 @@ ARM = (0.0, 0.0, 0.0)
 
 
 def _model() -> Model:
-    lever = antenna_lever(ANTENNA_LEVER, LEVER_SD_M)
-    return make_model("ins21", imu_noise(IMU), lever, time_offset(FIX_TIME, LATE_SD_S))
+    lever = antenna_lever_block(ANTENNA_LEVER, LEVER_SD_M)
+    return make_model("ins21", imu_noise(IMU), lever, time_offset_block(FIX_TIME, LATE_SD_S))
 
 
 def _fix(t_ns: int, place: Array) -> PositionMeasurement:
@@ -87,7 +92,7 @@ def _nees(kind: type[KalmanEstimator], number: int) -> tuple[float, float]:
     seen, moving = truth.at(t_s + late_s, arm), truth.at(t_s, arm)
     for k, t_ns in enumerate(np.rint(t_s * 1e9).astype(np.int64).tolist()):
         filter_.propagate(imu, t_ns)
-        to_metres = metres(float(seen.position[k, 0]), float(seen.position[k, 2]))
+        to_metres = metres_per_unit(float(seen.position[k, 0]), float(seen.position[k, 2]))
         north, east, down = moving.v_ned[k] + rng.standard_normal(3) * VELOCITY_SD_M_S
         sd_v = (VELOCITY_SD_M_S,) * 3
         velocity = VelocityMeasurement(
@@ -214,11 +219,13 @@ def test_what_an_attitude_makes_of_an_unknown_lever_is_noise() -> None:
 
 
 def test_of_two_lever_arms_neither_is_carried() -> None:
-    blocks = [antenna_lever(f"{ANTENNA_LEVER}{name}", 1.0) for name in ("", "_roof")]
+    blocks = [antenna_lever_block(f"{ANTENNA_LEVER}{name}", 1.0) for name in ("", "_roof")]
     lever, time = antenna_slots(make_model("ins21", imu_noise(IMU), *blocks))
     assert (lever.size, time.size) == (0, 0)
-    of_roof = time_offset(f"{FIX_TIME}_roof", 0.1)
-    model = make_model("ins21", imu_noise(IMU), blocks[1], time_offset(FIX_TIME, 0.1), of_roof)
+    of_roof = time_offset_block(f"{FIX_TIME}_roof", 0.1)
+    model = make_model(
+        "ins21", imu_noise(IMU), blocks[1], time_offset_block(FIX_TIME, 0.1), of_roof
+    )
     lever, time = antenna_slots(model)
     assert lever.tolist() == model.slots_of(f"{ANTENNA_LEVER}_roof")
     assert time.tolist() == model.slots_of(f"{FIX_TIME}_roof")

@@ -253,7 +253,7 @@ def _nees(unscented: bool, count: int, heading_deg: float) -> float:
         start = runs.with_error(true_at[0], rng.standard_normal(9) * sd[:9])
         f.initialise(0, 0, start, np.zeros(model.size), np.diag(sd**2))
         for t_s, nav in zip(fixes_s, true_at[1:], strict=True):
-            scale = runs.metres(float(nav[0]), float(nav[2]))
+            scale = runs.metres_per_unit(float(nav[0]), float(nav[2]))
             lat, lon, up = (float(x) for x in nav[:3] + 2.0 * rng.standard_normal(3) / scale)
             measurement = PositionMeasurement(
                 "gnss", round(t_s * 1e9), GATE, lat, lon, up, (2.0,) * 3, NO_LEVER

@@ -13,7 +13,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
-from fusiond.models.vehicle import FIX_MARKOV
+from fusiond.models.vehicle_parameter_blocks import FIX_MARKOV
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.imu_truth import Truth
@@ -21,7 +21,7 @@ from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
 from fusiond.studies.monte_carlo import nees_interval
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 from tests import runs
 
 RATE_HZ, FIX_HZ, SECONDS, RUNS = 50.0, 10.0, 150.0, 24
@@ -76,7 +76,7 @@ def _nees(seed: int, lasts_s: float) -> tuple[float, float]:
     for k, t in enumerate(t_s.tolist()):
         lat, lon, height = there.position[k].tolist()
         lat, lon, height = (
-            there.position[k] + error[k] / metres(float(lat), float(height))
+            there.position[k] + error[k] / metres_per_unit(float(lat), float(height))
         ).tolist()
         north, east, down = v[k].tolist()
         t_ns = round(t * 1e9)

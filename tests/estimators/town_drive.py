@@ -44,7 +44,7 @@ def drive(
     states = truth.at(t_s, LEVER)
     measurements: list[list[Linearised]] = []
     for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
-        off = noise * rng.standard_normal(3) * SD / runs.metres(float(p[0]), float(p[2]))
+        off = noise * rng.standard_normal(3) * SD / runs.metres_per_unit(float(p[0]), float(p[2]))
         lat, lon, height = (float(x) for x in p + off)
         n, e, d = (float(x) for x in v + noise * rng.standard_normal(3) * SD_V)
         t_ns = round(t * 1e9)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.files.csv_tables import FEWEST_ZEROS, TableError, counts, file_report
+from fusiond.files.csv_tables import FEWEST_ZEROS, TableError, file_report, rejection_counts
 from fusiond.files.fixed_decimal import newlines, parse_rows
 from fusiond.files.measurement_csv import (
     read_attitude,
@@ -113,9 +113,13 @@ def test_a_reason_has_a_count_and_rejections_stand_in_file_order(tmp_path: Path)
     assert [r.line for r in table.rejected] == [3, 4, 6, 7]
     report = file_report(len(table.t_s), table.rejected, first=1)
     assert report["rows"] == 2
-    assert report["rejected"] == counts(table.rejected)
+    assert report["rejected"] == rejection_counts(table.rejected)
     assert report["first_rejected"] == ["line 3: time_repeated: t_s = 0.000000 after 0.000000"]
-    assert counts(table.rejected) == {"time_repeated": 2, "out_of_range": 1, "unreadable": 1}
+    assert rejection_counts(table.rejected) == {
+        "time_repeated": 2,
+        "out_of_range": 1,
+        "unreadable": 1,
+    }
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=40))
@@ -245,13 +249,13 @@ def test_a_sigma_that_is_zero_in_every_row_is_none(tmp_path: Path) -> None:
     assert file_report(FEWEST_ZEROS, table.rejected)["rejected"] == {}
     # One row that knows its sigma, and a 0 is a row that cannot be true.
     one = read_gnss(write(tmp_path, header, *rows, "99,40,-105,1600,1,1,1,1"))
-    assert counts(one.rejected) == {"sd_not_positive": FEWEST_ZEROS}
+    assert rejection_counts(one.rejected) == {"sd_not_positive": FEWEST_ZEROS}
     # Too few to tell, and a class that must be there.
     few = read_gnss(write(tmp_path, header, *rows[1:]))
-    assert counts(few.rejected) == {"sd_not_positive": FEWEST_ZEROS - 1}
+    assert rejection_counts(few.rejected) == {"sd_not_positive": FEWEST_ZEROS - 1}
     rdss = "t_s,t_arrival_s,lat_deg,lon_deg,height_m,precision_class_m"
     table_rdss = read_rdss(write(tmp_path, rdss, *(f"{i},{i},40,9,5,0" for i in range(20))))
-    assert counts(table_rdss.rejected) == {"sd_not_positive": 20}
+    assert rejection_counts(table_rdss.rejected) == {"sd_not_positive": 20}
 
 
 def test_wheel(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from fusiond.dashboard.schemas import topics
+from fusiond.dashboard.message_parser import topic_parsers
 from fusiond.dashboard.vehicles import REFUSALS, Hub
 from fusiond.files import measurement_csv
 from fusiond.files.csv_tables import TableError
@@ -84,7 +84,7 @@ def hub(data: bytes) -> None:
         frame[vehicle.name] = new = vehicle.since(0)
         for topic, latest in new["messages"].items():
             if topic in SHOWN:
-                assert topics()[topic](latest["said"]) == latest["said"]
+                assert topic_parsers()[topic](latest["said"]) == latest["said"]
     json.dumps(frame, allow_nan=False)
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from drivers.can.bus import CanFrame
 from drivers.nmea.decoder import NmeaDecoder
 from drivers.nmea.mixed_framing import StreamSplitter
-from drivers.ntrip.reply import HEADER_BYTES, CasterRefusedError, CasterReply
+from drivers.ntrip.protocol import HEADER_BYTES, CasterRefusedError, CasterReply
 from drivers.raw.decoder import RawDecoder
 from drivers.rdss import binary_4_0, text_2_1
 from fusiond.navigator.state_file import MOST_BYTES, DamagedStateError, read_state

@@ -6,13 +6,13 @@ import binascii
 import math
 from collections import Counter
 
-from drivers.rdss.envelope import MARK
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import MessageReceived, TextEncoding
 from drivers.rdss.messages import Identity, Text
-from drivers.rdss.report import MODES
-from drivers.rdss.session import Session
+from drivers.rdss.position_report_coding import MODES
+from drivers.rdss.request_cycle_state import RequestCycleState
 from drivers.rdss.state_tables import TerminalOptions
+from drivers.rdss.vehicle_message_envelope import MARK
 from tests.fuzz.documents import input_of
 
 OWN, OTHER = 242286, 242407
@@ -26,7 +26,7 @@ def rdss_mail(data: bytes) -> None:
     if choice & 8:  # an envelope with the right check, so that what it holds is read
         body = bytes((MARK | choice >> 4 & 7,)) + payload[:200]
         payload = b"\xa4" + body + binascii.crc_hqx(body, 0xFFFF).to_bytes(2, "big")
-    session = Session(TerminalOptions(source="rdss"), Counter())
+    session = RequestCycleState(TerminalOptions(source="rdss"), Counter())
     session.identity = Identity(OWN, 60, comm_level=4)
     inbox = Inbox(session)
     user = OTHER if choice & 4 else OWN

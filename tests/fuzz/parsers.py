@@ -13,11 +13,11 @@ class Parser(NamedTuple):
     length: int
 
 
-_NMEA = ("decoder", "epochs", "fields", "time")
+_NMEA = ("decoder", "epoch_assembly", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("bcnav", "beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes")
 _SHARED = ("drivers.cycle", "drivers.solution", "drivers.solution_decoder", "drivers.splitter")
-_HUB = ("advice", "history", "vehicles", "schemas", "vehicle")
+_HUB = ("advice", "history", "vehicles", "message_parser", "vehicle")
 
 PARSERS = {
     "splitter": Parser(("drivers.nmea.mixed_framing",), 128),
@@ -35,9 +35,9 @@ PARSERS = {
     "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
     "rdss_mail": Parser(
         (
-            "drivers.rdss.envelope",
+            "drivers.rdss.vehicle_message_envelope",
             "drivers.rdss.inbox",
-            "drivers.rdss.report",
+            "drivers.rdss.position_report_coding",
             "drivers.rdss.text_coding",
         ),
         212,
@@ -45,7 +45,7 @@ PARSERS = {
     "can": Parser(
         tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "signal_bits", "pairing")), 162
     ),
-    "ntrip": Parser(("drivers.ntrip.reply",), 200),
+    "ntrip": Parser(("drivers.ntrip.protocol",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
     "hub": Parser(tuple(f"fusiond.dashboard.{module}" for module in _HUB), 512),
     "log": Parser(tuple(f"fusiond.recording.{m}" for m in ("info", "reader", "records")), 400),

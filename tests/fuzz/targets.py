@@ -20,7 +20,7 @@ from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, Heading, ImuSample, Measurement, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.mixed_framing import Frame, StreamSplitter
-from drivers.ntrip.reply import CasterRefusedError, CasterReply
+from drivers.ntrip.protocol import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Correction, Ephemeris, RawGnssEpoch

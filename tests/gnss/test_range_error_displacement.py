@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.range_bias_filter import FORGOTTEN_S, RangeBiases, subtract_biases
 from fusiond.gnss.range_error_displacement import (
     CLOCK_M,
     FLOOR_M,
@@ -19,7 +20,6 @@ from fusiond.gnss.range_error_displacement import (
     roots,
 )
 from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
-from fusiond.gnss.satellite_biases import FORGOTTEN_S, Levels, take_off
 from tests.gnss.test_corrections import sky, solved, store_of
 
 T_S = 1.4e9
@@ -133,17 +133,17 @@ def test_how_long_a_displacement_holds() -> None:
 # --------------------------------------------------------------------------- levels
 
 
-def taught(levels: Levels, z: Any, place: float = 1e-4) -> None:
+def taught(levels: RangeBiases, z: Any, place: float = 1e-4) -> None:
     assert levels.seen == []
     levels.seen.append((z, np.full(len(z), place)))
 
 
-def after(errors: Any, seconds: int, noise_m: float = 0.0) -> Levels:
+def after(errors: Any, seconds: int, noise_m: float = 0.0) -> RangeBiases:
     """Levels of ranges that are off by `errors` (n,), a second apart; as of a filter that knows
     its place, and takes off what they say."""
     rng, last = np.random.default_rng(5), None
     for t in range(seconds):
-        last = take_off(last, rows(), T_S + t)
+        last = subtract_biases(last, rows(), T_S + t)
         left = errors - last.offset + noise_m * rng.standard_normal(len(errors))
         taught(last, -left)
     assert last is not None
@@ -177,21 +177,21 @@ def test_a_satellite_that_is_alone_or_far_off_teaches_nothing() -> None:
     errors[2] = 40.0
     found = after(errors, 30)
     assert found.offset[2] == 0.0
-    last = take_off(None, rows(1), T_S)
+    last = subtract_biases(None, rows(1), T_S)
     taught(last, np.array([1.5]))
-    then = take_off(last, rows(1), T_S + 1.0)
+    then = subtract_biases(last, rows(1), T_S + 1.0)
     assert then.offset[0] == 0.0
     assert then.variance[0] == pytest.approx(r.lasting[0])
 
 
 def test_levels_come_by_the_second_and_are_forgotten() -> None:
     found = after(np.linspace(-1.0, 1.0, len(rows().satellites)), 60)
-    soon = take_off(found, rows(), T_S + 59.2)
+    soon = subtract_biases(found, rows(), T_S + 59.2)
     assert soon.seen is None
-    later = take_off(found, rows(), T_S + 59.0 + FORGOTTEN_S - 1.0)
+    later = subtract_biases(found, rows(), T_S + 59.0 + FORGOTTEN_S - 1.0)
     assert later.offset == pytest.approx(soon.offset)
     assert (later.variance > soon.variance).all()
-    gone = take_off(found, rows(), T_S + 60.0 + FORGOTTEN_S)
+    gone = subtract_biases(found, rows(), T_S + 60.0 + FORGOTTEN_S)
     assert (gone.offset == 0.0).all()
     assert gone.variance == pytest.approx(rows().lasting)
     assert math.isclose(found.t_s, T_S + 59.0)

@@ -20,7 +20,7 @@ from fusiond.integrity.consistency import (
 )
 from fusiond.integrity.innovation_window import ConsistencyMonitor
 from fusiond.studies import consistency_verdict_errors as study
-from fusiond.studies.single_axis_ins import Aided, Fault, innovations
+from fusiond.studies.single_axis_ins import AidedAxis, Fault, innovations
 
 Array = NDArray[np.float64]
 PAPER_RHO = (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781)
@@ -105,7 +105,7 @@ def test_false_alarm_rate_of_white_innovations(k: int, m: int, alpha: float) -> 
 
 @pytest.mark.parametrize("k", [20, 50, 200])
 @pytest.mark.parametrize("source", study.SOURCES, ids=lambda s: s.name)
-def test_false_alarm_rate_of_a_matched_kalman_filter(k: int, source: Aided) -> None:
+def test_false_alarm_rate_of_a_matched_kalman_filter(k: int, source: AidedAxis) -> None:
     rng = np.random.default_rng([2, k, int(source.sigma_m)])
     nu = innovations(source, Fault("none"), WINDOWS, k + LAGS, 0, rng)
     hits = np.count_nonzero(_verdicts(nu, k, 0.01))

@@ -26,7 +26,7 @@ def after(
     """Of fixes of a vehicle of such a speed, which is `told` otherwise and jumps at the last."""
     found, rng = Agreement(), np.random.default_rng(4)
     lat0 = 0.53
-    to_m = runs.metres(lat0, 0.0)
+    to_m = runs.metres_per_unit(lat0, 0.0)
     for k in range(count):
         t_ns, t_s = round(k * period_s * SECOND), k * period_s
         at = np.array(speed) * t_s + SD_M * rng.standard_normal(2)

@@ -2,7 +2,7 @@
 
 The vehicle is simulated here; its bytes pass a `Wire` and its samples an `AlteredImu` on their way
 to pseudo terminals and a CAN bus, a real one where `vcan0` is up. Judged as the matrix of faults on
-values (`fusiond.studies.faults.scoring`), on samples of whole seconds.
+values (`fusiond.studies.faults.error_sigma_score`), on samples of whole seconds.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.faults.runs import compared
-from fusiond.studies.faults.scoring import Course, Event, Sample
+from fusiond.studies.faults.error_sigma_score import Course, Event, Sample
+from fusiond.studies.faults.runs import error_sample
 from tests.broker import Broker
 from tests.hil.processes import SIM_IMU
 from tests.live.told import ToldDaemon
@@ -218,7 +218,7 @@ class Rig:
         if t_s < 0.0 or (self.samples and t_s < self.samples[-1].t_s + 1.0):
             return
         true = self.vehicle.truth.at(np.array([t_s]))
-        found = compared(replace(said, t_ns=round(t_s * 1e9)), true)
+        found = error_sample(replace(said, t_ns=round(t_s * 1e9)), true)
         self.samples.append(replace(found, t_s=float(int(t_s))))
 
     @property

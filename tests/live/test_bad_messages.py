@@ -12,9 +12,14 @@ from typing import Any
 
 import aiomqtt
 
-from drivers.rdss.envelope import TEXT, carried, sealed, text_body
 from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import Text
+from drivers.rdss.vehicle_message_envelope import (
+    TEXT,
+    encode_envelope,
+    encode_text_body,
+    envelope_to_text,
+)
 from tests.broker import Broker, Listener, listening
 from tests.hil.processes import DaemonProcess
 from tests.live.radio import CARDS, Radio, config, said
@@ -83,7 +88,9 @@ async def test_what_is_wrong_with_a_message_is_told_by_both_ends(tmp_path: Path)
             texts = [m["text"] for m in received(listener, "ahead")]
             assert texts == ["a short text", "停车检查油量"]
 
-            whole = carried(sealed(TEXT, text_body(7, b"go north")), "binary")
+            whole = envelope_to_text(
+                encode_envelope(TEXT, encode_text_body(7, b"go north")), "binary"
+            )
             for payload, encoding, card, crc_ok in wrong(whole.payload):
                 text = Text(STRANGER, payload, encoding, card, crc_ok=crc_ok)
                 radio.terminals["ahead"].hand_over(text, radio.now_s)
@@ -107,5 +114,5 @@ def wrong(whole: bytes) -> list[tuple[bytes, TextEncoding, int, bool]]:
         (b"\xa4hello", "mixed", AHEAD, False),
         (whole[:-3], "mixed", AHEAD, True),
         (whole[:-1] + b"\0", "mixed", AHEAD, True),
-        (b"\xa4" + sealed(7, b"\x02"), "mixed", AHEAD, True),
+        (b"\xa4" + encode_envelope(7, b"\x02"), "mixed", AHEAD, True),
     ]

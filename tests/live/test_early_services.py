@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from fusiond.clock.stamp_mapping import Clock
-from fusiond.commands.status import ask, chosen
+from fusiond.commands.status import retained_messages, selected_vehicle
 from fusiond.live import daemon
 from fusiond.live.daemon import Daemon
 from fusiond.live.early_services import Front
 from fusiond.navigation.compiled import FOLDER
-from fusiond.workers.forked import Forked
+from fusiond.workers.forked import ForkedJobs
 from tests.broker import Broker, listening
 from tests.hil.processes import DaemonProcess
 from tests.live.daemon_bench import Bench, running
@@ -46,7 +46,7 @@ async def test_it_answers_while_kernels_compile_and_goes_on_by_the_same_connecti
     first, second = tmp_path / "first", tmp_path / "second"
     with (
         Broker(tmp_path) as broker,
-        Forked([_waits_for(first), _waits_for(second)]) as compiling,
+        ForkedJobs([_waits_for(first), _waits_for(second)]) as compiling,
     ):
         config = bench.configuration(_mqtt(broker.port, "reset_filter"))
         front = Front(config, Clock(config.clock))
@@ -55,8 +55,8 @@ async def test_it_answers_while_kernels_compile_and_goes_on_by_the_same_connecti
             status = await listener.until(lambda heard: heard.payloads("fusiond/test/status"))
             said = json.loads(status[0])
             assert (said["mode"], said["why"]) == ("waiting", "compiling 0/2 kernels, once")
-            vehicles = await ask("127.0.0.1", broker.port, None, None, PATIENCE_S)
-            name, heard = chosen(vehicles, None, PATIENCE_S)
+            vehicles = await retained_messages("127.0.0.1", broker.port, None, None, PATIENCE_S)
+            name, heard = selected_vehicle(vehicles, None, PATIENCE_S)
             assert (name, heard.topics["status"]["mode"]) == ("test", "waiting")
             await client.publish("fusiond/test/cmd/reset_filter", '{"id": "a"}', qos=1)
             reply = await listener.until(lambda heard: heard.payloads("fusiond/test/reply"))
@@ -88,7 +88,7 @@ async def test_it_is_ready_after_a_while_though_kernels_still_compile(
     told: list[str] = []
     monkeypatch.setattr(front.service, "_send", told.append)
     stop = asyncio.Event()
-    with Forked([_waits_for(tmp_path / "never")]) as compiling:
+    with ForkedJobs([_waits_for(tmp_path / "never")]) as compiling:
         waiting = asyncio.create_task(front.wait_for(compiling, stop))
         await until(lambda: told)
         stop.set()
@@ -145,7 +145,7 @@ def test_where_nothing_can_be_kept_it_compiles_before_anybody_waits_for_ticks(
         compiled.append(-1)
 
     monkeypatch.setattr(daemon, "kernels_can_be_kept", lambda: False)
-    monkeypatch.setattr(daemon, "Forked", None)
+    monkeypatch.setattr(daemon, "ForkedJobs", None)
     monkeypatch.setattr(daemon.asyncio, "run", served)
     config = bench.configuration("[mqtt]\nenabled = false\n")
     jobs = [partial(compiled.append, k) for k in range(3)]

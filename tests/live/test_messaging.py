@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from drivers.rdss.mail import FleetFix
-from drivers.rdss.report import (
+from drivers.rdss.position_report_coding import (
     REPORT,
     SHORT_REPORT,
     PositionReport,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from drivers.base import DriverStatus
-from drivers.rdss.envelope import opened
 from drivers.rdss.messages import TextRequest
-from drivers.rdss.report import PositionReport, decode_report
-from drivers.rdss.text_coding import Wording
+from drivers.rdss.position_report_coding import PositionReport, decode_report
+from drivers.rdss.text_coding import EncodedText
+from drivers.rdss.vehicle_message_envelope import envelope_from_text
 from fusiond.navigation.earth import meridian_radius
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.fleet import FleetMessage
@@ -123,6 +123,6 @@ async def test_a_subordinates_fix_is_a_place_and_none_of_ones_own(bench: Bench) 
 
 def reported(message: TextRequest) -> PositionReport:
     assert message.receiver == ConvoyVehicle.CARD
-    envelope = opened(Wording(message.payload, message.encoding))
+    envelope = envelope_from_text(EncodedText(message.payload, message.encoding))
     assert envelope is not None
     return decode_report(envelope.kind, envelope.body)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.studies.faults.scoring import Course, Sample
+from fusiond.studies.faults.error_sigma_score import Course, Sample
 from tests.live.rig import AlteredImu, Wire
 from tests.live.wire_faults import ALL, FAULTS
 from tests.live.wire_runs import Run, judged

@@ -19,7 +19,7 @@ from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.replay.run import ReplayOptions, replay
 from fusiond.simulation.can.imu import CanImu
 from fusiond.simulation.live_devices import SimulatedVehicle
-from fusiond.studies.faults.runs import compared
+from fusiond.studies.faults.runs import error_sample
 from tests.live.daemon_bench import NO_MQTT, PARKED, REST, Bench, imu_section, running
 from tests.patience import until
 from tests.recording.driven import Drive
@@ -106,7 +106,7 @@ def test_the_spare_goes_on_where_the_first_got_stuck(tmp_path: Path) -> None:
     assert not navigator.imu.counters["gap"]
     # Its own biases are being found: one sigma is the class's no more, and no lie.
     true = drive.vehicle.truth_at(after.t_ns)
-    sample = compared(after, true)
+    sample = error_sample(after, true)
     assert max(sample.ratios) < 4.0
     assert after.sd_rpy_rad[2] > before.sd_rpy_rad[2]
     assert min(after.sd_rpy_rad) > SPARE.mounting_sd_deg * DEG

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fusiond.studies.faults.scoring import Course, judge
+from fusiond.studies.faults.error_sigma_score import Course, row_figures
 from tests.live.rig import REST_S, Rig, rig, under_way
 from tests.live.wire_faults import FAULTS, Action, plugged
 
@@ -90,7 +90,7 @@ def judged(found: Run, reference: Course) -> dict[str, Any]:
         replace(s, mode=s.mode if s.mode in usual.get(s.t_s, {s.mode}) else modes.get(s.t_s, ""))
         for s in found.course.samples
     ]
-    row = judge(found.course, replace(reference, samples=like), found.begin_s, found.end_s)
+    row = row_figures(found.course, replace(reference, samples=like), found.begin_s, found.end_s)
     return {
         "fault": found.fault,
         "phase": found.phase,

@@ -99,7 +99,7 @@ def fix_of(case: Case, row: int, rng: np.random.Generator) -> PositionFix:
     p, v = antenna.position[k], antenna.v_ned[k]
     if case.delay_s:
         v = truth_of(case).at(antenna.t_s[k : k + 1] + case.delay_s, case.lever).v_ned[0]
-    away = SD_M * rng.standard_normal(3) / np.abs(runs.metres(float(p[0]), float(p[2])))
+    away = SD_M * rng.standard_normal(3) / np.abs(runs.metres_per_unit(float(p[0]), float(p[2])))
     lat, lon, height = (p + away).tolist()
     north, east, down = (v + SD_M_S * rng.standard_normal(3)).tolist()
     t_ns = round(float(antenna.t_s[k]) * 1e9)

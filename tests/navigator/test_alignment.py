@@ -53,7 +53,9 @@ def _fixes(truth: Truth, seed: int, first_s: float = 0.5) -> list[Measurement]:
     states = truth.at(t)
     found: list[Measurement] = []
     for t_s, p, v in zip(t, states.position, states.v_ned, strict=True):
-        lat, lon, height = (float(x) for x in p + rng.standard_normal(3) / runs.metres(p[0], p[2]))
+        lat, lon, height = (
+            float(x) for x in p + rng.standard_normal(3) / runs.metres_per_unit(p[0], p[2])
+        )
         n, e, d = (float(x) for x in v + rng.standard_normal(3) * 0.05)
         t_ns = START_NS + round(t_s * 1e9)
         fix = PositionFix("gnss", t_ns, MonotonicStamp(t_ns), lat, lon, height)

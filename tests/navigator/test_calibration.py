@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.measurements import Measurement, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.configuration.schema import Config
 from fusiond.models.model import Model
-from fusiond.models.vehicle import mounting, time_offset
+from fusiond.models.vehicle_parameter_blocks import mounting_block, time_offset_block
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.calibration import (
     LOOK_NS,
@@ -83,7 +83,7 @@ def drive() -> Recorded:
     states = truth.at(t)
     for t_s, p, v in zip(t, states.position, states.v_ned, strict=True):
         at = START_NS + round(t_s * 1e9)
-        metre = 1.0 / runs.metres(p[0], p[2])
+        metre = 1.0 / runs.metres_per_unit(p[0], p[2])
         lat, lon, up = (float(x) for x in p + 0.05 * metre * rng.standard_normal(3))
         n, e, d = (float(x) for x in v + 0.05 * rng.standard_normal(3))
         stamp = MonotonicStamp(at)
@@ -217,7 +217,7 @@ def test_another_mounting_is_another_digest(change: dict[str, Any]) -> None:
 
 def watched(values: Callable[[float], float], sd: float, walk: bool = False) -> CalibrationState:
     """The state of the last parameter after three minutes of `values(t_s)`, in prior sigmas."""
-    block = time_offset("gnss_time", 1.0) if walk else mounting(1.0)
+    block = time_offset_block("gnss_time", 1.0) if walk else mounting_block(1.0)
     model = Model("watched", (block,))
     watch = CalibrationWatch(model, lambda code, text: None)
     for t_s in range(0, 180, 5):
@@ -252,7 +252,7 @@ def test_what_wanders_by_nature_may_move_so_far() -> None:
 def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg: float) -> None:
     """The mean of noisy looks at a constant moves by what its variance shrinks by, for ever; once
     the constant changes it moves by more, though a mean of so many moves slowly."""
-    model = Model("watched", (mounting(math.radians(5.0)),))
+    model = Model("watched", (mounting_block(math.radians(5.0)),))
     told = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
@@ -278,7 +278,7 @@ def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg:
 def test_a_turn_is_told_within_a_second() -> None:
     """It is vouched for until then."""
     prior, second_ns = math.radians(5.0), 1_000_000_000
-    model = Model("watched", (mounting(prior),))
+    model = Model("watched", (mounting_block(prior),))
     watch = CalibrationWatch(model, lambda code, text: None)
     p = np.eye(model.size) * (0.2 * prior) ** 2
     for k in range(64):
@@ -301,7 +301,7 @@ def test_a_turn_gives_up_a_calibration_of_before() -> None:
 def test_what_was_configured_wrongly_is_no_turn() -> None:
     """Seven of its sigmas: the state says so, and starting anew would not change it."""
     prior, noise, yaw = math.radians(5.0), math.radians(1.0), math.radians(35.0)
-    model = Model("watched", (mounting(prior),))
+    model = Model("watched", (mounting_block(prior),))
     watch = CalibrationWatch(model, lambda code, text: None)
     estimate, variance = 0.0, prior**2
     for k in range(200):
@@ -322,7 +322,7 @@ def test_a_spare_is_another_mounting_and_no_turn() -> None:
 
 
 def test_nothing_is_settled_before_a_minute_has_passed() -> None:
-    model = Model("watched", (mounting(1.0),))
+    model = Model("watched", (mounting_block(1.0),))
     watch = CalibrationWatch(model, lambda code, text: None)
     for cell in range(round(STAYS_S * 1e9 / LOOK_NS)):
         assert watch.look(cell * LOOK_NS, np.zeros(model.size), np.eye(model.size) * 1e-4)

@@ -15,7 +15,7 @@ from fusiond.models.model import Model
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.raw import CLOCK_RAMP
 from fusiond.studies.bds_tight import runs
-from fusiond.studies.live_filter import LiveFilter, drive_samples, drive_truth
+from fusiond.studies.daemon_fed_filter import DaemonFedFilter, drive_samples, drive_truth
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
@@ -41,7 +41,9 @@ def driven(
     nav = true_nav(drive_truth(), np.r_[0.0, t_s])
     started = with_error(nav[0], rng.standard_normal(9) * sd[:9])
     samples = drive_samples(runs.IMU, rng)
-    live = LiveFilter(KalmanEstimator(model, runs.IMU.gap_s), runs.IMU.gap_s, samples, started, sd)
+    live = DaemonFedFilter(
+        KalmanEstimator(model, runs.IMU.gap_s), runs.IMU.gap_s, samples, started, sd
+    )
     raw = intake.receivers["raw"]
     for message in runs.broadcast(simulated):
         raw.learn(message)

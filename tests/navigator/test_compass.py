@@ -18,7 +18,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.compass import declination
 from fusiond.navigator.navigator import Navigator
-from fusiond.studies.navigation_error import metres, nav_error, true_nav
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav
 from tests import runs
 from tests.navigator.vehicle import CONFIG, START_NS, drive, outcomes_of
 
@@ -76,7 +76,7 @@ def told(start: tuple[str, ...], bent_deg: Any, seed: int) -> tuple[Navigator, l
         noise = rng.standard_normal() * FIXED.sd_deg
         found.append(heading(at, yaw + (bent_deg(t, yaw) - 3.0 + noise) * DEG))
         if t < 9.0 and t % 1.0 == 0.0:  # the drive's own fixes come later
-            noise_m = rng.standard_normal(3) / metres(runs.ORIGIN[0], runs.ORIGIN[2])
+            noise_m = rng.standard_normal(3) / metres_per_unit(runs.ORIGIN[0], runs.ORIGIN[2])
             place = (float(x) for x in d.truth.at(np.array([t])).position[0] + noise_m)
             fix = PositionFix("gnss", at, MonotonicStamp(at), *place, sd_ned_m=(1.0, 1.0, 1.0))
             found.append(fix)

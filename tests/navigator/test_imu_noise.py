@@ -15,9 +15,15 @@ from fusiond.models.model import Model
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.unit_grade import UnitGrade
-from fusiond.studies.faults.scenes import RATE_HZ, RTK, Vehicle, drawing, scene
 from fusiond.studies.faults.sensor_data import Recording
-from fusiond.studies.faults.solution_errors import against
+from fusiond.studies.faults.sharpness_service_drives import (
+    RATE_HZ,
+    RTK,
+    Vehicle,
+    part_generator,
+    scene,
+)
+from fusiond.studies.faults.solution_errors import errors_against
 
 Array = NDArray[np.float64]
 
@@ -41,7 +47,7 @@ def _shares(added: Array, number: int) -> tuple[list[float], Array]:
         found.extend(float(shares[:2].max()) for _, shares in vibration.shares.rows(now))
 
     ticks = on.truth.at(np.arange(0.1, DURATION_S, 0.1))
-    run = against(on.config, recording, ticks, watch=watch)
+    run = errors_against(on.config, recording, ticks, watch=watch)
     return found, run.sigmas
 
 
@@ -49,7 +55,7 @@ def _shares(added: Array, number: int) -> tuple[list[float], Array]:
 def test_white_noise_is_noise_and_motion_that_comes_back_is_not(number: int) -> None:
     """Both shake every sample by as much, and means of up to 16 of them. The gyros really turn with
     the second: a body that road and springs rock at 2 to 6 Hz."""
-    rng = drawing("looked", number, 7)
+    rng = part_generator("looked", number, 7)
     white = rng.standard_normal((round(DURATION_S * RATE_HZ) + 1, 3)) * SHAKEN_RAD_S
     b, a = butter(2, (2.0, 6.0), "bandpass", fs=RATE_HZ)
     rocked = lfilter(b, a, white, axis=0)

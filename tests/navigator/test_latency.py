@@ -15,14 +15,14 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.position_jumps import Epoch
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults import imu_faults, measurement_faults
+from fusiond.studies.faults.error_sigma_score import longest_lie_s
 from fusiond.studies.faults.runs import VEHICLE, navigate
-from fusiond.studies.faults.scoring import longest_lie_s
 from fusiond.studies.faults.sensor_data import Drive, Recording
 
 TICKS_HZ = 100.0
 LATE_S = measurement_faults.LATE_S
 TRUTH, ON_TIME = Drive(duration_s=60.0).recorded(VEHICLE, seed=5)
-ALWAYS_LATE = measurement_faults.late(ON_TIME, 0.0, math.inf)
+ALWAYS_LATE = measurement_faults.stamped_late(ON_TIME, 0.0, math.inf)
 
 
 def looked(
@@ -123,7 +123,7 @@ def test_a_receiver_that_was_late_for_a_while_is_not_late_now() -> None:
     )
     _, on_time = Drive(duration_s=120.0).recorded(phone, seed=5)
     end_s = 42.0
-    recording = measurement_faults.late(on_time, 30.0, end_s - 30.0)
+    recording = measurement_faults.stamped_late(on_time, 30.0, end_s - 30.0)
     told, late, _ = looked(recording, tuple(end_s + 1.0 + 1.5 * k for k in range(10)), phone)
     assert not told
     assert not late.suspects

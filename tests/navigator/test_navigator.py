@@ -292,8 +292,8 @@ def test_the_solution_is_carried_ahead_of_the_last_sample() -> None:
     t_s = (now - START_NS) * 1e-9
     moved = d.truth.at(np.array([t_s, t_s + 0.06])).position
     base = navigator.solution(now)
-    expected = (moved[1] - moved[0]) * runs.metres(*moved[0, [0, 2]])
-    scale = runs.metres(*moved[0, [0, 2]])
+    expected = (moved[1] - moved[0]) * runs.metres_per_unit(*moved[0, [0, 2]])
+    scale = runs.metres_per_unit(*moved[0, [0, 2]])
     found = (
         np.array([later.lat_rad, later.lon_rad, later.height_m])
         - [base.lat_rad, base.lon_rad, base.height_m]

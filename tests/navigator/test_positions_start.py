@@ -38,7 +38,7 @@ def _fixes(truth: Truth, rng: np.random.Generator, from_s: float) -> list[tuple[
     found = []
     for t_s in np.arange(from_s + 1.3, truth.duration_s, SPACING_S):
         true = truth.at(np.array([t_s])).position[0]
-        lat, lon, _ = true + SD_M * rng.standard_normal(3) / runs.metres(true[0], true[2])
+        lat, lon, _ = true + SD_M * rng.standard_normal(3) / runs.metres_per_unit(true[0], true[2])
         late_s = 0.6 + min(float(rng.exponential(0.9)), 4.4)
         t_ns = round(t_s * 1e9)
         seen_ns = t_ns + round(late_s * 1e9)

@@ -46,7 +46,9 @@ class Drive:
         self.fixes = []
         for t_s in np.arange(5.0, SECONDS - LATE_S, SPACING_S).tolist():
             true = truth.at(np.array([t_s])).position[0]
-            lat, lon, _ = true + SD_M * rng.standard_normal(3) / runs.metres(true[0], true[2])
+            lat, lon, _ = true + SD_M * rng.standard_normal(3) / runs.metres_per_unit(
+                true[0], true[2]
+            )
             t_ns, seen_ns = round(t_s * 1e9), round((t_s + LATE_S) * 1e9)
             stamp, height = MonotonicStamp(t_ns), float(true[2])
             fix = DelayedFix("rdss", seen_ns, stamp, float(lat), float(lon), height, SD_M)

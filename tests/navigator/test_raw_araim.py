@@ -15,7 +15,7 @@ from fusiond.navigation.solution import BoundState, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
 from tests.navigator.vehicle import CONFIG, START_NS, STARTED_S, drive
-from tests.runs import metres
+from tests.runs import metres_per_unit
 
 CHUNK = 10
 # Above the levels of the sound receiver by a little.
@@ -86,7 +86,7 @@ def driven(
             solution = navigator.solution(now_ns)
             true = drive().truth.at(np.array([now_s])).position[0]
             apart = np.array([solution.lat_rad, solution.lon_rad, solution.height_m]) - true
-            north, east = (apart * metres(true[0], true[2]))[:2]
+            north, east = (apart * metres_per_unit(true[0], true[2]))[:2]
             found.append((solution, math.hypot(north, east)))
     return found, heard
 

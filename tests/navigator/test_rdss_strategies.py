@@ -25,7 +25,7 @@ from fusiond.studies.rdss.runs import (
     draw_fixes,
     grid,
     imu_samples,
-    metres,
+    metres_per_unit,
     nav_error,
     true_nav,
 )
@@ -74,7 +74,7 @@ def live(case: Case, strategy: str, scale: float) -> Array:
 
 def apart_m(a: Array, b: Array) -> float:
     """Greatest distance north or east between states (n, 10)."""
-    return float(np.abs((a[:, :2] - b[:, :2]) * metres(LAT, YANTAI_DEG_M[2])[:2]).max())
+    return float(np.abs((a[:, :2] - b[:, :2]) * metres_per_unit(LAT, YANTAI_DEG_M[2])[:2]).max())
 
 
 DRIVE = replace(rdss_dynamic.CASES[0], duration_s=150.0)

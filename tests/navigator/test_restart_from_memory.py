@@ -107,7 +107,7 @@ def _fix(navigator: Navigator, north_m: float = 0.0, noise: Any = None) -> Posit
         off = noise[:3]
         north, east = (states.v_ned[0, :2] + 0.05 * noise[3:]).tolist()
         velocity = north, east, None
-    lat, lon, up = (float(x) for x in at + off / runs.metres(at[0], at[2]))
+    lat, lon, up = (float(x) for x in at + off / runs.metres_per_unit(at[0], at[2]))
     fix = PositionFix("gnss", t_ns, MonotonicStamp(t_ns), lat, lon, up, sd_ned_m=(1.0, 1.0, 1.0))
     sd = (0.05, 0.05, None)
     return fix if velocity is None else replace(fix, v_ned_m_s=velocity, sd_v_ned_m_s=sd)

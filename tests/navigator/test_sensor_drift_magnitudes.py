@@ -14,7 +14,7 @@ from fusiond.configuration.aiding import CompassAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
-from fusiond.models.vehicle import SIDE_DRIFT, WHEEL_DRIFT
+from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.intake import Intake

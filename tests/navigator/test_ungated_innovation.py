@@ -37,7 +37,7 @@ def estimator() -> KalmanEstimator:
 
 def test_a_fix_is_as_far_off_as_it_was_put(estimator: KalmanEstimator) -> None:
     lat, lon, height = estimator.nav[:3].tolist()
-    north, east = runs.metres(lat, height)[:2]
+    north, east = runs.metres_per_unit(lat, height)[:2]
     place = lat - 3.0 / north, lon + 4.0 / east, height + 2.0
     fix = PositionMeasurement(*SOURCE, *place, (0.5, 7.0, 20.0), NO_LEVER)
     found = raw_innovation(fix, estimator)
@@ -49,7 +49,7 @@ def test_a_fix_is_as_far_off_as_it_was_put(estimator: KalmanEstimator) -> None:
 def test_a_fix_that_is_whitened_is_in_metres_again(estimator: KalmanEstimator) -> None:
     """Its rows are in sigmas of a covariance that is not diagonal."""
     lat, lon, height = estimator.nav[:3].tolist()
-    north, east = runs.metres(lat, height)[:2]
+    north, east = runs.metres_per_unit(lat, height)[:2]
     fix = replace(rdss_measurement(estimator.nav), lever=NO_LEVER, sd_time_s=0.3)
     fix = replace(fix, lat_rad=lat - 30.0 / north, lon_rad=lon + 40.0 / east)
     found = raw_innovation(fix, estimator)

@@ -14,8 +14,8 @@ from fusiond.configuration.si_units import imu_noise
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
 from fusiond.navigator.unit_grade import AS_ITS_CLASS, GRID, Values, graded_at_rest
-from fusiond.studies.faults.scenes import CODE, Vehicle, scene
-from fusiond.studies.faults.solution_errors import against, longest_s
+from fusiond.studies.faults.sharpness_service_drives import CODE, Vehicle, scene
+from fusiond.studies.faults.solution_errors import errors_against, longest_s
 
 UNITS, UNSEEN = 400, 0.02
 END_S = 45.0
@@ -96,7 +96,7 @@ def test_a_class_that_is_too_good_costs_no_lie(
             starts.append(navigator.started.how)
 
     ticks = on.truth.at(np.arange(0.1, END_S, 0.1))
-    run = against(Config.model_validate(own), on.recording, ticks, watch=watch)
+    run = errors_against(Config.model_validate(own), on.recording, ticks, watch=watch)
     nees = np.nanmean(np.square(run.errors[run.there] / run.sigmas[run.there]), axis=0)
     print(sensor, told, drive, nees.round(2))
     moving = sensor == "consumer" and drive == 0

@@ -8,7 +8,7 @@ import pytest
 
 from fusiond.configuration.aiding import UNKNOWN_LEVER_SD_M
 from fusiond.configuration.schema import Config
-from fusiond.models.vehicle import ANTENNA_LEVER, FIX_MARKOV
+from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER, FIX_MARKOV
 from fusiond.navigator.navigator import Navigator
 
 

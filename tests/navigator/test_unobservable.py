@@ -14,15 +14,22 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
-from fusiond.models.vehicle import ANTENNA_LEVER
+from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.scenes import CODE, RTK, Receiver, Vehicle, drawing, scene
 from fusiond.studies.faults.sensor_data import Recording, gnss_fixes
-from fusiond.studies.faults.solution_errors import against, published
+from fusiond.studies.faults.sharpness_service_drives import (
+    CODE,
+    RTK,
+    Receiver,
+    Vehicle,
+    part_generator,
+    scene,
+)
+from fusiond.studies.faults.solution_errors import errors_against, published_errors
 
 Array = NDArray[np.float64]
 
@@ -48,9 +55,9 @@ def _recorded(config: Config, receiver: Receiver, end_s: float) -> tuple[Recordi
     """The straight, of an antenna of which nothing is said."""
     car = replace(SCENARIOS["drive"], path=_straight).fitted(config)
     truth = car.truth(end_s)
-    sensed = car.imu_output(truth, drawing("looked", 0, 1))
+    sensed = car.imu_output(truth, part_generator("looked", 0, 1))
     options = replace(receiver.options, lever_arm_m=(0.5, -0.4, -1.2))
-    fixes = gnss_fixes(GnssReceiver(truth, options, drawing("looked", 0, 2)))
+    fixes = gnss_fixes(GnssReceiver(truth, options, part_generator("looked", 0, 2)))
     stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
     samples = np.hstack((sensed.gyro, sensed.accel))
     return Recording(stamps, stamps, samples, ()).with_received(fixes), truth
@@ -75,7 +82,7 @@ def test_straight_on_lever_roll_and_heading_stay_as_they_were(
         found.append(np.sqrt([p[s, s] for s in lever] + [p[1, 1], p[2, 2]]))
 
     ticks = truth.at(np.arange(0.1, END_S, 0.1))
-    against(config, recording, ticks, watch=watch)
+    errors_against(config, recording, ticks, watch=watch)
     sigmas = np.array(found)
     print((sigmas.min(axis=0) / sigmas[0]).round(3), sigmas[0].round(4), sigmas[-1].round(4))
     assert len(sigmas) > 500
@@ -92,8 +99,8 @@ def test_at_rest_a_heading_that_was_told_stays_as_it_was_told(estimator: str) ->
     config = _config(estimator, RTK, alignment=alignment)
     car = replace(SCENARIOS["drive"], path=lambda s: follow((Leg(s),), s, course_deg=30.0))
     truth = car.fitted(config).truth(REST_S)
-    sensed = car.fitted(config).imu_output(truth, drawing("looked", 0, 1))
-    fixes = gnss_fixes(GnssReceiver(truth, RTK.options, drawing("looked", 0, 2)))
+    sensed = car.fitted(config).imu_output(truth, part_generator("looked", 0, 1))
+    fixes = gnss_fixes(GnssReceiver(truth, RTK.options, part_generator("looked", 0, 2)))
     stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
     samples = np.hstack((sensed.gyro, sensed.accel))
     recording = Recording(stamps, stamps, samples, ()).with_received(fixes)
@@ -103,7 +110,7 @@ def test_at_rest_a_heading_that_was_told_stays_as_it_was_told(estimator: str) ->
         if navigator.started is not None:
             found.append(float(navigator.estimator.covariance[2, 2]) ** 0.5)
 
-    against(config, recording, truth.at(np.arange(0.1, REST_S, 0.1)), watch=watch)
+    errors_against(config, recording, truth.at(np.arange(0.1, REST_S, 0.1)), watch=watch)
     print(estimator, len(found), DEG * found[0], DEG * min(found))
     assert len(found) > 300
     assert min(found) > 0.98 * found[0]
@@ -123,7 +130,7 @@ def test_a_heading_lost_in_silent_bends_is_not_found_again(number: int) -> None:
     recording = on.recording.withheld(80.0, 300.0)
     for begin in gaps:
         recording = recording.without(recording.window(begin, SILENT_S))
-    run = published(on.config, recording, on.truth)
+    run = published_errors(on.config, recording, on.truth)
     squares = []
     for begin, end in zip(gaps, [*gaps[1:], 299.0], strict=True):
         rows = slice(round(10.0 * (begin + SILENT_S + 0.3)), round(10.0 * (end - 0.2)))

@@ -67,7 +67,7 @@ class Drive:
             t = (s.t_ns - START_NS) * 1e-9
             # Samples of that drive end where their stamp says, a period after the truth's.
             true = drive().truth.at(np.array([t]))
-            metres = runs.metres(true.position[0, 0], true.position[0, 2])
+            metres = runs.metres_per_unit(true.position[0, 0], true.position[0, 2])
             way = (np.array([s.lat_rad, s.lon_rad]) - true.position[0, :2]) * metres[:2]
             v = np.array(s.v_ned_m_s[:2]) - true.v_ned[0, :2]
             sd = np.array([*s.sd_ned_m[:2], *s.sd_v_ned_m_s[:2]])
@@ -165,7 +165,7 @@ def _late_fixes(strategy: str, kind: str) -> tuple[Array, Array]:
     d, rng = drive(), np.random.default_rng(3)
     times = np.arange(1.0, 40.0, 1.5)
     waiting = [
-        (t, p + rng.standard_normal(3) * 5.0 / runs.metres(p[0], p[2]))
+        (t, p + rng.standard_normal(3) * 5.0 / runs.metres_per_unit(p[0], p[2]))
         for t, p in zip(times, d.truth.at(times).position, strict=True)
     ]
     errors, sigmas = [], []
@@ -181,7 +181,7 @@ def _late_fixes(strategy: str, kind: str) -> tuple[Array, Array]:
         if s.mode is Mode.NAVIGATING and now > START_NS + 12 * runs.SECOND:
             true = d.truth.at(np.array([(now - START_NS) * 1e-9])).position[0]
             way = np.array([s.lat_rad, s.lon_rad]) - true[:2]
-            errors.append(np.hypot(*way * runs.metres(true[0], true[2])[:2]))
+            errors.append(np.hypot(*way * runs.metres_per_unit(true[0], true[2])[:2]))
             sigmas.append(math.hypot(*s.sd_ned_m[:2]))
     assert navigator.outcomes()["rdss"]["fused"] > 20
     assert navigator.active_filter.isolates == (kind == "federated")

@@ -55,7 +55,7 @@ def errors(said: Iterable[Solution], truth: Truth) -> tuple[Array, Array]:
     off, sds = [], []
     for s in said:
         true = truth.at(np.array([(s.t_ns - START_NS) * 1e-9]))
-        metres = runs.metres(true.position[0, 0], true.position[0, 2])
+        metres = runs.metres_per_unit(true.position[0, 0], true.position[0, 2])
         way = (np.array([s.lat_rad, s.lon_rad]) - true.position[0, :2]) * metres[:2]
         off.append([*way, *(np.array(s.v_ned_m_s[:2]) - true.v_ned[0, :2])])
         sds.append([*s.sd_ned_m[:2], *s.sd_v_ned_m_s[:2]])

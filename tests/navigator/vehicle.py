@@ -64,7 +64,9 @@ def drive() -> Drive:
     t = np.arange(9.013, SECONDS - 1.0, 1.0)
     states = truth.at(t)
     for t_s, p, v in zip(t, states.position, states.v_ned, strict=True):
-        lat, lon, up = (float(x) for x in p + rng.standard_normal(3) / runs.metres(p[0], p[2]))
+        lat, lon, up = (
+            float(x) for x in p + rng.standard_normal(3) / runs.metres_per_unit(p[0], p[2])
+        )
         n, e, d = (float(x) for x in v + rng.standard_normal(3) * 0.1)
         at = START_NS + round(t_s * 1e9)
         stamp = MonotonicStamp(at)

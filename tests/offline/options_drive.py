@@ -96,7 +96,7 @@ def write_files(folder: Path) -> Path:
     lines = []
     for t_s, p, v, rpy in states(1.0):
         lat, lon = np.degrees(
-            p[:2] + rng.standard_normal(2) / np.array(runs.metres(p[0], p[2]))[:2]
+            p[:2] + rng.standard_normal(2) / np.array(runs.metres_per_unit(p[0], p[2]))[:2]
         )
         hms = f"0733{t_s:05.2f}"
         speed, course = math.hypot(*v[:2]) + 0.05, math.degrees(math.atan2(v[1], v[0])) % 360.0
@@ -120,7 +120,7 @@ def write_files(folder: Path) -> Path:
     table(folder / "barometer.csv", "t_s,pressure_pa", air)
     stars = [(BEGIN_S + t, *np.degrees(rpy).tolist()) for t, _, _, rpy in states(2.3)]
     table(folder / "attitude.csv", "t_s,roll_deg,pitch_deg,yaw_deg", stars)
-    scale = np.array(runs.metres(runs.ORIGIN[0], runs.ORIGIN[2]))[:2]
+    scale = np.array(runs.metres_per_unit(runs.ORIGIN[0], runs.ORIGIN[2]))[:2]
     point = np.array(
         [*(runs.ORIGIN[:2] + np.array(POINT_M[:2]) / scale), runs.ORIGIN[2] + POINT_M[2]]
     )

@@ -15,7 +15,7 @@ from fusiond.files.measurement_csv import TrajectoryTable, read_solution
 from fusiond.offline.process import process
 from tests.drivers.raw.test_ssr import head, packed
 from tests.places import DATA, REPOSITORY
-from tests.runs import metres
+from tests.runs import metres_per_unit
 
 WALK = DATA / "walk_0827"
 CONFIG, STREAM = REPOSITORY / "config" / "walk_0827.toml", WALK / "gnss.ubx"
@@ -84,7 +84,7 @@ def processed(folder: Path, imu: Path, corrected: bytes | None) -> TrajectoryTab
 
 def apart_m(one: TrajectoryTable, other: TrajectoryTable) -> float:
     """RMS of the horizontal distance of two solutions."""
-    north, east, _ = metres(float(one.lat_rad[0]), float(one.height_m[0]))
+    north, east, _ = metres_per_unit(float(one.lat_rad[0]), float(one.height_m[0]))
     t = one.t_s[(one.t_s > other.t_s[0]) & (one.t_s < other.t_s[-1])]
     lat, lon = (
         np.interp(t, one.t_s, a) - np.interp(t, other.t_s, b)

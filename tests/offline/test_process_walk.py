@@ -27,7 +27,7 @@ from fusiond.gnss.single_point import single_point
 from fusiond.gnss.store import EphemerisStore
 from fusiond.offline.process import process
 from tests.places import DATA, REPOSITORY
-from tests.runs import metres
+from tests.runs import metres_per_unit
 
 WALK = DATA / "walk_0827"
 CONFIG = REPOSITORY / "config" / "walk_0827.toml"
@@ -54,7 +54,7 @@ def _process(
 def _off(t: Any, t_s: Any, lat: Any, lon: Any) -> Any:
     """North and east of the track (n, 2) in m, of positions given at `t_s`, at instants `t`."""
     track = read_gnss(WALK / "gnss.csv")
-    north, east, _ = metres(float(track.lat_rad[0]), float(track.height_m[0]))
+    north, east, _ = metres_per_unit(float(track.lat_rad[0]), float(track.height_m[0]))
     d_lat = np.interp(t, t_s, lat) - np.interp(t, track.t_s, track.lat_rad)
     d_lon = np.interp(t, t_s, lon) - np.interp(t, track.t_s, track.lon_rad)
     return np.column_stack([d_lat * north, d_lon * east])

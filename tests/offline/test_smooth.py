@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.files.measurement_csv import TrajectoryTable, read_solution, read_truth
-from fusiond.files.parquet_rows import flat
+from fusiond.files.resumable_parquet import flattened
 from fusiond.files.solution_csv import SMOOTHED
 from fusiond.navigation.solution import Mode
 from fusiond.offline import smooth
@@ -67,7 +67,7 @@ def test_each_start_is_smoothed(files: Files) -> None:
     assert "smoothed" not in before
     counts = after.pop("smoothed")
     # The first pass crosses each sample alone, since nodes hold the transitions between them.
-    found, expected = flat(after.pop("consistency")), flat(before.pop("consistency"))
+    found, expected = flattened(after.pop("consistency")), flattened(before.pop("consistency"))
     assert after == before
     for name, value in expected.items():
         wanted = pytest.approx(value, rel=1e-4) if isinstance(value, float) else value

@@ -6,8 +6,8 @@ from math import radians
 from typing import Any
 
 from drivers.rdss.mail import MessageStage
-from drivers.rdss.report import PositionReport
-from drivers.rdss.text_coding import worded
+from drivers.rdss.position_report_coding import PositionReport
+from drivers.rdss.text_coding import encode_shortest
 from fusiond.clock.results import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
@@ -255,7 +255,7 @@ EXAMPLES: dict[str, Any] = {
             "m1",
             242407,
             "text",
-            worded("Report fuel").payload,
+            encode_shortest("Report fuel").payload,
             "Report fuel",
             "sent",
             "",

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from fusiond.commands.app import app
 from fusiond.navigator.navigator import Navigator
 from fusiond.recording.reader import Log
-from fusiond.replay.calibration_replay import watched
-from fusiond.replay.replay_config import config_of
+from fusiond.replay.replay_config import replay_config
+from fusiond.replay.replay_for_calibration import replay_for_calibration
 from fusiond.simulation.can.imu import SIM_IMU
 from tests.live.daemon_bench import RDSS, imu_section
 from tests.places import REPOSITORY
@@ -68,7 +68,7 @@ def test_a_file_that_is_no_recording_is_reported(tmp_path: Path) -> None:
 def test_saved_calibration_of_the_daemon_is_ignored(tmp_path: Path) -> None:
     """Each pass begins without alignment, and is seen to the end."""
     recording = Log([DEMO])
-    config = config_of(recording.about, tmp_path)
+    config = replay_config(recording.about, tmp_path)
     started: list[bool] = []
 
     def look(navigator: Navigator) -> None:
@@ -77,5 +77,5 @@ def test_saved_calibration_of_the_daemon_is_ignored(tmp_path: Path) -> None:
             passed = navigator.estimator.sample - navigator.imu.start
             assert np.isfinite(navigator.imu.nav[passed - 1]).all()
 
-    watched(recording, config, look)
+    replay_for_calibration(recording, config, look)
     assert (started[0], started[-1]) == (False, True)

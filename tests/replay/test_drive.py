@@ -29,7 +29,7 @@ from fusiond.recording.reader import Log, LogError
 from fusiond.recording.records import Kind
 from fusiond.recording.track_export import WRITERS, Point
 from fusiond.replay.replay import Replay
-from fusiond.replay.replay_config import config_of
+from fusiond.replay.replay_config import replay_config
 from fusiond.replay.run import ReplayOptions, replay
 from tests.clock.host_time import S
 from tests.recording.driven import Drive
@@ -92,7 +92,7 @@ def test_every_tick_ends_in_the_same_bits(recorded: Recorded) -> None:
     assert recorded.solutions[-1].mode is Mode.NAVIGATING
     assert len(recorded.paths) == 2
     log = Log(recorded.paths)
-    run = Replay(log, config_of(log.about, recorded.folder))
+    run = Replay(log, replay_config(log.about, recorded.folder))
     solutions = [tick.solution for tick in run.ticks()]
     assert run.exact
     assert run.comparison.first is None
@@ -164,7 +164,7 @@ def test_a_cut_goes_on_from_a_state_before_it(recorded: Recorded, tmp_path: Path
     cut = tmp_path / "cut.mcap"
     assert trim(recorded.paths, 16.5, 17.5, cut).begins == "a state of the log"
     log = Log([cut])
-    run = Replay(log, config_of(log.about, tmp_path))
+    run = Replay(log, replay_config(log.about, tmp_path))
     solutions = {tick.solution.t_ns: tick.solution for tick in run.ticks()}
     assert (run.exact, run.began) == (False, "a state on the way")
     same = [(solutions[s.t_ns], s) for s in recorded.solutions if s.t_ns in solutions]

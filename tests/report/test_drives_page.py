@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.commands.app import app
-from fusiond.files.parquet_rows import write_rows
+from fusiond.files.resumable_parquet import write_rows
 from tests.patience import PATIENCE_S
 from tests.report.pages import item, items, numbers, read_page, series
 

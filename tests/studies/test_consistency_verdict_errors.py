@@ -41,7 +41,7 @@ def test_hysteresis_of_the_study_is_the_monitors() -> None:
     nu = np.random.default_rng(18).standard_normal((6, epochs, 2))
     nu[:, 250:] *= np.linspace(1.1, 1.6, 6)[:, None, None]
     outside = study.window_verdicts(*study.window_statistics(nu, k), 2, k, 0.01) > 0
-    held = study.held(outside, k // 2)
+    held = study.verdicts_with_hysteresis(outside, k // 2)
     for run in range(len(nu)):
         monitor = ConsistencyMonitor(ConsistencyOptions(window=k))
         found = []

@@ -12,19 +12,19 @@ import pytest
 from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.configuration.load import load_config
 from fusiond.studies.faults import imu_faults, measurement_faults
-from fusiond.studies.faults.extra_faults import EVERY
-from fusiond.studies.faults.library import FAULTS, PHASES
-from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
-from fusiond.studies.faults.scoring import (
+from fusiond.studies.faults.error_sigma_score import (
     QUANTITIES,
     Course,
     Event,
     Sample,
     axis_ratio,
-    judge,
     longest_lie_s,
     recovered_s,
+    row_figures,
 )
+from fusiond.studies.faults.extra_faults import EVERY
+from fusiond.studies.faults.library import FAULTS, PHASES
+from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_fault, run_row
 from fusiond.studies.faults.sensor_data import Drive, Received, Recording
 
 GOOD = (1.0,) * len(QUANTITIES)
@@ -46,7 +46,7 @@ def course(
 
 
 def verdict(of: Course) -> str:
-    return str(judge(of, course(), BEGIN_S, END_S)["verdict"])
+    return str(row_figures(of, course(), BEGIN_S, END_S)["verdict"])
 
 
 def test_two_seconds_beyond_are_no_lie_and_three_are() -> None:
@@ -64,7 +64,7 @@ def test_seconds_beyond_that_are_apart_do_not_add_up() -> None:
 def test_each_quantity_can_lie(quantity: int) -> None:
     ratios = tuple(5.1 if k == quantity else 0.0 for k in range(len(QUANTITIES)))
     samples = [Sample(float(t), "navigating", ratios) for t in range(1, 5)]
-    found = judge(Course(samples, ()), course(), 1.0, 2.0)
+    found = row_figures(Course(samples, ()), course(), 1.0, 2.0)
     assert found["verdict"] == "lie"
     assert found["largest_ratio_of"] == QUANTITIES[quantity]
 
@@ -84,7 +84,7 @@ def test_exactly_five_sigma_is_no_lie() -> None:
 
 @pytest.mark.parametrize("mode", ["coasting", "invalid"])
 def test_a_lie_is_one_in_any_mode_that_publishes(mode: str) -> None:
-    found = judge(course(range(12, 30), mode), course(), BEGIN_S, END_S)
+    found = row_figures(course(range(12, 30), mode), course(), BEGIN_S, END_S)
     assert found["verdict"] == "lie"
     assert found["lie_modes"] == {mode: 18}
     assert found["longest_lie_s"] == 18.0
@@ -95,7 +95,7 @@ def test_a_lie_is_one_in_any_mode_that_publishes(mode: str) -> None:
 
 def test_what_publishes_nothing_does_not_lie() -> None:
     silent = [Sample(s.t_s, "aligning") if 12.0 <= s.t_s < 30.0 else s for s in course().samples]
-    found = judge(Course(silent, ()), course(), BEGIN_S, END_S)
+    found = row_figures(Course(silent, ()), course(), BEGIN_S, END_S)
     assert found["verdict"] == "degraded and said so"
     assert found["lie_modes"] == {}
     assert (found["noticed_s"], found["recovered_s"]) == (2.0, 10.0)
@@ -103,7 +103,7 @@ def test_what_publishes_nothing_does_not_lie() -> None:
 
 def test_a_lie_with_an_event_is_a_lie() -> None:
     event = Event(11.0, "verdict_too_small", "gnss")
-    found = judge(course(range(12, 30), events=(event,)), course(), BEGIN_S, END_S)
+    found = row_figures(course(range(12, 30), events=(event,)), course(), BEGIN_S, END_S)
     assert found["verdict"] == "lie"
     assert found["noticed_s"] == 1.0
 
@@ -111,9 +111,9 @@ def test_a_lie_with_an_event_is_a_lie() -> None:
 def test_an_event_that_comes_without_the_fault_says_nothing() -> None:
     usual = Event(15.0, "verdict_coloured", "gnss")
     reference = course(events=(usual,))
-    assert judge(reference, reference, BEGIN_S, END_S)["verdict"] == "survived"
+    assert row_figures(reference, reference, BEGIN_S, END_S)["verdict"] == "survived"
     twice = course(events=(usual, replace(usual, t_s=18.0)))
-    assert judge(twice, reference, BEGIN_S, END_S)["noticed_s"] == 8.0
+    assert row_figures(twice, reference, BEGIN_S, END_S)["noticed_s"] == 8.0
 
 
 def test_an_event_before_the_fault_does_not_notice_it() -> None:
@@ -129,7 +129,7 @@ def test_what_cannot_be_compared_is_beyond() -> None:
         assert axis_ratio(error, sigma) == math.inf
     assert axis_ratio(-3.0, 2.0) == 1.5
     samples = [Sample(float(t), "navigating", (math.inf,) * 5, math.nan) for t in range(1, 9)]
-    found = judge(Course(samples, ()), course(), 1.0, 2.0)
+    found = row_figures(Course(samples, ()), course(), 1.0, 2.0)
     assert found["verdict"] == "lie"
     assert found["largest_ratio"] is None
     assert found["largest_horizontal_m"] is None
@@ -185,7 +185,7 @@ def test_a_fault_alters_nothing_before_it_begins(name: str) -> None:
 
 def test_a_step_is_500_m_to_the_north_in_the_window_alone() -> None:
     whole = recording()
-    found = measurement_faults.step(whole, 10.0, 5.0)
+    found = measurement_faults.position_step(whole, 10.0, 5.0)
     for was, now in zip(whole.received, found.received, strict=True):
         assert now.seen_ns == was.seen_ns
         if not isinstance(was.measurement, PositionFix):
@@ -229,10 +229,10 @@ def test_noise_is_so_many_times_what_there_was() -> None:
 
 def test_absent_and_late_are_of_their_kinds() -> None:
     whole = recording()
-    assert len(measurement_faults.absent(whole, 10.0, 5.0).received) == len(whole.received) - 15
-    wheels = measurement_faults.absent(whole, 10.0, 5.0, WheelSpeed).received
+    assert len(measurement_faults.removed(whole, 10.0, 5.0).received) == len(whole.received) - 15
+    wheels = measurement_faults.removed(whole, 10.0, 5.0, WheelSpeed).received
     assert len(wheels) == len(whole.received) - 5
-    assert len(measurement_faults.now_and_then(whole, 10.0, 10.0, WheelSpeed).received) == 81
+    assert len(measurement_faults.intermittent(whole, 10.0, 10.0, WheelSpeed).received) == 81
     late = [
         item
         for item in measurement_faults.wheels_delayed(whole, 10.0, 5.0, late_s=0.5).received

@@ -15,11 +15,11 @@ from fusiond.studies.faults.faulty_hours import (
     JUDGED_S,
     LASTS_S,
     SETTLED_S,
-    Happening,
+    TimedFault,
     by_fault,
     faults_of,
     faulty_hour_of,
-    happenings,
+    timed_faults,
 )
 from fusiond.studies.faults.hours import (
     CORRECTED,
@@ -50,8 +50,8 @@ def test_what_needs_another_drive_or_configuration_does_not_happen() -> None:
 def test_one_is_over_and_settled_before_the_next(name: str) -> None:
     kind, lengths = KINDS[name], set[float]()
     for seed in HOURS:
-        found = happenings(kind, seed, 3600.0)
-        assert found == happenings(kind, seed, 3600.0) != happenings(kind, seed + 1, 3600.0)
+        found = timed_faults(kind, seed, 3600.0)
+        assert found == timed_faults(kind, seed, 3600.0) != timed_faults(kind, seed + 1, 3600.0)
         assert APART_S[0] <= found[0].begin_s <= APART_S[1]
         assert 3600.0 - sum(APART_S) < found[-1].begin_s <= 3600.0 - APART_S[0]
         for one, other in pairwise(found):
@@ -71,10 +71,10 @@ def test_of_two_receivers_either_or_both_are_wrong() -> None:
     spared = {
         (EVERY[h.fault].of_imu, h.spares)
         for seed in HOURS
-        for h in happenings(KINDS["two receivers"], seed, 3600.0)
+        for h in timed_faults(KINDS["two receivers"], seed, 3600.0)
     }
     assert spared == {(False, None), (False, "gnss"), (False, "second"), (True, None)}
-    alone = {h.spares for seed in HOURS for h in happenings(KINDS["town"], seed, 3600.0)}
+    alone = {h.spares for seed in HOURS for h in timed_faults(KINDS["town"], seed, 3600.0)}
     assert alone == {None}
 
 
@@ -108,11 +108,11 @@ def changed(was: Recording, now: Recording) -> dict[str, list[int]]:
 )
 def test_a_fault_spares_what_it_names(spares: str | None, wrong: set[str]) -> None:
     whole = recording()
-    stepped = Happening("step_500m", 10.0, 15.0, spares).put_into(whole)
+    stepped = TimedFault("step_500m", 10.0, 15.0, spares).put_into(whole)
     assert changed(whole, stepped) == {source: [10, 11, 12, 13, 14] for source in wrong}
     assert [r.seen_ns for r in stepped.received] == [r.seen_ns for r in whole.received]
     assert np.array_equal(stepped.samples, whole.samples)
-    both = Happening("step_and_gyro_bias", 10.0, 15.0, spares).put_into(whole)
+    both = TimedFault("step_and_gyro_bias", 10.0, 15.0, spares).put_into(whole)
     assert {*changed(whole, both)} == wrong
     off = (both.samples - whole.samples)[:, 2]
     assert np.flatnonzero(off).tolist() == list(range(99, 149))
@@ -121,7 +121,7 @@ def test_a_fault_spares_what_it_names(spares: str | None, wrong: set[str]) -> No
 
 def test_two_receivers_freeze_each_at_its_own() -> None:
     whole = recording()
-    frozen = Happening("fix_frozen", 10.0, 15.0).put_into(whole)
+    frozen = TimedFault("fix_frozen", 10.0, 15.0).put_into(whole)
     assert changed(whole, frozen) == {source: [11, 12, 13, 14] for source in ("gnss", "second")}
     for item in frozen.received:
         m = item.measurement
@@ -165,7 +165,7 @@ def test_its_noise_is_that_of_the_hour_with_nothing_wrong(minutes: dict[str, Any
     """Before its only fault begins, both tell the same."""
     [fault] = minutes["faults"]
     short_s = fault["begin_s"] // 1.0
-    assert happenings(KINDS["town"], FROZEN, short_s) == []
+    assert timed_faults(KINDS["town"], FROZEN, short_s) == []
     quiet, calm = faulty_hour_of(FROZEN, short_s), hour_of(FROZEN, short_s)
     assert quiet["faults"] == []
     for key in ("kind", "beyond_s", "not_navigating_s", "longest_lie_s", "told"):

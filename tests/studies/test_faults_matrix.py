@@ -16,25 +16,25 @@ from drivers.measurements import PositionFix
 from fusiond.navigation.solution import Solution
 from fusiond.simulation.imu_truth import metres_to_geodetic
 from fusiond.simulation.trajectories import Leg, Path, follow
+from fusiond.studies.faults.error_sigma_score import LIE_S, NAVIGATING, Sample, longest_lie_s
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.hours import hour_of, rates
 from fusiond.studies.faults.library import FAULTS, Fault
-from fusiond.studies.faults.measurement_faults import carried_off, step, velocity_bias
+from fusiond.studies.faults.measurement_faults import position_step, spoofed_drift, velocity_bias
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
-from fusiond.studies.faults.random_drives import drawn
+from fusiond.studies.faults.random_drives import drive_of_number
 from fusiond.studies.faults.runs import (
     VEHICLE,
     Row,
-    compared,
-    course_of,
-    driven,
-    placed,
+    error_sample,
+    on_random_drive,
+    run_course,
     run_fault,
+    run_navigator,
     run_row,
 )
-from fusiond.studies.faults.scoring import LIE_S, NAVIGATING, Sample, longest_lie_s
 from fusiond.studies.faults.sensor_data import Drive, Recording
-from fusiond.studies.faults.tables import TABLES, put_into
+from fusiond.studies.faults.tables import TABLES, replace_table
 
 NOT_COUNTED = pytest.mark.xfail(
     strict=True, reason="a lie in mode coasting, which did not count: docs/faults.md"
@@ -92,8 +92,8 @@ def test_what_a_failure_leaves_open_is_open_in_the_navigation_after_it(
     """A unit that has turned; a receiver that is believed again and off still: for 97 and 48 s.
     That one fix a second shows the turned unit's tilt late is another matter, of seconds."""
     of = EVERY[fault]
-    path = of.drive if drive is None else drawn(drive)
-    found = course_of(replace(of, drive=replace(path, gnss_rate_hz=rate_hz)), "navigating", seed)
+    path = of.drive if drive is None else drive_of_number(drive)
+    found = run_course(replace(of, drive=replace(path, gnss_rate_hz=rate_hz)), "navigating", seed)
     assert drive is not None or {"diverged", "sensor_fault"} & {e.code for e in found.events}
     assert longest_lie_s(found.samples) <= 5.0
 
@@ -106,8 +106,8 @@ def test_positions_that_run_away_alone_are_open(fault: str, drive: int, rate_hz:
     """Followed without a doubt, and what navigation begins anew with: 98 and 125 sigma, for 18 and
     17 s and longer."""
     of = EVERY[fault]
-    path = replace(drawn(drive), places_alone=True, gnss_rate_hz=rate_hz)
-    found = course_of(replace(of, drive=path), "navigating", 0)
+    path = replace(drive_of_number(drive), places_alone=True, gnss_rate_hz=rate_hz)
+    found = run_course(replace(of, drive=path), "navigating", 0)
     assert longest_lie_s(found.samples) <= 2.0
 
 
@@ -152,8 +152,8 @@ def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) 
     """A slow drift before it can be told, and one that came back while it went on; a fix that is
     the same to the bit at rest; a start of velocities of which two were reversed; a position that
     was blamed by a velocity that had just come back. Town has none of them."""
-    of = placed(FAULTS[fault], drive)
-    found = course_of(of, phase, seed=drive % 65)  # type: ignore[arg-type]
+    of = on_random_drive(FAULTS[fault], drive)
+    found = run_course(of, phase, seed=drive % 65)  # type: ignore[arg-type]
     assert found.crash is None
     assert longest_lie_s(found.samples) <= LIE_S
 
@@ -167,8 +167,8 @@ def twice_carried_off(whole: Recording) -> Recording:
     fixes = [item for item in whole.received if isinstance(item.measurement, PositionFix)]
     found = whole.with_received(fixes)
     for begin_s in TWICE_S:
-        found = carried_off(found, begin_s, MOVED_S, AWAY_M_S)
-        found = step(found, begin_s + MOVED_S, 1000.0, AWAY_M_S * MOVED_S)
+        found = spoofed_drift(found, begin_s, MOVED_S, AWAY_M_S)
+        found = position_step(found, begin_s + MOVED_S, 1000.0, AWAY_M_S * MOVED_S)
     return found
 
 
@@ -178,7 +178,7 @@ def twice_carried_off(whole: Recording) -> Recording:
 )
 def test_what_lies_while_coasting_is_not_vouched_for(fault: str, phase: str, drive: int) -> None:
     """Mode `navigating` comes when sigma holds again."""
-    found = course_of(placed(FAULTS[fault], drive), phase, seed=drive % 65)  # type: ignore[arg-type]
+    found = run_course(on_random_drive(FAULTS[fault], drive), phase, seed=drive % 65)  # type: ignore[arg-type]
     vouched = [s if s.mode == NAVIGATING else replace(s, ratios=()) for s in found.samples]
     assert longest_lie_s(vouched) <= LIE_S
 
@@ -204,10 +204,10 @@ def test_a_receiver_that_sets_off_twice_while_the_vehicle_stands_is_not_followed
     said = replace(true, position=true.position + moved, v_ned=v_ned)
 
     def look(solution: Solution, row: int) -> Sample:
-        either = compared(solution, true, row), compared(solution, said, row)
+        either = error_sample(solution, true, row), error_sample(solution, said, row)
         return min(either, key=lambda sample: max(sample.ratios, default=0.0))
 
-    course = driven(VEHICLE, twice_carried_off(recording), duration_s, look)
+    course = run_navigator(VEHICLE, twice_carried_off(recording), duration_s, look)
     assert course.crash is None
     assert "isolated" in {event.code for event in course.events}
     assert longest_lie_s(course.samples) <= LIE_S
@@ -250,12 +250,12 @@ def test_quiet_minutes_raise_no_alarm() -> None:
 def test_a_table_goes_between_its_marks(tmp_path: File) -> None:
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- power: written by --page -->\nold\n<!-- end of power -->\nb\n")
-    put_into(page, "power", "new\n")
-    put_into(page, "power", "newer\n")
+    replace_table(page, "power", "new\n")
+    replace_table(page, "power", "newer\n")
     text = page.read_text()
     assert text.startswith("a\n")
     assert text.endswith("\nb\n")
     assert text.count("newer") == 1
     assert "old" not in text
     with pytest.raises(ValueError, match="no marks of matrix"):
-        put_into(page, "matrix", "")
+        replace_table(page, "matrix", "")

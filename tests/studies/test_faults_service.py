@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 
 from drivers.measurements import PositionFix
-from fusiond.studies.faults.measurement_faults import frozen
+from fusiond.studies.faults.measurement_faults import frozen_fix
 from fusiond.studies.faults.runs import ANTENNA_M
-from fusiond.studies.faults.scenes import (
-    CODE,
-    RTK,
-    SHARED_S,
-    SHARES,
-    SHARING,
-    Vehicle,
-    drawing,
-    scene,
-)
 from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.service import (
     AFTER_OUTAGES,
@@ -33,15 +23,25 @@ from fusiond.studies.faults.service import (
     Job,
     figures,
     jobs,
-    old,
     service_run,
+    stale_fixes,
+)
+from fusiond.studies.faults.sharpness_service_drives import (
+    CODE,
+    RTK,
+    SHARED_S,
+    SHARES,
+    SHARING,
+    Vehicle,
+    part_generator,
+    scene,
 )
 from fusiond.studies.faults.solution_errors import (
     STEP_S,
     Published,
     lasting_from,
     longest_s,
-    published,
+    published_errors,
 )
 from fusiond.studies.faults.tables import TABLES
 
@@ -61,9 +61,9 @@ def course(seconds: float = 100.0, error_m: float = 0.0, sigma: float = 1.0) -> 
 
 
 def test_what_is_scored_is_not_what_is_looked_at() -> None:
-    firsts = {(s, k): float(drawing(s, k, 0).uniform()) for s in SHARES for k in range(50)}
+    firsts = {(s, k): float(part_generator(s, k, 0).uniform()) for s in SHARES for k in range(50)}
     assert len(set(firsts.values())) == 100
-    assert firsts["looked", 3] == drawing("looked", 3, 0).uniform()
+    assert firsts["looked", 3] == part_generator("looked", 3, 0).uniform()
     vehicle = Vehicle("mems", CODE)
     one, same, other = (scene(vehicle, s, 0, 60.0) for s in ("looked", "looked", "scored"))
     assert np.array_equal(one.recording.samples, same.recording.samples)
@@ -109,7 +109,7 @@ def test_a_typical_unit_is_better_than_its_class_and_no_less_noisy() -> None:
 
 def test_late_fixes_say_what_was_true_before() -> None:
     recording = scene(Vehicle("mems", CODE), "looked", 0, 60.0).recording
-    before, after = fixes(recording), fixes(old(recording, 40.0, 10.0, 3.0))
+    before, after = fixes(recording), fixes(stale_fixes(recording, 40.0, 10.0, 3.0))
     assert [fix.stamp for fix in before] == [fix.stamp for fix in after]
     moved = [k for k in range(len(before)) if before[k] != after[k]]
     assert moved == list(range(39, 49))  # those that are valid from 40 s to before 50 s
@@ -192,10 +192,10 @@ def test_one_of_each_is_run_and_told() -> None:
 
 def test_what_is_published_is_compared_with_the_truth_at_10_hz() -> None:
     on = scene(Vehicle("mems", RTK), "looked", 0, 60.0)
-    run = published(on.config, on.recording, on.truth)
+    run = published_errors(on.config, on.recording, on.truth)
     assert len(run.t_s) == 600
     late = run.there & (run.t_s > 50.0)
     assert late.sum() == 100
     assert run.horizontal_m[late].max() < 0.2
-    held = published(on.config, frozen(on.recording, 40.0, LASTS_S), on.truth)
+    held = published_errors(on.config, frozen_fix(on.recording, 40.0, LASTS_S), on.truth)
     assert np.nanmax(abs(held.errors[held.t_s < 40.0] - run.errors[run.t_s < 40.0])) == 0.0

@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.studies.faults.recorded_fault_free import DRIVES, RealJob, real_run
 from fusiond.studies.faults.recorded_fault_free import jobs as real_jobs
-from fusiond.studies.faults.scenes import CODE, Vehicle, scene
+from fusiond.studies.faults.sharpness_service_drives import CODE, Vehicle, scene
 from fusiond.studies.faults.sigma_sharpness import (
     CELLS,
     DURATION_S,
@@ -21,7 +21,7 @@ from fusiond.studies.faults.sigma_sharpness import (
     figures,
     jobs,
     moments,
-    outside,
+    nees_class,
     phases_of,
     sharpness_run,
 )
@@ -99,7 +99,7 @@ def test_what_is_not_published_is_no_number_and_what_is_not_known_is_left_out() 
     ],
 )
 def test_chance_is_no_verdict(nees: float, half: float, verdict: str) -> None:
-    assert outside(nees, half) == verdict
+    assert nees_class(nees, half) == verdict
 
 
 def test_the_interval_is_that_of_so_few_drives() -> None:

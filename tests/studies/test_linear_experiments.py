@@ -16,8 +16,8 @@ from fusiond.studies.paper_models_nees import (
     GROUPS,
     HONEST,
     WITHOUT_IMU,
-    flown,
     plot,
+    run_case,
     run_study,
     tables,
 )
@@ -40,7 +40,7 @@ def test_every_model_and_every_paper_is_flown() -> None:
 
 
 def test_a_run_repeats_and_another_is_another() -> None:
-    first, again, other = (flown("001 planar10", 5, k) for k in (0, 0, 1))
+    first, again, other = (run_case("001 planar10", 5, k) for k in (0, 0, 1))
     assert first == again != other
 
 
@@ -70,7 +70,7 @@ def test_its_result_its_tables_and_its_picture(tmp_path: Path) -> None:
 def test_models_without_scale_factors_know_their_attitude_and_velocity(case: str) -> None:
     """A unit of 5000 ppm in a town: 0.45 deg of heading a corner. Mean of three runs; an attitude
     in error is one draw a run, of which three have a spread of 0.47."""
-    rows = [flown(case, 0, k) for k in range(3)]
+    rows = [run_case(case, 0, k) for k in range(3)]
     mean = {group: math.fsum(row[f"{group}_nees"] for row in rows) / 3.0 for group in GROUPS}
     assert 0.7 < mean["position"] < 1.4
     assert 0.65 < mean["velocity"] < 1.4

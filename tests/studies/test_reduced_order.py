@@ -18,7 +18,7 @@ from fusiond.studies import STUDIES
 from fusiond.studies.covariance_analysis import analyse
 from fusiond.studies.reduced_order import flight, study
 from fusiond.studies.reduced_order.cost import costs
-from fusiond.studies.reduced_order.runs import combinations, fly, started
+from fusiond.studies.reduced_order.runs import combinations, fly, started_filter
 from fusiond.studies.reduced_order.study import plot, run_study, tables
 
 RUNS = 6
@@ -190,7 +190,7 @@ def test_transition_of_a_second_is_that_of_the_running_filter() -> None:
             zip(rowless, rowless, strict=True), np.arange(of.size), p, p, np.arange(9)
         )
         path = flight.truth(5.0)
-        estimator = started(of, flight.true_nav(path)[0])
+        estimator = started_filter(of, flight.true_nav(path)[0])
         estimator.propagate(
             flight.imu_buffer(np.hstack([path.gyro, path.accel])), 5 * flight.EPOCH_NS
         )

@@ -21,7 +21,12 @@ from fusiond.models.catalogue import make_model
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.gnss.raw import START, GnssRaw
 from fusiond.studies.bds_tight import runs
-from fusiond.studies.live_filter import DURATION_S, LiveFilter, drive_samples, drive_truth
+from fusiond.studies.daemon_fed_filter import (
+    DURATION_S,
+    DaemonFedFilter,
+    drive_samples,
+    drive_truth,
+)
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 SIGNALS = (("G", "1C"), ("G", "2L"), ("C", "2I"), ("C", "6I"))
@@ -83,7 +88,9 @@ def scored(per_hour: float, number: int, breaks: bool = False) -> Scored:
     t_s = runs.epochs()[:EPOCHS]
     nav = true_nav(drive_truth(), np.r_[0.0, t_s])
     estimator = Told(model, runs.IMU.gap_s)
-    live = LiveFilter(estimator, runs.IMU.gap_s, samples, with_error(nav[0], unit * sd[:9]), sd)
+    live = DaemonFedFilter(
+        estimator, runs.IMU.gap_s, samples, with_error(nav[0], unit * sd[:9]), sd
+    )
     raw = intake.receivers["raw"]
     for message in runs.broadcast(sim):
         raw.learn(message)

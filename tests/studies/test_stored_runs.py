@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 from fusiond.commands.app import app
 from fusiond.files.csv_tables import TableError
-from fusiond.files.parquet_rows import RowFile, read_rows, write_rows
-from fusiond.studies import random_drives
-from fusiond.studies.monte_carlo import of_run, on_processes, runs_on
+from fusiond.files.resumable_parquet import ResumableRows, read_rows, write_rows
+from fusiond.studies import random_drives_study
+from fusiond.studies.monte_carlo import map_runs, run_generator, runner_context
 from fusiond.studies.rdss import static
 from fusiond.studies.rdss.runs import simulate
-from fusiond.studies.stored_runs import KeptRuns, described
-from fusiond.workers.outcome import Outcome
+from fusiond.studies.stored_runs import StoredRuns, stable_text
+from fusiond.workers.runner_interface import Outcome
 
 DURATION_S = 25.0
 """Long enough to align and to drive off."""
@@ -50,12 +50,12 @@ def kept_runs(
 ) -> tuple[list[Any], int]:
     """Results, and how many were made for them."""
     here = Here()
-    with RowFile(path) as file, runs_on(here, KeptRuns(file, study, 0)):
-        return on_processes(work, runs), here.made
+    with ResumableRows(path) as file, runner_context(here, StoredRuns(file, study, 0)):
+        return map_runs(work, runs), here.made
 
 
 def test_a_row_a_drive_by_the_names_of_batch(tmp_path: Path) -> None:
-    path, work = tmp_path / "rows.parquet", partial(random_drives.drive_run, DURATION_S, 3)
+    path, work = tmp_path / "rows.parquet", partial(random_drives_study.drive_run, DURATION_S, 3)
     first, made = kept_runs(path, work, 2)
     assert made == 2
     assert kept_runs(path, work, 2) == (first, 0)
@@ -85,9 +85,9 @@ def test_a_summary_of_kept_runs_is_that_of_new_ones(tmp_path: Path) -> None:
 
 def test_another_case_has_rows_of_its_own() -> None:
     case = static.CASE
-    names = [described(partial(simulate, c, 0)) for c in (case, replace(case, window=40))]
+    names = [stable_text(partial(simulate, c, 0)) for c in (case, replace(case, window=40))]
     assert names[0] != names[1]
-    assert names[0] == described(partial(simulate, replace(case), 0))
+    assert names[0] == stable_text(partial(simulate, replace(case), 0))
     assert " at 0x" not in names[0]
 
 
@@ -110,14 +110,16 @@ def test_a_file_of_rows_calls_nothing(tmp_path: Path, result: bytes) -> None:
 def test_runs_are_children_of_the_seeds_sequence() -> None:
     """Child k, whoever makes it, and none that another seed has."""
     whole = np.random.SeedSequence(7).spawn(4)
-    assert np.array_equal(of_run(7, 3).generate_state(4), whole[3].generate_state(4))
-    states = {tuple(of_run(s, k).generate_state(2)) for s in range(20) for k in range(20)}
+    assert np.array_equal(run_generator(7, 3).generate_state(4), whole[3].generate_state(4))
+    states = {tuple(run_generator(s, k).generate_state(2)) for s in range(20) for k in range(20)}
     assert len(states) == 400
 
 
 def test_the_command_goes_on_where_its_rows_end(tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
-    kept_runs(path, partial(random_drives.drive_run, random_drives.DURATION_S, 0), 2, "drives")
+    kept_runs(
+        path, partial(random_drives_study.drive_run, random_drives_study.DURATION_S, 0), 2, "drives"
+    )
     call = ["study", "drives", "--workers", "1", "--out", str(path), "--runs"]
     done = CliRunner().invoke(app, [*call, "2"])
     assert "2 there" in done.stderr

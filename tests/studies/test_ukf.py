@@ -17,7 +17,7 @@ from fusiond.aiding.base import Innovation, State
 from fusiond.aiding.pseudorange import PseudorangeMeasurement, epoch_values
 from fusiond.navigation.strapdown import STEP_RATE_B, STEP_SIZE
 from fusiond.studies import STUDIES
-from fusiond.studies.live_filter import LiveFilter, drive_samples, drive_truth
+from fusiond.studies.daemon_fed_filter import DaemonFedFilter, drive_samples, drive_truth
 from fusiond.studies.ukf import runs as ukf_runs
 from fusiond.studies.ukf import study as ukf
 
@@ -123,7 +123,7 @@ def test_a_clock_that_is_set_unannounced_is_found(name: str) -> None:
     sd = model.initial.copy()
     sd[:9] = [0.003, 0.003, 0.03, 0.5, 0.5, 0.5, 30.0, 30.0, 30.0]
     start = ukf_runs._true_states(problem.every_s)[0][0]
-    live = LiveFilter(ukf_runs.FILTERS[name](model), ukf_runs.IMU.gap_s, samples, start, sd)
+    live = DaemonFedFilter(ukf_runs.FILTERS[name](model), ukf_runs.IMU.gap_s, samples, start, sd)
     (slot,) = model.slots_of("clock_offset")
     for k, epoch in enumerate(measurements):
         measurement = epoch[0]

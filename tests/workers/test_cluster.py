@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
-from fusiond.studies.monte_carlo import on_processes, runs_on
+from fusiond.studies.monte_carlo import map_runs, runner_context
 from fusiond.workers.cluster import Cluster, ClusterError
 from tests.patience import PATIENCE_S
 from tests.places import REPOSITORY
@@ -51,9 +51,9 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
 
 
 def test_two_workers_one_killed_in_the_middle(scheduler: str, tmp_path: Path) -> None:
-    with Cluster(scheduler) as cluster, runs_on(cluster) as lost:
+    with Cluster(scheduler) as cluster, runner_context(cluster) as lost:
         assert cluster.workers == 2
-        assert on_processes(drawn, RUNS) == [drawn(number) for number in range(RUNS)]
+        assert map_runs(drawn, RUNS) == [drawn(number) for number in range(RUNS)]
         assert not lost
 
         items = ["a", "killed", "raises", "b"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.workers import forked
-from fusiond.workers.forked import Forked
+from fusiond.workers.forked import ForkedJobs
 from tests.patience import PATIENCE_S
 
 
@@ -53,7 +53,7 @@ def _jobs(folder: Path, count: int) -> list[Callable[[], None]]:
 
 
 def test_each_job_is_done_once_elsewhere_and_counted(tmp_path: Path) -> None:
-    with Forked(_jobs(tmp_path, 50)) as work:
+    with ForkedJobs(_jobs(tmp_path, 50)) as work:
         counts = list(work)
     assert counts[-1] == work.total == 50
     assert counts == sorted(counts)
@@ -67,7 +67,7 @@ def test_each_job_is_done_once_elsewhere_and_counted(tmp_path: Path) -> None:
 def test_a_child_that_holds_its_share_is_followed_by_another(tmp_path: Path) -> None:
     held: list[bytearray] = []
     share = 10_000_000
-    work = Forked([partial(_noted_heavily, tmp_path, k, held) for k in range(16)], share=share)
+    work = ForkedJobs([partial(_noted_heavily, tmp_path, k, held) for k in range(16)], share=share)
     assert list(work)[-1] == 16
     work.end()
     pids = _pids(tmp_path, 16)
@@ -78,7 +78,7 @@ def test_a_child_that_holds_its_share_is_followed_by_another(tmp_path: Path) -> 
 def test_a_job_that_kills_its_child_is_tried_twice_and_left(tmp_path: Path) -> None:
     jobs = _jobs(tmp_path, 6)
     jobs[2] = partial(_dies, tmp_path, 2)
-    with Forked(jobs) as work:
+    with ForkedJobs(jobs) as work:
         assert list(work)[-1] == 5
     assert len(_pids(tmp_path, 6)) == 7
 
@@ -86,12 +86,12 @@ def test_a_job_that_kills_its_child_is_tried_twice_and_left(tmp_path: Path) -> N
 def test_a_job_that_dies_once_is_done(tmp_path: Path) -> None:
     jobs = _jobs(tmp_path, 6)
     jobs[0] = partial(_dies_once, tmp_path, 0)
-    with Forked(jobs) as work:
+    with ForkedJobs(jobs) as work:
         assert list(work)[-1] == 6
 
 
 def test_a_job_that_raises_says_why(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with Forked([_raises, *_jobs(tmp_path, 2)]) as work:
+    with ForkedJobs([_raises, *_jobs(tmp_path, 2)]) as work:
         assert list(work)[-1] == 2
     assert "ValueError: a mistake" in capfd.readouterr().err
 
@@ -101,7 +101,7 @@ def test_a_forked_job_can_be_awaited_and_cancelled(tmp_path: Path) -> None:
         _noted(tmp_path, 1)
         signal.pause()
 
-    with Forked([*_jobs(tmp_path, 1), endless]) as work:
+    with ForkedJobs([*_jobs(tmp_path, 1), endless]) as work:
         assert select.select([work], [], [], PATIENCE_S)[0]
         assert work.read()
         assert work.done == 1
@@ -136,7 +136,7 @@ def test_children_step_back_to_normal_priority(
     def told() -> None:
         (tmp_path / "set").write_text(repr(set_to[-1]))
 
-    with Forked([told]) as work:
+    with ForkedJobs([told]) as work:
         assert list(work) == [1]
     assert (tmp_path / "set").read_text() == repr((os.PRIO_PROCESS, 0, 0))
 
@@ -151,7 +151,7 @@ def test_one_child_works_where_memory_is_short(
             (tmp_path / "meminfo").write_text(told)
         folder = tmp_path / str(told is None)
         folder.mkdir()
-        with Forked([partial(_slow, folder, k) for k in range(8)]) as work:
+        with ForkedJobs([partial(_slow, folder, k) for k in range(8)]) as work:
             assert list(work)[-1] == 8
         processors = min(forked.MOST_CHILDREN, len(os.sched_getaffinity(0)))
         assert len(set(_pids(folder, 8))) == (1 if told else processors)

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from fusiond.studies.monte_carlo import on_processes, runs_on
+from fusiond.studies.monte_carlo import map_runs, runner_context
 from fusiond.workers.pool import Pool
 from tests.patience import PATIENCE_S
 from tests.workers.jobs import dies_once, drawn, mishap, pid, third_dies, threads
@@ -15,10 +15,10 @@ RUNS = 23
 
 
 def test_results_do_not_depend_on_the_number_of_workers() -> None:
-    here = on_processes(drawn, RUNS)
+    here = map_runs(drawn, RUNS)
     for workers in (1, 3):
-        with Pool(workers) as pool, runs_on(pool) as lost:
-            assert on_processes(drawn, RUNS) == here
+        with Pool(workers) as pool, runner_context(pool) as lost:
+            assert map_runs(drawn, RUNS) == here
         assert not lost
 
 
@@ -57,8 +57,8 @@ def test_an_endless_item_is_killed() -> None:
 
 
 def test_a_study_says_which_runs_it_lost() -> None:
-    with Pool(2) as pool, runs_on(pool) as lost:
-        assert on_processes(third_dies, 4) == [0, 1, 3]
+    with Pool(2) as pool, runner_context(pool) as lost:
+        assert map_runs(third_dies, 4) == [0, 1, 3]
     assert [(run.number, run.ended) for run in lost] == [(2, "died")]
 
 

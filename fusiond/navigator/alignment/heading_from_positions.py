@@ -29,7 +29,7 @@ from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle import MOUNTING, mounting
+from fusiond.models.vehicle_parameter_blocks import MOUNTING, mounting_block
 from fusiond.navigation.alignment import level
 from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -79,7 +79,7 @@ def bank_model(model: Model, options: AlignmentOptions) -> Model:
         return model
     try:
         return Model(
-            model.name, (*model.blocks, mounting(options.course_sd_rad)), model.hold_height
+            model.name, (*model.blocks, mounting_block(options.course_sd_rad)), model.hold_height
         )
     except TooManyStatesError:
         return model

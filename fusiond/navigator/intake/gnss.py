@@ -13,16 +13,16 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import SUFFIX, VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     ANTENNA_LEVER,
     CLOCK_SKEW,
     FIX_MARKOV,
     FIX_TIME,
     VELOCITY_TIME,
-    antenna_lever,
-    clock_skew,
+    antenna_lever_block,
+    clock_skew_block,
     fix_markov_block,
-    time_offset,
+    time_offset_block,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
 from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
@@ -279,15 +279,15 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
     found = []
     if section.time_offset_sd_s:
         skew, sd_s = sections.own(CLOCK_SKEW, source, section), section.time_offset_sd_s
-        found.append(time_offset(sections.own(FIX_TIME, source, section), sd_s, skew))
+        found.append(time_offset_block(sections.own(FIX_TIME, source, section), sd_s, skew))
         if section.use_velocity:
             name = sections.own(VELOCITY_TIME, source, section)
-            found.append(time_offset(name, sd_s, skew))
-        found.append(clock_skew(skew))
+            found.append(time_offset_block(name, sd_s, skew))
+        found.append(clock_skew_block(skew))
     lever_sd = lever_sd_m(section, sections.aiding)
     if lever_sd:
         name = sections.own(ANTENNA_LEVER, source, section)
-        found.append(antenna_lever(name, lever_sd))
+        found.append(antenna_lever_block(name, lever_sd))
     names = _fix_bias(source, section, sections)
     if names:
         level, down = names

@@ -9,13 +9,13 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.height import BarometerMeasurement, HeightMeasurement
 from fusiond.configuration.aiding import BarometerAiding, HeightAiding
 from fusiond.models.blocks import Block
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     BAROMETER_AIRFLOW,
     BAROMETER_OFFSET,
     BAROMETER_SCALE,
-    barometer_airflow,
-    barometer_offset,
-    barometer_scale,
+    barometer_airflow_block,
+    barometer_offset_block,
+    barometer_scale_block,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
@@ -45,9 +45,9 @@ def blocks(source: str, section: BarometerAiding, sections: Sections) -> list[Bl
     """Offset, scale and airflow of a barometer's height."""
     offset, scale, airflow = _names(source, section, sections)
     return [
-        barometer_offset(offset, section.weather_sd_m, section.weather_walk_m_sqrt_s),
-        barometer_scale(scale, section.temperature_sd),
-        barometer_airflow(airflow, section.airflow_sd),
+        barometer_offset_block(offset, section.weather_sd_m, section.weather_walk_m_sqrt_s),
+        barometer_scale_block(scale, section.temperature_sd),
+        barometer_airflow_block(airflow, section.airflow_sd),
     ]
 
 

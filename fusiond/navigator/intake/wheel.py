@@ -10,15 +10,15 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.models.blocks import Block
-from fusiond.models.vehicle import (
+from fusiond.models.vehicle_parameter_blocks import (
     WHEEL_DRIFT,
     WHEEL_LATENCY,
     WHEEL_ROUNDING,
     WHEEL_SCALE,
-    drift,
-    time_offset,
-    wheel_rounding,
-    wheel_scale,
+    drift_block,
+    time_offset_block,
+    wheel_rounding_block,
+    wheel_scale_block,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
@@ -56,15 +56,17 @@ def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[A
 
 def blocks(source: str, section: WheelAiding, sections: Sections) -> list[Block]:
     """Drift, scale, latency and rounding of the wheel's speed."""
-    found = [wheel_rounding(sections.own(WHEEL_ROUNDING, source, section), SHARED_SD)]
+    found = [wheel_rounding_block(sections.own(WHEEL_ROUNDING, source, section), SHARED_SD)]
     if section.drift_sd_m_s:
         name = sections.own(WHEEL_DRIFT, source, section)
-        found.append(drift(name, section.drift_sd_m_s, section.drift_s))
+        found.append(drift_block(name, section.drift_sd_m_s, section.drift_s))
     if section.scale_sd:
-        found.append(wheel_scale(sections.own(WHEEL_SCALE, source, section), section.scale_sd))
+        found.append(
+            wheel_scale_block(sections.own(WHEEL_SCALE, source, section), section.scale_sd)
+        )
     if section.latency_sd_s:
         name = sections.own(WHEEL_LATENCY, source, section)
-        found.append(time_offset(name, section.latency_sd_s))
+        found.append(time_offset_block(name, section.latency_sd_s))
     return found
 
 

@@ -23,7 +23,7 @@ from functools import cached_property
 from drivers.base import DriverStatus
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.outputs import Foxglove
-from fusiond.files.install_extra import install
+from fusiond.files.install_extra import install_command
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.foxglove.channels import CHANNELS, Channel
 from fusiond.outputs.messages.base import Message
@@ -59,7 +59,7 @@ class FoxgloveServer:
 
     def __init__(self, section: Foxglove, around: Surroundings) -> None:
         if _MISSING is not None:
-            raise ConfigError(f"outputs.foxglove: {_MISSING}: {install('foxglove')}")
+            raise ConfigError(f"outputs.foxglove: {_MISSING}: {install_command('foxglove')}")
         self.nav_rate_hz = section.rate_hz
         self.origins = frozenset(section.origins)
         self._vehicle = around.vehicle

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from drivers.rdss.mail import FleetFix
-from drivers.rdss.report import PositionReport
+from drivers.rdss.position_report_coding import PositionReport
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.messages.base import HalfTurn, Message, Milliseconds, Number, QuarterTurn, Turn
 from fusiond.outputs.messages.base import stamp as stamped

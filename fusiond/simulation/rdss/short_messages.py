@@ -12,19 +12,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.rdss.envelope import (
+from drivers.rdss.messages import FieldError, Text, TextRequest
+from drivers.rdss.position_report_coding import REPORT, PositionReport, encode_report
+from drivers.rdss.text_coding import EncodedText, encode_shortest
+from drivers.rdss.vehicle_message_envelope import (
     RECEIPT,
     TEXT,
-    Receipted,
-    carried,
-    opened,
-    read_text,
-    receipt_body,
-    sealed,
+    Receipt,
+    decode_text_body,
+    encode_envelope,
+    encode_receipt_body,
+    envelope_from_text,
+    envelope_to_text,
 )
-from drivers.rdss.messages import FieldError, Text, TextRequest
-from drivers.rdss.report import REPORT, PositionReport, encode_report
-from drivers.rdss.text_coding import Wording, worded
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.terminal import RdssTerminal
 
@@ -33,7 +33,7 @@ from fusiond.simulation.rdss.terminal import RdssTerminal
 class MessageNetwork:
     """See the module. Probabilities are of each message; `delay_s` from burst to serial line.
 
-    Counters: `carried`, `lost`, `damaged` (handed over with a CRC that failed), `nobody`.
+    Counters: `envelope_to_text`, `lost`, `damaged` (handed over with a CRC that failed), `nobody`.
     """
 
     rng: np.random.Generator
@@ -90,10 +90,15 @@ class ConvoyVehicle:
         """Deliver due messages."""
         if t_s >= self._next_report_s:
             self._next_report_s = t_s + self.REPORT_S
-            self._say(carried(sealed(REPORT, encode_report(self._report(t_s))), "binary"), t_s)
+            self._say(
+                envelope_to_text(
+                    encode_envelope(REPORT, encode_report(self._report(t_s))), "binary"
+                ),
+                t_s,
+            )
         if t_s >= self._next_order_s:
             self._next_order_s = t_s + self.ORDER_S
-            self._say(worded(self.ORDERS[self._orders % len(self.ORDERS)]), t_s)
+            self._say(encode_shortest(self.ORDERS[self._orders % len(self.ORDERS)]), t_s)
             self._orders += 1
 
     def _report(self, t_s: float) -> PositionReport:
@@ -115,15 +120,17 @@ class ConvoyVehicle:
         if message.receiver != self.CARD:
             return
         try:
-            envelope = opened(Wording(message.payload, message.encoding, message.odd))
+            envelope = envelope_from_text(
+                EncodedText(message.payload, message.encoding, message.odd)
+            )
         except FieldError:
             return
         if envelope is not None and envelope.kind == TEXT:
-            number, _ = read_text(envelope.body)
-            body = receipt_body(Receipted(number, envelope.crc))
-            self._say(carried(sealed(RECEIPT, body), "binary"), t_s + 2.0)
+            number, _ = decode_text_body(envelope.body)
+            body = encode_receipt_body(Receipt(number, envelope.crc))
+            self._say(envelope_to_text(encode_envelope(RECEIPT, body), "binary"), t_s + 2.0)
 
-    def _say(self, wording: Wording, t_s: float) -> None:
+    def _say(self, wording: EncodedText, t_s: float) -> None:
         text = Text(
             self.CARD, wording.payload, wording.encoding, self._ahead.options.user, odd=wording.odd
         )

@@ -48,7 +48,7 @@ from drivers.rdss.messages import (
     Unknown,
     VersionRequest,
 )
-from drivers.rdss.text_coding import Wording, level_bits
+from drivers.rdss.text_coding import EncodedText, card_level_bits
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions
@@ -187,8 +187,8 @@ class RdssTerminal:
                     "DWSQ", t_s, message.period_s, lambda due: self._position(message, due)
                 )
             case TextRequest():
-                wording = Wording(message.payload, message.encoding, message.odd)
-                fits = wording.bits <= level_bits(o.comm_level)
+                wording = EncodedText(message.payload, message.encoding, message.odd)
+                fits = wording.bits <= card_level_bits(o.comm_level)
                 if self._transmit("TXSQ", "TXA", t_s, None if fits else Outcome.FAILED):
                     self.carry(o.user, message, t_s)
 

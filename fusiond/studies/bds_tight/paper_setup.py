@@ -45,9 +45,9 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Path, Profile
 from fusiond.studies.bds_tight.runs import COUNTED_S, OPTIONS, START_SD, Receiver, broadcast, epochs
-from fusiond.studies.live_filter import DURATION_S, ORIGIN_DEG_M, RATE_HZ, LiveFilter
-from fusiond.studies.monte_carlo import on_processes
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.daemon_fed_filter import DURATION_S, ORIGIN_DEG_M, RATE_HZ, DaemonFedFilter
+from fusiond.studies.monte_carlo import map_runs
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ COLUMNS = {
 }
 
 
-def way() -> Path:
+def true_path() -> Path:
     """Winding path from the origin to 200 m west and 40 m up."""
     end = DURATION_S - REST_S - RAMP_S
     begin = REST_S + RAMP_S
@@ -124,7 +124,7 @@ def way() -> Path:
 def truth() -> Truth:
     """Truth of that path, sampled at the IMU's rate."""
     lat, lon, height = ORIGIN_DEG_M
-    return Truth(way(), (lat * DEG, lon * DEG, height), RATE_HZ, DURATION_S)
+    return Truth(true_path(), (lat * DEG, lon * DEG, height), RATE_HZ, DURATION_S)
 
 
 @dataclass(slots=True)
@@ -165,7 +165,7 @@ def simulate(seed: int, number: int) -> dict[str, Trace]:
         sd = model.initial.copy()
         sd[:9] = [tilt * DEG, tilt * DEG, heading * DEG, *[velocity] * 3, *[horizontal] * 2, height]
         started = with_error(nav[0], unit * sd[:9])
-        live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, started, sd)
+        live = DaemonFedFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, started, sd)
         raw = intake.receivers["raw"]
         for message in broadcast(simulated):
             raw.learn(message)
@@ -184,9 +184,11 @@ def simulate(seed: int, number: int) -> dict[str, Trace]:
     return traces
 
 
-def found(runs: int, seed: int, progress: Callable[[], None] | None = None) -> dict[str, Any]:
+def paper_figures(
+    runs: int, seed: int, progress: Callable[[], None] | None = None
+) -> dict[str, Any]:
     """Figures of each row, gains, and the course of run 0 for the pictures."""
-    results = on_processes(partial(simulate, seed), runs, progress)
+    results = map_runs(partial(simulate, seed), runs, progress)
     counted = epochs() >= COUNTED_S
     rows = {name: _figures([r[name] for r in results], counted) for name in results[0]}
     t_s = epochs()
@@ -214,7 +216,7 @@ def found(runs: int, seed: int, progress: Callable[[], None] | None = None) -> d
 
 def _metres(position: Array) -> Array:
     start = truth().at(np.zeros(1)).position[0]
-    return np.asarray((position - start) * metres(float(start[0]), float(start[2])))
+    return np.asarray((position - start) * metres_per_unit(float(start[0]), float(start[2])))
 
 
 def _figures(traces: Sequence[Trace], counted: NDArray[np.bool_]) -> dict[str, Any]:

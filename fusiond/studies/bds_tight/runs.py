@@ -54,14 +54,14 @@ from fusiond.models.model import Model
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.gnss.masks import canyon
 from fusiond.simulation.gnss.raw import START, GnssRaw, GnssRawOptions
-from fusiond.studies.live_filter import (
+from fusiond.studies.daemon_fed_filter import (
     DURATION_S,
     RATE_HZ,
-    LiveFilter,
+    DaemonFedFilter,
     drive_samples,
     drive_truth,
 )
-from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.monte_carlo import map_runs
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
@@ -83,8 +83,8 @@ and heading (deg) of levelling and a compass."""
 RAW = RawAiding(systems=("C",), lever_arm_m=LEVER)
 LOOSE = GnssAiding(lever_arm_m=LEVER, bias_sd_m=RAW.bias_sd_m, bias_down_sd_m=RAW.bias_down_sd_m)
 ORBIT_ERRORS_M = (0.6, 0.3, 0.0)
-"""Errors of orbits and clocks: BeiDou-3's as published (fusiond.gnss.plan), for the cases; half of
-them and none, to explain the NEES."""
+"""Errors of orbits and clocks: BeiDou-3's as published (fusiond.gnss.signal_choice), for the cases;
+half of them and none, to explain the NEES."""
 OPTIONS = GnssRawOptions(
     rate_hz=1.0,
     signals=(("C", "2I"),),
@@ -299,7 +299,7 @@ def _filter_trace(
     sd[:9] = [tilt * DEG, tilt * DEG, heading * DEG, *[velocity] * 3, *[horizontal] * 2, height]
     nav = _true_states()[0]
     start = with_error(nav[0], unit_error * sd[:9])
-    live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, start, sd)
+    live = DaemonFedFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, start, sd)
     estimator = live.estimator
     raw = intake.receivers.get("raw")
     if raw is not None:
@@ -350,4 +350,4 @@ def monte_carlo(
     runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[list[dict[str, CaseRun]]]:
     """Runs in order, on two processes."""
-    return on_processes(partial(simulate, seed), runs, progress)
+    return map_runs(partial(simulate, seed), runs, progress)

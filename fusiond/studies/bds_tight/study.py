@@ -42,8 +42,8 @@ from fusiond.studies.bds_tight.runs import (
     in_stretch,
     monte_carlo,
 )
+from fusiond.studies.daemon_fed_filter import DURATION_S
 from fusiond.studies.figure_file import save_figure
-from fusiond.studies.live_filter import DURATION_S
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def run_study(
         raise ValueError("runs must be at least 2")
     step = step_counter(progress, 2 * count)
     results = monte_carlo(count, seed, step)
-    own = paper_setup.found(count, seed, step)
+    own = paper_setup.paper_figures(count, seed, step)
     cases = {case: _case(case, [r[0][case] for r in results]) for case in CASES}
     growth = {row: cases["canyon3"][row]["growth_m"] for row in ("tight_ekf", "coasting")}
     three = {

@@ -15,8 +15,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from fusiond.studies.faults.bounds import bound_run
-from fusiond.studies.faults.bounds import jobs as bound_jobs
+from fusiond.studies.faults.detection_bounds import bound_run
+from fusiond.studies.faults.detection_bounds import jobs as bound_jobs
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.faulty_hours import faulty_hour_of
 from fusiond.studies.faults.hours import hour_of
@@ -26,14 +26,14 @@ from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, 
 from fusiond.studies.faults.recorded_fault_free import jobs as real_jobs
 from fusiond.studies.faults.recorded_fault_free import real_run
 from fusiond.studies.faults.runs import rows, run_row
-from fusiond.studies.faults.scenes import SHARES
 from fusiond.studies.faults.service import jobs as service_jobs
 from fusiond.studies.faults.service import service_run
+from fusiond.studies.faults.sharpness_service_drives import SHARES
 from fusiond.studies.faults.sigma_sharpness import jobs as sharpness_jobs
 from fusiond.studies.faults.sigma_sharpness import sharpness_run
-from fusiond.studies.faults.tables import TABLES, put_into
-from fusiond.studies.monte_carlo import over, runs_on, step_counter
-from fusiond.workers.pool import Pool, processors
+from fusiond.studies.faults.tables import TABLES, replace_table
+from fusiond.studies.monte_carlo import map_items, runner_context, step_counter
+from fusiond.workers.pool import Pool, processor_count
 
 Row = dict[str, Any]
 
@@ -60,7 +60,7 @@ def main() -> int:
     parser.add_argument(
         "--at", type=float, nargs="+", metavar="S", help="faults begin so long after the recording"
     )
-    parser.add_argument("--workers", type=int, default=processors(), help="processes")
+    parser.add_argument("--workers", type=int, default=processor_count(), help="processes")
     parser.add_argument("--json", type=Path, metavar="F.json")
     parser.add_argument("--table", type=Path, metavar="F.md")
     parser.add_argument("--page", type=Path, metavar="F.md", help="put the table into this page")
@@ -90,7 +90,7 @@ def main() -> int:
     if asked.table is not None:
         asked.table.write_text(text)
     if asked.page is not None:
-        put_into(asked.page, kind, text)
+        replace_table(asked.page, kind, text)
     print(text, end="")
     return 0
 
@@ -131,8 +131,8 @@ def _run(
         if sys.stderr.isatty():
             print(f"\r{done}/{total}", end="", file=sys.stderr, flush=True)
 
-    with Pool(workers) as pool, runs_on(pool) as lost:
-        found = over(one, wanted, step_counter(tell, len(wanted)))
+    with Pool(workers) as pool, runner_context(pool) as lost:
+        found = map_items(one, wanted, step_counter(tell, len(wanted)))
     for run in lost:
         print(f"row {run.number} {run.ended}: {run.reason}", file=sys.stderr)
     return found

@@ -33,14 +33,14 @@ _slip = partial(measurement.wheels_scaled, factor=1.5)
 
 MORE: dict[str, Fault] = {
     # fixes of the receiver
-    "step_3m": _of_fixes(partial(measurement.step, north_m=3.0), 20.0),
-    "step_10m": _of_fixes(partial(measurement.step, north_m=10.0), 20.0),
-    "step_50m": _of_fixes(partial(measurement.step, north_m=50.0), 20.0),
-    "scatter_20m": _of_fixes(partial(measurement.scattered, sd_m=20.0), 30.0),
+    "step_3m": _of_fixes(partial(measurement.position_step, north_m=3.0), 20.0),
+    "step_10m": _of_fixes(partial(measurement.position_step, north_m=10.0), 20.0),
+    "step_50m": _of_fixes(partial(measurement.position_step, north_m=50.0), 20.0),
+    "scatter_20m": _of_fixes(partial(measurement.scattered_positions, sd_m=20.0), 30.0),
     "height_50m": _of_fixes(partial(measurement.too_high, up_m=50.0), 20.0),
     "velocity_off_3_m_s": _of_fixes(partial(measurement.velocity_bias, north_m_s=3.0), 20.0),
     "sigma_1mm": _of_fixes(partial(measurement.tiny_sigma, sd_m=1e-3), 30.0),
-    "fixes_late_2s": _of_fixes(partial(measurement.late, late_s=2.0), 30.0),
+    "fixes_late_2s": _of_fixes(partial(measurement.stamped_late, late_s=2.0), 30.0),
     # samples of the IMU
     "gyro_bias_0.3_deg_s": _of_imu(partial(imu.bias_step, size=0.3 * DEG)),
     "force_bias_0.5_m_s2": _of_imu(partial(imu.bias_step, size=0.5, axis=FORWARD)),
@@ -72,7 +72,7 @@ MORE: dict[str, Fault] = {
         partial(measurement.wheels_scaled, factor=KM_H), phases=("aligning",), begin_s=0.0
     ),
     "wheels_now_and_then": _of_wheels(
-        lambda r, begin_s, length_s: measurement.now_and_then(r, begin_s, length_s, WheelSpeed),
+        lambda r, begin_s, length_s: measurement.intermittent(r, begin_s, length_s, WheelSpeed),
         60.0,
     ),
     # several at once
@@ -85,33 +85,33 @@ MORE: dict[str, Fault] = {
         60.0,
     ),
     "step_and_locked": _at_once(
-        _both(partial(measurement.step, north_m=50.0), measurement.wheels_locked), 10.0
+        _both(partial(measurement.position_step, north_m=50.0), measurement.wheels_locked), 10.0
     ),
     "step_and_gyro_bias": _silences(
-        _both(partial(measurement.step, north_m=50.0), imu.bias_step), 20.0
+        _both(partial(measurement.position_step, north_m=50.0), imu.bias_step), 20.0
     ),
     "no_fixes": _silences(
-        lambda r, begin_s, length_s: measurement.absent(
+        lambda r, begin_s, length_s: measurement.removed(
             r, begin_s, length_s, PositionFix, DelayedFix
         ),
         60.0,
     ),
     "no_wheels": _at_once(
-        lambda r, begin_s, length_s: measurement.absent(r, begin_s, length_s, WheelSpeed), 60.0
+        lambda r, begin_s, length_s: measurement.removed(r, begin_s, length_s, WheelSpeed), 60.0
     ),
-    "no_aids": _silences(measurement.absent, 60.0),
-    "no_aids_and_gyro_bias": _silences(_both(measurement.absent, imu.bias_step), 30.0),
+    "no_aids": _silences(measurement.removed, 60.0),
+    "no_aids_and_gyro_bias": _silences(_both(measurement.removed, imu.bias_step), 30.0),
     "no_aids_and_imu_noise": _silences(
-        _both(measurement.absent, partial(imu.noisy, times=10.0)), 30.0
+        _both(measurement.removed, partial(imu.noisy, times=10.0)), 30.0
     ),
     "no_fixes_and_slip": _at_once(
         _both(
-            lambda r, begin_s, length_s: measurement.absent(r, begin_s, length_s, PositionFix),
+            lambda r, begin_s, length_s: measurement.removed(r, begin_s, length_s, PositionFix),
             _slip,
         ),
         20.0,
     ),
-    "all_silent": _silences(_both(measurement.absent, imu.silent), 5.0),
+    "all_silent": _silences(_both(measurement.removed, imu.silent), 5.0),
 }
 
 EVERY = {**FAULTS, **MORE}

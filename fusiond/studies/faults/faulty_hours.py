@@ -22,6 +22,15 @@ from typing import Any
 
 import numpy as np
 
+from fusiond.studies.faults.error_sigma_score import (
+    LIE_S,
+    NAVIGATING,
+    Course,
+    Event,
+    Sample,
+    longest_lie_s,
+    row_figures,
+)
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.hours import (
     HOUR_S,
@@ -29,24 +38,15 @@ from fusiond.studies.faults.hours import (
     USUAL,
     Kind,
     beyond_s,
-    named,
+    event_name,
     resident_mb,
     stated_per_h,
-    tests_of,
+    tests_by_series,
 )
 from fusiond.studies.faults.library import TO_THE_END
-from fusiond.studies.faults.measurement_faults import sparing
+from fusiond.studies.faults.measurement_faults import except_source
 from fusiond.studies.faults.power import largest
 from fusiond.studies.faults.runs import navigate
-from fusiond.studies.faults.scoring import (
-    LIE_S,
-    NAVIGATING,
-    Course,
-    Event,
-    Sample,
-    judge,
-    longest_lie_s,
-)
 from fusiond.studies.faults.sensor_data import GNSS, SECOND, Recording, town
 
 APART_S = (180.0, 480.0)
@@ -62,7 +62,7 @@ NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class TimedFault:
     """Fault of the library from `begin_s` to `end_s`, on all receivers but one it may spare."""
 
     fault: str
@@ -75,7 +75,7 @@ class Happening:
         alter = EVERY[self.fault].alter
         assert alter is not None
         if self.spares is not None:
-            alter = sparing(alter, self.spares)
+            alter = except_source(alter, self.spares)
         return alter(whole, self.begin_s, self.end_s - self.begin_s)
 
 
@@ -90,7 +90,7 @@ def faults_of(kind: Kind) -> tuple[str, ...]:
     )
 
 
-def happenings(kind: Kind, seed: int, duration_s: float) -> list[Happening]:
+def timed_faults(kind: Kind, seed: int, duration_s: float) -> list[TimedFault]:
     """Faults of an hour, without the last; the last so long before the end as two are apart at
     least."""
     rng = np.random.default_rng([seed, 3])
@@ -102,18 +102,18 @@ def happenings(kind: Kind, seed: int, duration_s: float) -> list[Happening]:
         spares = (None, *RECEIVERS)[rng.integers(3)]
         length_s = drawn_s if fault.length_s == TO_THE_END else fault.length_s
         of_two = kind.drive.second and not fault.of_imu
-        found.append(Happening(name, begin_s, begin_s + length_s, spares if of_two else None))
+        found.append(TimedFault(name, begin_s, begin_s + length_s, spares if of_two else None))
     return found
 
 
 def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
-    """An hour of the kind that is the seed's turn: the figures of `judge` of each fault until the
-    next, and of the quiet what `hours.hour_of` has of an hour with nothing wrong."""
+    """Figures of an hour of the kind that is the seed's turn: `row_figures` of each fault until the
+    next, and those of `hours.hour_of` for the quiet between faults."""
     name = tuple(KINDS)[seed % len(KINDS)]
     kind = KINDS[name]
     config = kind.config()
     truth, recording = kind.recorded(config, seed, duration_s)
-    happened = happenings(kind, seed, duration_s)
+    happened = timed_faults(kind, seed, duration_s)
     for happening in happened:
         recording = happening.put_into(recording)
     course = navigate(config, recording, truth)
@@ -133,7 +133,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
 
     aligned = course.samples[modes.index(NAVIGATING) if NAVIGATING in modes else len(modes) :]
     samples = [s if calm(s.t_s) else replace(s, mode="", ratios=()) for s in aligned]
-    told = Counter(named(e.code, e.text) for e in course.events if alarms(e))
+    told = Counter(event_name(e.code, e.text) for e in course.events if alarms(e))
     ends = [*(h.begin_s for h in happened[1:]), duration_s]
     return {
         "kind": name,
@@ -147,8 +147,8 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "hours": sum(s.mode == NAVIGATING for s in samples) / 3600.0,
         "told": dict(told),
         "stated_per_h": stated_per_h(config),
-        "tests": tests_of(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
-        "judged": tests_of(
+        "tests": tests_by_series(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
+        "judged": tests_by_series(
             r for r in recording.received if quiet(r.seen_ns * 1e-9, SETTLED_S + JUDGED_S)
         ),
         "limits": kind.drive.second,
@@ -160,7 +160,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     }
 
 
-def _figures(course: Course, h: Happening, until_s: float) -> dict[str, Any]:
+def _figures(course: Course, h: TimedFault, until_s: float) -> dict[str, Any]:
     """Figures of a fault, as if the course ended before the next, compared with a course without a
     report."""
     before = [s.mode for s in course.samples if s.t_s < h.begin_s]
@@ -169,7 +169,7 @@ def _figures(course: Course, h: Happening, until_s: float) -> dict[str, Any]:
         e for e in course.events if h.begin_s <= e.t_s < until_s and e.code not in NOTHING_WRONG
     ]
     usual = Course([Sample(s.t_s, NAVIGATING) for s in samples], ())
-    found = judge(Course(samples, events), usual, h.begin_s, h.end_s)
+    found = row_figures(Course(samples, events), usual, h.begin_s, h.end_s)
     noticed_s = found.pop("noticed_s")
     in_time = noticed_s is not None and h.begin_s + noticed_s <= h.end_s + SETTLED_S
     return {

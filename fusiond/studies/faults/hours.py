@@ -40,9 +40,14 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.trajectories import Leg, Path, follow
+from fusiond.studies.faults.error_sigma_score import (
+    MOST_SIGMA,
+    NAVIGATING,
+    QUANTITIES,
+    longest_lie_s,
+)
 from fusiond.studies.faults.library import with_second, with_wheels
 from fusiond.studies.faults.runs import VEHICLE, navigate
-from fusiond.studies.faults.scoring import MOST_SIGMA, NAVIGATING, QUANTITIES, longest_lie_s
 from fusiond.studies.faults.sensor_data import (
     REST_S,
     TOWN_LEGS,
@@ -80,7 +85,7 @@ MOTORWAY_LEGS = (
 )
 
 
-def around(legs: tuple[Leg, ...], duration_s: float) -> Path:
+def circuit_legs(legs: tuple[Leg, ...], duration_s: float) -> Path:
     """Legs of the circuit, repeated."""
     rounds = int(duration_s / sum(leg.duration_s for leg in legs)) + 1
     return follow((Leg(REST_S), *legs * rounds), duration_s, course_deg=40.0, bank_ratio=-0.08)
@@ -88,7 +93,7 @@ def around(legs: tuple[Leg, ...], duration_s: float) -> Path:
 
 def around_town(duration_s: float) -> Path:
     """The town of the matrix."""
-    return around(TOWN_LEGS, duration_s)
+    return circuit_legs(TOWN_LEGS, duration_s)
 
 
 def on_motorway(duration_s: float) -> Path:
@@ -171,7 +176,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     course = navigate(config, recording, truth)
     since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
     told = Counter(
-        named(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
+        event_name(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
     )
     after = [s for s in course.samples if s.t_s > since_s]
     stated = [s.ratios for s in after if s.ratios]
@@ -181,7 +186,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "hours": duration_s / 3600.0,
         "told": dict(told),
         "stated_per_h": stated_per_h(config),
-        "tests": tests_of(recording.received),
+        "tests": tests_by_series(recording.received),
         "limits": kind.drive.second,
         "not_navigating_s": sum(s.mode != NAVIGATING for s in after),
         "beyond_s": beyond_s(stated),
@@ -211,14 +216,14 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
-def named(code: str, text: str) -> str:
+def event_name(code: str, text: str) -> str:
     """Name of an event with its source."""
     if code.startswith("verdict_"):
         return f"{code} {text.rpartition(' ')[2]}"
     return f"{code} {text.partition(' ')[0]}" if code == "isolated" else code
 
 
-def tests_of(received: Iterable[Received]) -> dict[str, int]:
+def tests_by_series(received: Iterable[Received]) -> dict[str, int]:
     """Innovations by series; those of constraints are not counted."""
     found: Counter[str] = Counter()
     for item in received:

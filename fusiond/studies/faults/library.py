@@ -160,47 +160,53 @@ _of_two = partial(Fault, drive=Drive(second=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
 _of_places = partial(_under_way, length_s=60.0, drive=Drive(places_alone=True))
-_carried_off = partial(measurement.carried_off, north_m_s=1.0)
+_carried_off = partial(measurement.spoofed_drift, north_m_s=1.0)
 
 FAULTS: dict[str, Fault] = {
     "none": Fault(),
     # fixes of the receiver
-    "step_500m": Fault(measurement.step, 20.0),
+    "step_500m": Fault(measurement.position_step, 20.0),
     "position_0n_0e": Fault(measurement.null_island, 20.0),
-    "fix_frozen": Fault(measurement.frozen, 20.0),
+    "fix_frozen": Fault(measurement.frozen_fix, 20.0),
     "velocity_reversed": Fault(measurement.velocity_reversed, 20.0),
     "velocity_1s_old": Fault(measurement.velocity_old, 60.0),
     "drift_0.1_m_s": Fault(partial(measurement.drift, north_m_s=0.1), 60.0, phases=UNDER_WAY),
     "drift_0.2_m_s": Fault(partial(measurement.drift, north_m_s=0.2), 60.0, phases=UNDER_WAY),
     "drift_0.5_m_s": Fault(measurement.drift, 60.0),
     # In an outage it is within what the outage leaves open: nobody can tell.
-    "step_2m_to_the_end": Fault(partial(measurement.step, north_m=2.0), phases=("navigating",)),
-    "step_10m_to_the_end": Fault(partial(measurement.step, north_m=10.0), phases=UNDER_WAY),
-    "step_500m_to_the_end": Fault(measurement.step, phases=UNDER_WAY),
+    "step_2m_to_the_end": Fault(
+        partial(measurement.position_step, north_m=2.0), phases=("navigating",)
+    ),
+    "step_10m_to_the_end": Fault(
+        partial(measurement.position_step, north_m=10.0), phases=UNDER_WAY
+    ),
+    "step_500m_to_the_end": Fault(measurement.position_step, phases=UNDER_WAY),
     "velocity_ramp_0.1_m_s2": Fault(measurement.velocity_ramp, 60.0),
     # In an outage a velocity is not known as well as that: nobody can tell.
-    "carried_off_0.5_m_s": Fault(measurement.carried_off, 60.0, phases=("navigating",)),
+    "carried_off_0.5_m_s": Fault(measurement.spoofed_drift, 60.0, phases=("navigating",)),
     # Of a receiver without velocities, which would tell.
     "places_drift_0.5_m_s": _of_places(measurement.drift),
     "places_drift_2_m_s": _of_places(partial(measurement.drift, north_m_s=2.0)),
-    "fixes_late_0.8s": Fault(measurement.late, phases=UNDER_WAY),
-    "fixes_always_late_0.8s": _from_start(measurement.late),
+    "fixes_late_0.8s": Fault(measurement.stamped_late, phases=UNDER_WAY),
+    "fixes_always_late_0.8s": _from_start(measurement.stamped_late),
     "false_burst_1khz": Fault(measurement.false_burst, 0.5),
     "sigma_1e-9": Fault(measurement.tiny_sigma, 20.0),
     "sigma_infinite": Fault(measurement.infinite_sigma, 1.0),
     "latitude_nan": Fault(measurement.nan_latitude, 1.0),
     "height_1e300": Fault(measurement.huge_height, 0.4),
     "speed_1e300": Fault(measurement.huge_speed, 0.4),
-    "speed_2000_knots": Fault(measurement.fast, 20.0),
+    "speed_2000_knots": Fault(measurement.impossible_speed, 20.0),
     "fixes_twice": Fault(measurement.repeated, 20.0),
     "fixes_from_future": Fault(measurement.from_future, 20.0),
     "multipath_tunnel_jump": _under_way(measurement.multipath_tunnel_jump, 60.6),
     "first_fixes_at_90s": _from_start(measurement.no_fix_yet, 90.0, drive=Drive(_smooth)),
     # fixes of two receivers
-    "one_of_two_drifts_0.5_m_s": _of_two(measurement.sparing(measurement.drift, SECOND), 60.0),
-    "two_step_500m": _of_two(measurement.step, 20.0),
-    "two_frozen": _of_two(measurement.frozen, 20.0),
-    "two_carried_off_0.5_m_s": _of_two(measurement.carried_off, 60.0, phases=("navigating",)),
+    "one_of_two_drifts_0.5_m_s": _of_two(
+        measurement.except_source(measurement.drift, SECOND), 60.0
+    ),
+    "two_step_500m": _of_two(measurement.position_step, 20.0),
+    "two_frozen": _of_two(measurement.frozen_fix, 20.0),
+    "two_carried_off_0.5_m_s": _of_two(measurement.spoofed_drift, 60.0, phases=("navigating",)),
     # The IMU and the wheels alone can say so.
     "carried_off_1_m_s_wheels": _under_way(_carried_off, 60.0, drive=Drive(wheels=True)),
     "two_carried_off_1_m_s_wheels": _under_way(

@@ -57,7 +57,7 @@ def _fixes(r: Recording, begin_s: float, end_s: float) -> list[Received]:
     ]
 
 
-def sparing(alter: Alter, source: str) -> Alter:
+def except_source(alter: Alter, source: str) -> Alter:
     """Change to a recording, except to that source."""
 
     def altered(r: Recording, begin_s: float, length_s: float) -> Recording:
@@ -82,7 +82,9 @@ def _north(fix: PositionFix, north_m: float) -> PositionFix:
     return replace(fix, lat_rad=_north_of(fix.lat_rad, fix.height_m, north_m))
 
 
-def step(r: Recording, begin_s: float, length_s: float, north_m: float = STEP_M) -> Recording:
+def position_step(
+    r: Recording, begin_s: float, length_s: float, north_m: float = STEP_M
+) -> Recording:
     """Positions too far to the north."""
     return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, north_m))
 
@@ -94,7 +96,7 @@ def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
     )
 
 
-def frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
+def frozen_fix(r: Recording, begin_s: float, length_s: float) -> Recording:
     """Repeat each receiver's first position and velocity of the window at new instants."""
     first: dict[str, PositionFix] = {}
 
@@ -123,7 +125,7 @@ def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIF
     )
 
 
-def carried_off(
+def spoofed_drift(
     r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S
 ) -> Recording:
     """Drift positions to the north with matching velocities, as a spoofed receiver's."""
@@ -169,7 +171,9 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _changed(r, begin_s, length_s, PositionFix, grown)
 
 
-def late(r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S) -> Recording:
+def stamped_late(
+    r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S
+) -> Recording:
     """Fixes that are older than their stamps.
 
     As of a line that is slow from its first byte on, and a receiver whose time nobody knows."""
@@ -253,7 +257,7 @@ def huge_speed(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _at_speed(r, begin_s, length_s, HUGE)
 
 
-def fast(r: Recording, begin_s: float, length_s: float) -> Recording:
+def impossible_speed(r: Recording, begin_s: float, length_s: float) -> Recording:
     """A velocity of 2,000 knots to the north."""
     return _at_speed(r, begin_s, length_s, FAST_M_S)
 
@@ -349,7 +353,7 @@ def wheels_delayed(r: Recording, begin_s: float, length_s: float, late_s: float)
     return r.with_received(received)
 
 
-def absent(r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]) -> Recording:
+def removed(r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]) -> Recording:
     """Remove the measurements of these kinds, or of all."""
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
     return r.with_received(
@@ -361,16 +365,16 @@ def absent(r: Recording, begin_s: float, length_s: float, *kinds: type[Measureme
     )
 
 
-def now_and_then(
+def intermittent(
     r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]
 ) -> Recording:
     """Remove these kinds for three seconds of each five."""
     for start_s in np.arange(begin_s, begin_s + length_s, 5.0).tolist():
-        r = absent(r, start_s, 3.0, *kinds)
+        r = removed(r, start_s, 3.0, *kinds)
     return r
 
 
-def scattered(r: Recording, begin_s: float, length_s: float, sd_m: float) -> Recording:
+def scattered_positions(r: Recording, begin_s: float, length_s: float, sd_m: float) -> Recording:
     """Scatter positions by `sd_m` to the north beyond their stated sigma."""
     rng = np.random.default_rng(0)
     return _changed(

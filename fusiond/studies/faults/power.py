@@ -19,9 +19,9 @@ from typing import Any
 from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
+from fusiond.studies.faults.error_sigma_score import LIE_S
 from fusiond.studies.faults.library import PHASES, Fault
 from fusiond.studies.faults.runs import run_fault
-from fusiond.studies.faults.scoring import LIE_S
 from fusiond.studies.faults.sensor_data import Alter, Drive
 
 LASTS_S = 60.0
@@ -43,7 +43,7 @@ SWEEPS: dict[str, Sweep] = {
     "position steps": Sweep(
         "m",
         (2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0),
-        lambda size: partial(measurement.step, north_m=size),
+        lambda size: partial(measurement.position_step, north_m=size),
     ),
     "position runs away": Sweep(
         "m/s",
@@ -55,7 +55,7 @@ SWEEPS: dict[str, Sweep] = {
         (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
         lambda size: partial(measurement.velocity_bias, north_m_s=size),
     ),
-    "fix is frozen": Sweep("", (1.0,), lambda _: measurement.frozen),
+    "fix is frozen": Sweep("", (1.0,), lambda _: measurement.frozen_fix),
     "stated sigma too small": Sweep(
         "times",
         (1.5, 2.0, 3.0, 5.0, 10.0, 30.0),
@@ -64,7 +64,7 @@ SWEEPS: dict[str, Sweep] = {
     "fixes late": Sweep(
         "s",
         (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 2.0, 3.0),
-        lambda size: partial(measurement.late, late_s=size),
+        lambda size: partial(measurement.stamped_late, late_s=size),
     ),
     "yaw gyro off": Sweep(
         "deg/s",

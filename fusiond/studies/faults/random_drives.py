@@ -21,12 +21,12 @@ RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 
 
 @lru_cache(maxsize=8)
-def drawn(number: int) -> Drive:
+def drive_of_number(number: int) -> Drive:
     """The drive of a number."""
-    return drawn_by(np.random.default_rng([2026, number]))
+    return random_drive(np.random.default_rng([2026, number]))
 
 
-def drawn_by(rng: np.random.Generator, duration_s: float = DURATION_S) -> Drive:
+def random_drive(rng: np.random.Generator, duration_s: float = DURATION_S) -> Drive:
     """The drive that a generator draws."""
     legs = _legs(rng, duration_s)
     course_deg, bank_ratio = rng.uniform(0.0, 360.0), rng.uniform(-0.1, 0.02)

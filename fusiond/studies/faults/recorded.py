@@ -38,10 +38,10 @@ from fusiond.offline.can_through_drivers import read_can_log
 from fusiond.offline.measurement_files import READERS, Arrival, source_of
 from fusiond.offline.process import process
 from fusiond.simulation.imu_truth import States
+from fusiond.studies.faults.error_sigma_score import QUANTITIES, Course, Sample, row_figures
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.library import Fault, PhaseName
-from fusiond.studies.faults.runs import VEHICLE, compared, driven
-from fusiond.studies.faults.scoring import QUANTITIES, Course, Sample, judge
+from fusiond.studies.faults.runs import VEHICLE, error_sample, run_navigator
 from fusiond.studies.faults.sensor_data import Received, Recording, town
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ def run_recorded(row: RecordedRow, place: Place) -> dict[str, Any]:
         "duration_s": part.duration_s,
         "begin_s": begin_s,
         "end_s": end_s,
-        **judge(course, reference, begin_s, end_s),
+        **row_figures(course, reference, begin_s, end_s),
     }
 
 
@@ -171,13 +171,13 @@ def _run(place: Place, part: _Part, fault: Fault, begin_s: float) -> Course:
     turned = replace(states, rpy=states.rpy + np.array([0.0, 0.0, fault.turned_rad]))
 
     def look(solution: Solution, row: int) -> Sample:
-        found = compared(solution, states, row, sd[row].tolist())
+        found = error_sample(solution, states, row, sd[row].tolist())
         if fault.turned_rad and solution.t_ns >= begin_s * 1e9:
-            other = compared(solution, turned, row, sd[row].tolist())
+            other = error_sample(solution, turned, row, sd[row].tolist())
             return min(found, other, key=lambda sample: sample.ratios[YAW : YAW + 1])
         return found
 
-    return driven(config, recording, part.duration_s, look)
+    return run_navigator(config, recording, part.duration_s, look)
 
 
 def _cut(r: Recording, from_s: float, length_s: float) -> Recording:

@@ -29,12 +29,12 @@ from fusiond.files.measurement_csv import TrajectoryTable, read_imu, read_truth
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.measurement_files import READERS
 from fusiond.simulation.imu_truth import States
-from fusiond.studies.faults.hours import USUAL, named
+from fusiond.studies.faults.hours import USUAL, event_name
 from fusiond.studies.faults.recorded import FUSED
 from fusiond.studies.faults.runs import TICKS_PER_S
 from fusiond.studies.faults.sensor_data import Received, Recording
 from fusiond.studies.faults.sigma_sharpness import moments
-from fusiond.studies.faults.solution_errors import AXES, STEP_S, Bools, against, longest_s
+from fusiond.studies.faults.solution_errors import AXES, STEP_S, Bools, errors_against, longest_s
 
 Array = NDArray[np.float64]
 
@@ -142,14 +142,14 @@ def real_run(job: RealJob) -> dict[str, Any]:
         recording = recording.withheld(at_s, at_s + length_s)
     states, sd, near = _at_ticks(reference, begin_s, float(whole.imu_seen[-1]) * 1e-9)
     own = _Own()
-    run = against(config, recording, states, sd, own.watch)
+    run = errors_against(config, recording, states, sd, own.watch)
     held = np.zeros_like(near)
     for at_s, length_s in windows:
         held |= (states.t_s >= at_s) & (states.t_s < at_s + length_s)
     since = run.t_s >= run.t_s[int(np.argmax(run.navigating))]
     first_s = float(run.t_s[since][0])
     told = Counter(
-        named(e.code, e.text) for e in run.events if e.t_s > first_s and e.code not in USUAL
+        event_name(e.code, e.text) for e in run.events if e.t_s > first_s and e.code not in USUAL
     )
     compared = near & run.there & (held if windows else np.full_like(held, drive.truth is not None))
     return {

@@ -21,6 +21,7 @@ from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
+from fusiond.studies.faults.error_sigma_score import Course, Event, Sample, axis_ratio, row_figures
 from fusiond.studies.faults.library import (
     FAULTS,
     PHASES,
@@ -30,8 +31,7 @@ from fusiond.studies.faults.library import (
     with_spare,
     with_wheels,
 )
-from fusiond.studies.faults.random_drives import drawn
-from fusiond.studies.faults.scoring import Course, Event, Sample, axis_ratio, judge
+from fusiond.studies.faults.random_drives import drive_of_number
 from fusiond.studies.faults.sensor_data import DURATION_S, Drive, Recording, town
 
 Array = NDArray[np.float64]
@@ -82,21 +82,21 @@ def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
 
 
 def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
-    """The figures of a row; the same seed gives the same. `drive` as of `placed`."""
+    """The figures of a row; the same seed gives the same. `drive` as of `on_random_drive`."""
     return {
         "fault": row.fault,
         "phase": row.phase,
-        **run_fault(placed(FAULTS[row.fault], drive), row.phase, seed),
+        **run_fault(on_random_drive(FAULTS[row.fault], drive), row.phase, seed),
     }
 
 
-def placed(fault: Fault, drive: int | None) -> Fault:
+def on_random_drive(fault: Fault, drive: int | None) -> Fault:
     """Fault on the drawn drive of that number instead of the town, if it can occur there."""
     if drive is None or fault.drive.path is not town:
         return fault
     own = fault.drive
     found = replace(
-        drawn(drive),
+        drive_of_number(drive),
         wheels=own.wheels,
         spare=own.spare,
         second=own.second,
@@ -111,17 +111,17 @@ def run_fault(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
     harmless = fault.alter is None and fault.configure is None
     end_s = begin_s if harmless else min(begin_s + fault.length_s, DURATION_S)
     reference = _unharmed(fault.drive, phase, seed)
-    course = reference if harmless else course_of(fault, phase, seed)
-    return {"begin_s": begin_s, "end_s": end_s, **judge(course, reference, begin_s, end_s)}
+    course = reference if harmless else run_course(fault, phase, seed)
+    return {"begin_s": begin_s, "end_s": end_s, **row_figures(course, reference, begin_s, end_s)}
 
 
 @lru_cache(maxsize=8)
 def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
     """Result of the same drive without a fault."""
-    return course_of(Fault(drive=drive), phase, seed)
+    return run_course(Fault(drive=drive), phase, seed)
 
 
-def course_of(fault: Fault, phase: PhaseName, seed: int) -> Course:
+def run_course(fault: Fault, phase: PhaseName, seed: int) -> Course:
     """Result of a fault in a phase."""
     vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
     if fault.drive.spare:
@@ -150,12 +150,12 @@ def navigate(
     track = truth.at(np.arange(1.0, truth.duration_s + 0.5))
 
     def look(solution: Solution, row: int) -> Sample:
-        return compared(solution, track, row)
+        return error_sample(solution, track, row)
 
-    return driven(config, recording, truth.duration_s, look, watch)
+    return run_navigator(config, recording, truth.duration_s, look, watch)
 
 
-def driven(
+def run_navigator(
     config: Config,
     recording: Recording,
     duration_s: float,
@@ -236,7 +236,7 @@ def _said(source: str, r: Recording) -> list[ImuSample]:
     ]
 
 
-def compared(
+def error_sample(
     solution: Solution, true: States, row: int = 0, true_sd: Sequence[float] = (0.0,) * 9
 ) -> Sample:
     """Compare a solution with that row of true states, known to `true_sd` (m, m/s, rad)."""

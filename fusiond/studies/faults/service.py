@@ -28,7 +28,9 @@ from drivers.measurements import PositionFix
 from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
-from fusiond.studies.faults.scenes import (
+from fusiond.studies.faults.error_sigma_score import LIE_S
+from fusiond.studies.faults.sensor_data import Alter, Received, Recording
+from fusiond.studies.faults.sharpness_service_drives import (
     CODE,
     RTK,
     SHARING,
@@ -36,11 +38,9 @@ from fusiond.studies.faults.scenes import (
     Scene,
     Share,
     Vehicle,
-    drawing,
+    part_generator,
     scene,
 )
-from fusiond.studies.faults.scoring import LIE_S
-from fusiond.studies.faults.sensor_data import Alter, Received, Recording
 from fusiond.studies.faults.solution_errors import (
     AXES,
     JUDGED,
@@ -49,7 +49,7 @@ from fusiond.studies.faults.solution_errors import (
     Published,
     lasting_from,
     longest_s,
-    published,
+    published_errors,
 )
 
 BEGINS_S = (150.0, 270.0)
@@ -66,7 +66,7 @@ OUTAGE_DURATION_S = 600.0
 IMU, VELOCITY, POSITION, NONE = "IMU", "velocity", "position, latency, freeze", "nothing wrong"
 
 
-def old(r: Recording, begin_s: float, length_s: float, age_s: float) -> Recording:
+def stale_fixes(r: Recording, begin_s: float, length_s: float, age_s: float) -> Recording:
     """Replace fixes by positions of `age_s` before, with present stamps."""
     fixes = [item for item in r.received if isinstance(item.measurement, PositionFix)]
     t_ns = np.array([item.t_ns for item in fixes])
@@ -98,9 +98,9 @@ FAULTS: dict[str, tuple[str, Alter]] = {
     "roll gyro off by 0.3 deg/s": (IMU, _gyro(0.3, 0)),
     "forward force off by 0.5 m/s^2": (IMU, _force(0.5, 3)),
     "sideways force off by 0.5 m/s^2": (IMU, _force(0.5, 4)),
-    "position off by 2 m": (POSITION, partial(measurement.step, north_m=2.0)),
-    "position off by 10 m": (POSITION, partial(measurement.step, north_m=10.0)),
-    "position off by 500 m": (POSITION, partial(measurement.step, north_m=500.0)),
+    "position off by 2 m": (POSITION, partial(measurement.position_step, north_m=2.0)),
+    "position off by 10 m": (POSITION, partial(measurement.position_step, north_m=10.0)),
+    "position off by 500 m": (POSITION, partial(measurement.position_step, north_m=500.0)),
     "position runs away, 0.1 m/s": (POSITION, partial(measurement.drift, north_m_s=0.1)),
     "position runs away, 0.2 m/s": (POSITION, partial(measurement.drift, north_m_s=0.2)),
     "position runs away, 0.5 m/s": (POSITION, partial(measurement.drift, north_m_s=0.5)),
@@ -108,9 +108,9 @@ FAULTS: dict[str, tuple[str, Alter]] = {
     "velocity off by 0.5 m/s": (VELOCITY, partial(measurement.velocity_bias, north_m_s=0.5)),
     "velocity off by 2 m/s": (VELOCITY, partial(measurement.velocity_bias, north_m_s=2.0)),
     "velocity runs away, 0.1 m/s^2": (VELOCITY, measurement.velocity_ramp),
-    "fixes 1 s late": (POSITION, partial(old, age_s=1.0)),
-    "fixes 3 s late": (POSITION, partial(old, age_s=3.0)),
-    "fixes frozen": (POSITION, measurement.frozen),
+    "fixes 1 s late": (POSITION, partial(stale_fixes, age_s=1.0)),
+    "fixes 3 s late": (POSITION, partial(stale_fixes, age_s=3.0)),
+    "fixes frozen": (POSITION, measurement.frozen_fix),
     "velocity reversed": (VELOCITY, measurement.velocity_reversed),
 }
 """Group and alteration of each. Of receivers to the north."""
@@ -147,11 +147,11 @@ def service_run(job: Job, share: Share) -> dict[str, Any]:
         return _outages(job, share)
     group, alter = FAULTS[job.fault] if job.fault else (NONE, None)
     on, steady = _steady(RECEIVERS[job.receiver], job.number, share, DURATION_S)
-    draws = drawing(share, job.number, 4, ["", *FAULTS].index(job.fault))
+    draws = part_generator(share, job.number, 4, ["", *FAULTS].index(job.fault))
     begin_s = round(float(draws.uniform(*BEGINS_S)), 1)
     run = steady
     if alter is not None:
-        run = published(on.config, alter(on.recording, begin_s, LASTS_S), on.truth)
+        run = published_errors(on.config, alter(on.recording, begin_s, LASTS_S), on.truth)
     return {
         "part": "fault",
         "drive": job.number,
@@ -170,7 +170,7 @@ def _steady(
     """Drive, and its published solution without a fault."""
     vehicle = Vehicle("data sheet", receiver, told="noise")
     on = scene(vehicle, share, number, duration_s)
-    return on, published(on.config, on.recording, on.truth)
+    return on, published_errors(on.config, on.recording, on.truth)
 
 
 def figures(run: Published, steady: Published, begin_s: float, end_s: float) -> dict[str, Any]:
@@ -223,7 +223,7 @@ def _outages(job: Job, share: Share) -> dict[str, Any]:
     recording = on.recording
     for begin_s, length_s in OUTAGES_S.items():
         recording = recording.withheld(begin_s, begin_s + length_s)
-    run = published(on.config, recording, on.truth)
+    run = published_errors(on.config, recording, on.truth)
     found = []
     for begin_s, length_s in OUTAGES_S.items():
         end_s = begin_s + length_s

@@ -9,7 +9,7 @@ from typing import Any
 
 from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.recorded_fault_free import PHASE as COMPARED
-from fusiond.studies.faults.sigma_sharpness import PHASES, figures, outside
+from fusiond.studies.faults.sigma_sharpness import PHASES, figures, nees_class
 from fusiond.studies.faults.solution_errors import AXES
 
 Row = dict[str, Any]
@@ -93,7 +93,7 @@ def _entry(nees: float, half: float, ratio: float) -> str:
         return "-"
     text = f"{nees:.2f}"
     mark = {"right": text, "perhaps": f"{text}?", "outside": f"**{text}**"}
-    return f"{mark[outside(nees, half)]} ({ratio:.2f})"
+    return f"{mark[nees_class(nees, half)]} ({ratio:.2f})"
 
 
 def _counts(found: Rows) -> list[tuple[str, ...]]:
@@ -105,7 +105,7 @@ def _counts(found: Rows) -> list[tuple[str, ...]]:
             columns = []
             for quantity in AXES:
                 numbers = [figures(rows, phase, quantity)[:2] for rows in cells]
-                count = Counter(outside(*each) for each in numbers if not math.isnan(each[0]))
+                count = Counter(nees_class(*each) for each in numbers if not math.isnan(each[0]))
                 columns.append(f"{count['right']}, {count['perhaps']}, {count['outside']}")
             if cells:
                 lines.append((name, phase, *columns))

@@ -29,7 +29,8 @@ import numpy as np
 from scipy.stats import t
 
 from fusiond.configuration.sensor_class import CLASSES
-from fusiond.studies.faults.scenes import (
+from fusiond.studies.faults.sensor_data import Recording
+from fusiond.studies.faults.sharpness_service_drives import (
     CODE,
     RTK,
     SHARING,
@@ -38,14 +39,13 @@ from fusiond.studies.faults.scenes import (
     Vehicle,
     scene,
 )
-from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.solution_errors import (
     AXES,
     STEP_S,
     Bools,
     Published,
     longest_s,
-    published,
+    published_errors,
 )
 
 DURATION_S = 420.0
@@ -99,10 +99,10 @@ def sharpness_run(job: tuple[int, int], share: Share) -> dict[str, Any]:
     recording = on.recording
     for begin_s, length_s in OUTAGES_S.items():
         recording = recording.withheld(begin_s, begin_s + length_s)
-    run = published(on.config, recording, on.truth)
+    run = published_errors(on.config, recording, on.truth)
     return {
         "cell": cell,
-        **described(vehicle),
+        **cell_name(vehicle),
         "drive": drive,
         "phases": {name: moments(run, where) for name, where in phases_of(run, recording).items()},
         "not_navigating_s": {
@@ -114,7 +114,7 @@ def sharpness_run(job: tuple[int, int], share: Share) -> dict[str, Any]:
     }
 
 
-def described(vehicle: Vehicle) -> dict[str, Any]:
+def cell_name(vehicle: Vehicle) -> dict[str, Any]:
     """A cell by name."""
     return {
         "imu": vehicle.sensor,
@@ -176,8 +176,8 @@ def figures(rows: Iterable[Mapping[str, Any]], phase: str, name: str) -> tuple[f
     return float(np.mean(nees)), half, math.sqrt(sigma2 / error2)
 
 
-def outside(nees: float, half: float) -> str:
-    """Class of a NEES: `right`; `outside` of `RIGHT` with its whole interval; or `perhaps`."""
+def nees_class(nees: float, half: float) -> str:
+    """Class of a NEES: `right`; `nees_class` of `RIGHT` with its whole interval; or `perhaps`."""
     low, high = RIGHT
     if low <= nees <= high:
         return "right"

@@ -19,8 +19,8 @@ from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
-from fusiond.studies.faults.runs import TICKS_PER_S, driven
-from fusiond.studies.faults.scoring import MOST_SIGMA, NAVIGATING, Event, Sample
+from fusiond.studies.faults.error_sigma_score import MOST_SIGMA, NAVIGATING, Event, Sample
+from fusiond.studies.faults.runs import TICKS_PER_S, run_navigator
 from fusiond.studies.faults.sensor_data import Recording
 
 Array = NDArray[np.float64]
@@ -101,13 +101,13 @@ class Published:
         return found
 
 
-def published(config: Config, recording: Recording, truth: Truth) -> Published:
+def published_errors(config: Config, recording: Recording, truth: Truth) -> Published:
     """Published solution of a recording, against the truth."""
     ticks = np.arange(1.0, math.floor(truth.duration_s * TICKS_PER_S + 1e-6) + 0.5)
-    return against(config, recording, truth.at(ticks * STEP_S))
+    return errors_against(config, recording, truth.at(ticks * STEP_S))
 
 
-def against(
+def errors_against(
     config: Config,
     recording: Recording,
     true: States,
@@ -128,7 +128,7 @@ def against(
         )
         return Sample(solution.t_ns * 1e-9, str(solution.mode))
 
-    course = driven(config, recording, n * STEP_S, look, watch, every_ticks=1)
+    course = run_navigator(config, recording, n * STEP_S, look, watch, every_ticks=1)
     unit = metres_to_geodetic(true.position[:, 0], true.position[:, 2], np.ones((n, 3)))
     apart = rows[:, :3] - true.position
     apart[:, 1] = _wrapped(apart[:, 1])

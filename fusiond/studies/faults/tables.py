@@ -70,11 +70,13 @@ SLOW_S = 60.0
 """Longest recovery from a fault that is over."""
 
 
-def recorded(found: Rows) -> str:
+def recorded_table(found: Rows) -> str:
     """Table with a line for each fault, phase and instant that lied, lasted over a minute beyond
     its end, or ended the navigator; and the count of each verdict."""
     named = [{**row, "fault": f"{row['fault']}, at {row['at_s']:g} s"} for row in found]
-    return matrix([row for row in named if _failed(row)]).rpartition("\n\n")[0] + _count(found)
+    return matrix_table([row for row in named if _failed(row)]).rpartition("\n\n")[0] + _count(
+        found
+    )
 
 
 def _failed(row: Mapping[str, Any]) -> bool:
@@ -83,7 +85,7 @@ def _failed(row: Mapping[str, Any]) -> bool:
     return row["verdict"] in {"crashed", "lie"} or (late and over)
 
 
-def matrix(found: Rows) -> str:
+def matrix_table(found: Rows) -> str:
     """A line a row, and the count of each verdict."""
     lines = []
     for row in found:
@@ -118,7 +120,7 @@ def _count(found: Rows) -> str:
     return f"\n\n{len(found)} rows: {counted}.\n"
 
 
-def power(found: Rows) -> str:
+def power_table(found: Rows) -> str:
     """A line a kind and size of fault."""
     lines = [
         (
@@ -137,7 +139,7 @@ def power(found: Rows) -> str:
     return table(POWER, lines) + "\n"
 
 
-def alarms(found: Rows) -> str:
+def alarm_table(found: Rows) -> str:
     """Table with a line a vehicle and alarm, and the time of errors beyond five sigma."""
     hours = sum(row["hours"] for row in found)
     other_s = sum(row["not_navigating_s"] for row in found)
@@ -147,7 +149,7 @@ def alarms(found: Rows) -> str:
     )
 
 
-def faulty(found: Rows) -> str:
+def fault_table(found: Rows) -> str:
     """Table with a line a fault, the alarms of the quiet between faults, and the errors in it."""
     lines = [
         (
@@ -203,7 +205,7 @@ def _beyond(found: Rows) -> str:
     return f"Beyond five sigma in any mode: {counted}; at most {lie_s:g} s together."
 
 
-def bounds(found: Rows) -> str:
+def bounds_table(found: Rows) -> str:
     """A line a fault and receiver or phase: of its runs each, but the longest lie, in order."""
     lines = []
     for key in dict.fromkeys((row["fault"], row["where"]) for row in found):
@@ -221,19 +223,19 @@ def bounds(found: Rows) -> str:
 
 
 TABLES: Mapping[str, Callable[[Rows], str]] = {
-    "matrix": matrix,
-    "power": power,
-    "alarms": alarms,
-    "faulty": faulty,
-    "recorded": recorded,
+    "matrix": matrix_table,
+    "power": power_table,
+    "alarms": alarm_table,
+    "faulty": fault_table,
+    "recorded": recorded_table,
     "service": service,
     "sharpness": sharpness,
-    "bounds": bounds,
+    "bounds": bounds_table,
     "real": real,
 }
 
 
-def put_into(page: Path, kind: str, text: str) -> None:
+def replace_table(page: Path, kind: str, text: str) -> None:
     """Replace the text between the marks of `kind` in a page; ValueError without them."""
     begin, end = f"<!-- {kind}: written by --page -->\n", f"<!-- end of {kind} -->"
     before, found, rest = page.read_text().partition(begin)

@@ -36,10 +36,10 @@ from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
-from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.daemon_fed_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import map_runs
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
-from fusiond.studies.undiagnosed_timeline import Trusting
+from fusiond.studies.timeline_without_diagnosis import WithoutDiagnosis
 
 Array = NDArray[np.float64]
 FaultKind = Literal["", "step", "drift", "frozen"]
@@ -186,7 +186,7 @@ def _run(
     imu = ImuBuffer(rate, HISTORY_S, np.eye(3), 0.0, STUDY_IMU.gap_s)
     timeline = Timeline(estimator, imu, HISTORY_S, CHECKPOINT_S)
     if not filter_.isolates:
-        timeline.diagnosis = Trusting()
+        timeline.diagnosis = WithoutDiagnosis()
     p = np.diag(initial_sd(model) ** 2)
     estimator.initialise(0, 0, start, np.zeros(model.size), p)
     timeline.start()
@@ -228,4 +228,4 @@ def monte_carlo(
     progress: Callable[[], None] | None = None,
 ) -> list[dict[str, Trace]]:
     """Runs in order; on two processes when there are enough of them."""
-    return on_processes(partial(simulate, filters, fault, sd_m, seed), runs, progress)
+    return map_runs(partial(simulate, filters, fault, sd_m, seed), runs, progress)

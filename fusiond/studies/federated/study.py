@@ -1,7 +1,7 @@
 r"""Study `federated`: the four experiments of paper 004, and faults in one of three local filters.
 
 Experiments: `fusiond.studies.federated.linear_experiments` (1 to 3),
-`fusiond.studies.federated.platform` (4, with an inertial unit),
+`fusiond.studies.federated.experiment_4` (4, with an inertial unit),
 `fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has them).
 Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its
 start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.studies.federated import linear_experiments, platform, without_imu
+from fusiond.studies.federated import experiment_4, linear_experiments, without_imu
 from fusiond.studies.federated.runs import (
     DRIFT_M_S,
     DURATION_S,
@@ -39,7 +39,7 @@ from fusiond.studies.federated.runs import (
     monte_carlo,
 )
 from fusiond.studies.figure_file import save_figure
-from fusiond.studies.monte_carlo import Progress, nees_interval, on_processes, step_counter
+from fusiond.studies.monte_carlo import Progress, map_runs, nees_interval, step_counter
 
 Array = NDArray[np.float64]
 
@@ -89,13 +89,13 @@ def run_study(
             "1_random_truth": linear_experiments.random_truth(count, seed),
             "2_constant_truth": linear_experiments.constant_truth(count, seed),
             "3_two_sensors": linear_experiments.two_sensors(count, seed),
-            "4_active_and_passive": platform.platform(
-                on_processes(partial(platform.simulate, seed), count, step)
+            "4_active_and_passive": experiment_4.experiment_4(
+                map_runs(partial(experiment_4.simulate, seed), count, step)
             ),
         },
         "without_imu": {
             name: without_imu.result(
-                on_processes(partial(without_imu.simulate, name, seed), count, step)
+                map_runs(partial(without_imu.simulate, name, seed), count, step)
             )
             for name in without_imu.EXPERIMENTS
         },

@@ -26,7 +26,7 @@ from fusiond.configuration.schema import Config
 from fusiond.estimators.federated.fusion import fuse_uncorrelated
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import metres_to_geodetic
-from fusiond.studies.federated.platform import (
+from fusiond.studies.federated.experiment_4 import (
     ACTIVE_DELAY_S,
     ACTIVE_EVERY_S,
     CLASS_M,
@@ -136,7 +136,7 @@ def arrivals(name: str, rng: np.random.Generator) -> tuple[list[Measurement], di
             error *= PASSIVE_SD_M
         true = truth().at(t_s).position
         at = true + metres_to_geodetic(true[:, 0], true[:, 2], error)
-        rows[source] = np.column_stack([t_s, way(at), error[:, :2]])
+        rows[source] = np.column_stack([t_s, true_path(at), error[:, :2]])
         for t, p in zip(t_s, at, strict=True):
             found.append(_fix(source, active, round(t * 1e9), p))
     return sorted(found, key=lambda m: m.t_seen_ns), rows
@@ -152,7 +152,7 @@ def _fix(source: str, active: bool, t_ns: int, position: Array) -> Measurement:
     return PositionFix(source, seen, stamp, lat, lon, height, sd_ned_m=PASSIVE_SD_M)
 
 
-def way(positions: Array) -> Array:
+def true_path(positions: Array) -> Array:
     """Metres north and east (n, 2) of the start."""
     lat, lon, height = truth().at(np.zeros(1)).position[0]
     unit = metres_to_geodetic(np.array([lat]), np.array([height]), np.ones((1, 3)))[0]
@@ -184,7 +184,7 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
         e = navigator.active_filter
         errors.append(nav_error(e.nav, true[k])[COUNTED])
         covariances.append(e.covariance[np.ix_(COUNTED, COUNTED)])
-        places.append(way(e.nav[None, :3])[0])
+        places.append(true_path(e.nav[None, :3])[0])
     return Course(np.array(errors), np.array(covariances), np.array(places))
 
 
@@ -253,7 +253,7 @@ def _rms(values: list[Array]) -> float:
 @lru_cache(maxsize=1)
 def _true_way() -> Array:
     t_s = np.arange(COUNTED_FROM_S, DURATION_S, 1.0)
-    return way(truth().at(t_s).position)
+    return true_path(truth().at(t_s).position)
 
 
 def _series(run: Run) -> dict[str, Any]:

@@ -48,8 +48,8 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
-from fusiond.studies.monte_carlo import on_processes
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.monte_carlo import map_runs
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -144,7 +144,7 @@ def epochs() -> tuple[Array, Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class RunErrors:
     """Errors of one run: IMU buffer, gyro drift (k, 3) at the epochs, measurements by epoch,
     start."""
 
@@ -156,14 +156,14 @@ class Drawn:
     sd: Array
 
 
-def draw(case: Case, seed: int, number: int) -> Drawn:
+def draw(case: Case, seed: int, number: int) -> RunErrors:
     """Draw run `number`."""
     rng = np.random.default_rng([seed, number])
     imu = flown_imu(case)
     flown = truth()
     out = imu_output(imu, flown.gyro, flown.accel, rng)
     t_s, true, rpy = epochs()
-    to_metres = metres(ORIGIN_DEG_M[0] * DEG, ORIGIN_DEG_M[2])
+    to_metres = metres_per_unit(ORIGIN_DEG_M[0] * DEG, ORIGIN_DEG_M[2])
     times = np.rint(flown.t_s[1:] * 1e9).astype(np.int64)
     buffer = ImuBuffer(RATE_HZ, DURATION_S + 10.0, np.eye(3), 0.0, IMU.gap_s)
     buffer.append(times, np.hstack([out.gyro, out.accel]))
@@ -194,7 +194,7 @@ def draw(case: Case, seed: int, number: int) -> Drawn:
     first = true_nav(flown, np.zeros(1))[0]
     start = with_error(first, rng.standard_normal(9) * sigma[:9])
     drift = out.gyro_bias[np.rint(t_s * RATE_HZ).astype(int) - 1]
-    return Drawn(buffer, drift, measurements, model, start, sigma)
+    return RunErrors(buffer, drift, measurements, model, start, sigma)
 
 
 def flown_imu(case: Case) -> Imu:
@@ -202,7 +202,7 @@ def flown_imu(case: Case) -> Imu:
     return IMU.model_copy(update={"accel_bias_initial_mg": case.accel_bias_mg})
 
 
-def begin(drawn: Drawn, make: Callable[[Model], Estimator]) -> Estimator:
+def begin(drawn: RunErrors, make: Callable[[Model], Estimator]) -> Estimator:
     """A filter at the start of a run."""
     estimator = make(drawn.model)
     parameters = np.zeros(drawn.model.size)
@@ -210,7 +210,7 @@ def begin(drawn: Drawn, make: Callable[[Model], Estimator]) -> Estimator:
     return estimator
 
 
-def fly(drawn: Drawn, make: Callable[[Model], Estimator]) -> Trace:
+def fly(drawn: RunErrors, make: Callable[[Model], Estimator]) -> Trace:
     """Run one filter through one run's data."""
     estimator = begin(drawn, make)
     _, true, _ = epochs()
@@ -240,11 +240,11 @@ def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """Runs of a case in order; on two processes when there are enough of them."""
-    return on_processes(partial(simulate, case, seed), runs, progress)
+    return map_runs(partial(simulate, case, seed), runs, progress)
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class StepTimes:
     """Processor time of a second, us: the median, least of some repeats, and as table 2 of the
     paper has it (mean, max, min, variance) over the seconds of the repeat of that median."""
 
@@ -252,11 +252,11 @@ class Spent:
     spread: dict[str, float]
 
 
-def times_per_step_us(case: Case, seed: int) -> dict[str, Spent]:
+def times_per_step_us(case: Case, seed: int) -> dict[str, StepTimes]:
     """Processor time of one second by filter: its IMU samples propagated, its measurements fused.
     The filters take turns, so that what else runs falls on all of them."""
     drawn = draw(case, seed, 0)
-    best: dict[str, Spent] = {}
+    best: dict[str, StepTimes] = {}
     for _ in range(TIMED_REPEATS):
         for name, make in filters().items():
             estimator, spent = begin(drawn, make), []
@@ -275,5 +275,5 @@ def times_per_step_us(case: Case, seed: int) -> dict[str, Spent]:
                     "min": float(counted.min()),
                     "variance": float(counted.var()),
                 }
-                best[name] = Spent(median, spread)
+                best[name] = StepTimes(median, spread)
     return best

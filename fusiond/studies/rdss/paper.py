@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fusiond.studies.navigation_error import metres
+from fusiond.studies.navigation_error import metres_per_unit
 from fusiond.studies.rdss.runs import RDSS_ALONE, YANTAI_DEG_M, Array, Case, Trace, grid
 
 SHOWN = "optimal_prediction"
@@ -21,7 +21,7 @@ INS = "ins_alone"
 def first_run(case: Case, traces: dict[str, Trace]) -> dict[str, Any]:
     """Position errors, innovations by step, and tracks of one run, for the figures."""
     t_s, true = grid(case)
-    scale = metres(float(true[0, 0]), YANTAI_DEG_M[2])[:2]
+    scale = metres_per_unit(float(true[0, 0]), YANTAI_DEG_M[2])[:2]
     way = (true[:, :2] - true[0, :2]) * scale
     return {
         "t_s": t_s.tolist(),

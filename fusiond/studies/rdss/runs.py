@@ -40,9 +40,9 @@ from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Path as Trajectory
-from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
-from fusiond.studies.monte_carlo import on_processes
-from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from fusiond.studies.daemon_fed_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import map_runs
+from fusiond.studies.navigation_error import metres_per_unit, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -300,7 +300,7 @@ def simulate(case: Case, seed: int, number: int) -> dict[str, Trace]:
     fixes = draw_fixes(case, rng)
     sd = initial_sd(case, make_model("planar15", imu_noise(case.imu)))
     error = rng.standard_normal(9) * sd[:9]
-    to_metres = metres(float(true[0, 0]), YANTAI_DEG_M[2])[:2]
+    to_metres = metres_per_unit(float(true[0, 0]), YANTAI_DEG_M[2])[:2]
     traces = {}
     for f in case.filters:
         run = Navigation(case, f, samples, error)
@@ -345,4 +345,4 @@ def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """Runs of a case in order; on two processes when there are enough of them."""
-    return on_processes(partial(simulate, case, seed), runs, progress)
+    return map_runs(partial(simulate, case, seed), runs, progress)

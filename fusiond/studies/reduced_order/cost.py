@@ -32,7 +32,7 @@ from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, WIDTHS, coefficients
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.studies.reduced_order import flight
-from fusiond.studies.reduced_order.runs import started
+from fusiond.studies.reduced_order.runs import started_filter
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -139,7 +139,7 @@ def _live_second(of: Model, all_in_view: bool) -> Callable[[], float]:
     ]
 
     def timed() -> float:
-        estimator = started(of, nav[0])
+        estimator = started_filter(of, nav[0])
         start = time.process_time_ns()
         for measurements in given:
             estimator.propagate(buffer, measurements[0].t_ns)

@@ -98,7 +98,7 @@ def azimuth_ratio(of_17_arcsec: float, of_23_arcsec: float) -> float:
     return half + math.sqrt(half**2 - 1.0)
 
 
-def found(
+def implied_sigmas(
     models: dict[str, Model], systems: dict[str, list[System]], kept: NDArray[np.int64]
 ) -> dict[str, Any]:
     """One sigma at the end of the flight with the implied noises, of 23 and of 17 states, and of 23

@@ -25,11 +25,11 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.sensor_errors import imu_output
-from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
-from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.daemon_fed_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import map_runs
 from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.reduced_order import flight
-from fusiond.studies.undiagnosed_timeline import Trusting
+from fusiond.studies.timeline_without_diagnosis import WithoutDiagnosis
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def combinations(of: Model) -> Array:
 
 
 @dataclass(slots=True)
-class Flown:
+class FilterRun:
     """Result of one filter in one run: error (k, 20) and its covariance in the filter (k, 20,
     20)."""
 
@@ -62,7 +62,7 @@ def fly(
     all_in_view: bool,
     seed: int,
     number: int,
-) -> dict[str, Flown]:
+) -> dict[str, FilterRun]:
     """Run `number`: every filter on the same errors, taken every `every_s` seconds.
 
     The first of `models` describes the truth. With `all_in_view` a run has the same IMU, clock,
@@ -86,12 +86,12 @@ def fly(
             true = State(nav[k + 1], xi, np.zeros(STEP_SIZE), true_model)
             yield flight.measured(scene, true, scene.noise(noise[k]))
 
-    filters = {name: started(of, with_error(nav[0], start)) for name, of in models.items()}
+    filters = {name: started_filter(of, with_error(nav[0], start)) for name, of in models.items()}
     true = np.zeros(len(combinations(true_model)))
     errors: dict[str, list[Array]] = {name: [] for name in models}
     beliefs: dict[str, list[Array]] = {name: [] for name in models}
     project = {name: combinations(of) for name, of in models.items()}
-    for second in live(filters.values(), np.hstack([imu.gyro, imu.accel]), given()):
+    for second in fly_on_timeline(filters.values(), np.hstack([imu.gyro, imu.accel]), given()):
         if second % every_s:
             continue
         sample = round(second * flight.IMU.rate_hz) - 1
@@ -104,10 +104,10 @@ def fly(
             error[:CORE_SIZE] = nav_error(e.nav, nav[second])
             errors[name].append(error)
             beliefs[name].append(m @ e.covariance @ m.T)
-    return {name: Flown(np.array(errors[name]), np.array(beliefs[name])) for name in models}
+    return {name: FilterRun(np.array(errors[name]), np.array(beliefs[name])) for name in models}
 
 
-def live(
+def fly_on_timeline(
     filters: Iterable[KalmanEstimator],
     samples: Array,
     given: Iterable[flight.Measurements],
@@ -124,7 +124,7 @@ def live(
     for estimator in filters:
         buffer = ImuBuffer(rate_hz, HISTORY_S, np.eye(3), 0.0, flight.IMU.gap_s)
         timelines.append(Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S))
-        timelines[-1].diagnosis = Trusting()
+        timelines[-1].diagnosis = WithoutDiagnosis()
         timelines[-1].start()
     for k, measurements in enumerate(given):
         second = slice(k * count, (k + 1) * count)
@@ -155,7 +155,7 @@ def _clock(rng: np.random.Generator, start: Array, steps: int) -> Array:
     return out
 
 
-def started(of: Model, nav: Array) -> KalmanEstimator:
+def started_filter(of: Model, nav: Array) -> KalmanEstimator:
     """A filter at the start of the flight with navigation state (10,)."""
     estimator = KalmanEstimator(of, flight.IMU.gap_s)
     estimator.initialise(0, 0, nav, np.zeros(of.size), np.diag(flight.initial_sd(of) ** 2))
@@ -170,12 +170,12 @@ def monte_carlo(
     seed: int,
     progress: Callable[[], None],
     all_in_view: bool = False,
-) -> dict[str, Flown]:
+) -> dict[str, FilterRun]:
     """Runs of `fly`, stacked: error (runs, k, 20) and covariance (runs, k, 20, 20) by filter."""
     one_run = partial(fly, models, seconds, every_s, all_in_view, seed)
-    found = on_processes(one_run, runs, progress)
+    found = map_runs(one_run, runs, progress)
     return {
-        name: Flown(
+        name: FilterRun(
             np.array([one[name].error for one in found]),
             np.array([one[name].believed for one in found]),
         )

@@ -28,7 +28,7 @@ from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.studies.covariance_analysis import Result, System, analyse
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.observability import Epoch, Observability, observability
-from fusiond.studies.reduced_order import flight, implied, rest
+from fusiond.studies.reduced_order import flight, implied, observability_at_rest
 from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, costs
 from fusiond.studies.reduced_order.report import (
     BELIEVED,
@@ -42,7 +42,7 @@ from fusiond.studies.reduced_order.report import (
     sigma_cells,
     sigmas,
 )
-from fusiond.studies.reduced_order.runs import Flown, combinations, monte_carlo, nees
+from fusiond.studies.reduced_order.runs import FilterRun, combinations, monte_carlo, nees
 
 DEFAULT_RUNS = 40
 CONFIDENCE = 0.99
@@ -78,9 +78,9 @@ def run_study(
     for variant, (sd, tau_s) in VARIANTS.items():
         variants[variant] = _variant(systems, sd, tau_s)
         advance()
-    at_rest = rest.found()
+    at_rest = observability_at_rest.rest_observability()
     advance()
-    as_printed = implied.found(models, systems, fine["17"].kept)
+    as_printed = implied.implied_sigmas(models, systems, fine["17"].kept)
     advance()
     flown = monte_carlo(models, VALIDATION_S, CHECKED_S, count, seed, advance)
     validation = _validation(models, fine, flown)
@@ -196,7 +196,7 @@ def _series(found: dict[str, Analysed]) -> dict[str, Any]:
 
 def _observability(of: Analysed) -> dict[str, Any]:
     """Rank, weakest directions, and each state: share of its sigma that is left."""
-    names, sd = rest.state_names(of.model), flight.initial_sd(of.model)
+    names, sd = observability_at_rest.state_names(of.model), flight.initial_sd(of.model)
     found: Observability = observability((Epoch(s.phi, s.h, s.r) for s in of.systems), sd)
     filtered = np.sqrt(np.diag(of.results[-1].true)) / sd
     return {
@@ -223,7 +223,7 @@ def _observability(of: Analysed) -> dict[str, Any]:
 
 
 def _validation(
-    models: dict[str, Model], analysed: dict[str, Analysed], flown: dict[str, Flown]
+    models: dict[str, Model], analysed: dict[str, Analysed], flown: dict[str, FilterRun]
 ) -> dict[str, Any]:
     """NEES of live filters against the analysis and against their own belief.
 

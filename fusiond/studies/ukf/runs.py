@@ -42,15 +42,15 @@ from fusiond.models.blocks import ClockNoise, clock_blocks
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigator.timeline import Entry
-from fusiond.studies.live_filter import (
+from fusiond.studies.daemon_fed_filter import (
     DURATION_S,
     ORIGIN_DEG_M,
     RATE_HZ,
-    LiveFilter,
+    DaemonFedFilter,
     drive_samples,
     drive_truth,
 )
-from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.monte_carlo import map_runs
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
@@ -320,7 +320,7 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
     start = with_error(nav[0], error)
     traces = {}
     for name, make in FILTERS.items():
-        live = LiveFilter(make(model), IMU.gap_s, samples, start, sd)
+        live = DaemonFedFilter(make(model), IMU.gap_s, samples, start, sd)
         estimator = live.estimator
         if isinstance(estimator, InvariantFilter):
             estimator.turns = True
@@ -354,4 +354,4 @@ def monte_carlo(
     problem: Problem, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """Runs of a problem in order, on two processes."""
-    return on_processes(partial(simulate, problem, seed), runs, progress)
+    return map_runs(partial(simulate, problem, seed), runs, progress)

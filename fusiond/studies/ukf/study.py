@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from fusiond.studies.daemon_fed_filter import DURATION_S
 from fusiond.studies.figure_file import save_figure
-from fusiond.studies.live_filter import DURATION_S
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.ukf.runs import (
     COUNTED_S,

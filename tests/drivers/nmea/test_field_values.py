@@ -14,7 +14,7 @@ from pynmeagps.nmeareader import NMEAReader
 from drivers.measurements import (
     PositionFix,
 )
-from drivers.nmea.fields import typed
+from drivers.nmea.fields import typed_fields
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_SW,
@@ -115,14 +115,14 @@ def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length:
             for k, text in enumerate(printed)
         ]
         with pytest.raises(ValueError, match=r"could not convert|invalid literal"):
-            typed(address[2:], plain)
+            typed_fields(address[2:], plain)
         return
     angles = (_ANGLES.get((address[2:], k), "") for k, text in enumerate(printed) if text)
     if any(name and getattr(wanted, name) == "" for name in angles):  # passed there as empty
         with pytest.raises(ValueError, match="not an angle"):
-            typed(address[2:], printed)
+            typed_fields(address[2:], printed)
         return
-    found = typed(address[2:], printed)
+    found = typed_fields(address[2:], printed)
     # Its time is an object that nobody asks for; satellites are numbered there.
     for name in found.keys() - {"printed", "time", "svid"}:
         assert repr(found[name]) == repr(getattr(wanted, name))

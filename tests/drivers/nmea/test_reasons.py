@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.foreign_protocols import named
+from drivers.nmea.foreign_protocols import protocol_sentence
 from drivers.nmea.reasons import MANY, MOST_NAMES, implausible_date
 from tests.drivers.nmea.sentences import (
     GGA,
@@ -169,7 +169,7 @@ def stripped(payload: bytes) -> bytes:
 def test_a_protocol_that_is_not_read_is_named(make: Callable[[bytes], bytes], name: str) -> None:
     payload = bytes([0x41, 0, 0xC3, 7, 0x55, 0x81, 0x2C, 0x3F] * 3)
     stream = make(payload) * 6
-    assert name in named(stream)
+    assert name in protocol_sentence(stream)
     cause = fed(b"\x00\x7f" + stream).cause
     assert name in cause
     assert ": " in cause, "what would do"
@@ -181,7 +181,7 @@ def test_a_protocol_that_is_not_read_is_named(make: Callable[[bytes], bytes], na
 
 @given(st.binary(max_size=4000))
 def test_noise_is_no_protocol_and_costs_little(data: bytes) -> None:
-    assert isinstance(named(data), str)
+    assert isinstance(protocol_sentence(data), str)
     assert isinstance(fed(data).cause, str)
 
 
@@ -189,7 +189,7 @@ def test_noise_is_no_protocol_and_costs_little(data: bytes) -> None:
     "sync", [b"\xa0\xa2", b"\xf1\xd9", b"\xaa\x44\x12", b"$@", b"#AAAA,", b"@@AA"]
 )
 def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
-    assert named((sync + b"\x0f\xff\x0f") * 400) == ""
+    assert protocol_sentence((sync + b"\x0f\xff\x0f") * 400) == ""
 
 
 # ------------------------------------------------------------------ sentences, and no fix

@@ -5,17 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from drivers.rdss.envelope import (
-    RECEIPT,
-    TEXT,
-    Receipted,
-    carried,
-    opened,
-    read_text,
-    receipt_body,
-    sealed,
-    text_body,
-)
 from drivers.rdss.mail import FleetFix, MessageReceived
 from drivers.rdss.messages import (
     Family,
@@ -28,10 +17,21 @@ from drivers.rdss.messages import (
     Text,
     TextRequest,
 )
-from drivers.rdss.outbox import Change
-from drivers.rdss.report import PositionReport
+from drivers.rdss.outbox import StageChange
+from drivers.rdss.position_report_coding import PositionReport
 from drivers.rdss.state_tables import Action, MailReady, TerminalOptions
-from drivers.rdss.text_coding import Wording
+from drivers.rdss.text_coding import EncodedText
+from drivers.rdss.vehicle_message_envelope import (
+    RECEIPT,
+    TEXT,
+    Receipt,
+    decode_text_body,
+    encode_envelope,
+    encode_receipt_body,
+    encode_text_body,
+    envelope_from_text,
+    envelope_to_text,
+)
 from tests.drivers.rdss.bench import USER, Bench
 
 OTHER = 242407
@@ -60,7 +60,7 @@ class MailBench(Bench):
     level: int = 3
     answer_text: AnswerText = sent
     mail: list[MessageReceived | FleetFix] = field(default_factory=list)
-    changes: list[Change] = field(default_factory=list)
+    changes: list[StageChange] = field(default_factory=list)
     bursts: list[tuple[float, Message]] = field(default_factory=list)
 
     def do(self, actions: list[Action]) -> None:
@@ -108,14 +108,14 @@ def bench(**given: object) -> MailBench:
 
 
 def receipt_for(request: TextRequest) -> Text:
-    envelope = opened(Wording(request.payload, request.encoding))
+    envelope = envelope_from_text(EncodedText(request.payload, request.encoding))
     assert envelope is not None
-    number, _ = read_text(envelope.body)
-    body = receipt_body(Receipted(number, envelope.crc))
-    wording = carried(sealed(RECEIPT, body), "binary")
+    number, _ = decode_text_body(envelope.body)
+    body = encode_receipt_body(Receipt(number, envelope.crc))
+    wording = envelope_to_text(encode_envelope(RECEIPT, body), "binary")
     return Text(OTHER, wording.payload, wording.encoding, USER)
 
 
 def asking(number: int, text: bytes) -> Text:
-    wording = carried(sealed(TEXT, text_body(number, text)), "binary")
+    wording = envelope_to_text(encode_envelope(TEXT, encode_text_body(number, text)), "binary")
     return Text(OTHER, wording.payload, wording.encoding, USER, 600)

@@ -7,15 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.rdss.envelope import (
-    TEXT,
-    Receipted,
-    crc_of,
-    opened,
-    read_receipt,
-    sealed,
-    text_body,
-)
 from drivers.rdss.mail import FleetFix, MessageReceived
 from drivers.rdss.messages import (
     Message,
@@ -23,8 +14,17 @@ from drivers.rdss.messages import (
     TextRequest,
 )
 from drivers.rdss.outbox import MOST_ATTEMPTS
-from drivers.rdss.report import decode_report
-from drivers.rdss.text_coding import Wording
+from drivers.rdss.position_report_coding import decode_report
+from drivers.rdss.text_coding import EncodedText
+from drivers.rdss.vehicle_message_envelope import (
+    TEXT,
+    Receipt,
+    decode_receipt_body,
+    encode_envelope,
+    encode_text_body,
+    envelope_crc,
+    envelope_from_text,
+)
 from tests.drivers.rdss.bench import FIX, USER
 from tests.drivers.rdss.mail_bench import (
     HERE,
@@ -74,10 +74,10 @@ def test_a_text_that_asks_is_answered_each_time_and_known_when_it_comes_again() 
         ("go north", 7, True),
     ]
     assert len(b.texts) == 2
-    envelope = opened(Wording(b.texts[0].payload, b.texts[0].encoding))
+    envelope = envelope_from_text(EncodedText(b.texts[0].payload, b.texts[0].encoding))
     assert envelope is not None
-    crc = crc_of(sealed(TEXT, text_body(7, b"go north")))
-    assert read_receipt(envelope.body) == Receipted(7, crc)
+    crc = envelope_crc(encode_envelope(TEXT, encode_text_body(7, b"go north")))
+    assert decode_receipt_body(envelope.body) == Receipt(7, crc)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_text_that_asks_is_answered_each_time_and_known_when_it_comes_again() 
         (Text(OTHER, b"\xa4\xf9abc", "mixed", USER), "cut"),
         (replace(asking(1, b"hello"), payload=asking(1, b"hello").payload[:-3]), "cut"),
         (replace(asking(1, b"hello"), payload=asking(1, b"hello").payload[:-1] + b"\0"), "damaged"),
-        (Text(OTHER, b"\xa4" + sealed(7, b"\x02"), "mixed", USER), "version"),
+        (Text(OTHER, b"\xa4" + encode_envelope(7, b"\x02"), "mixed", USER), "version"),
     ],
 )
 def test_whatever_comes_is_handed_on_with_what_is_wrong_of_it(text: Text, fault: str) -> None:
@@ -123,7 +123,7 @@ def test_a_card_of_level_1_reports_in_short() -> None:
     b = bench(level=1)
     b.cycle.post_report("r", OTHER, HERE, b.t_ns)
     b.run(62)
-    envelope = opened(Wording(b.texts[0].payload, b.texts[0].encoding))
+    envelope = envelope_from_text(EncodedText(b.texts[0].payload, b.texts[0].encoding))
     assert envelope is not None
     assert decode_report(*envelope[:2]).dated is False
 

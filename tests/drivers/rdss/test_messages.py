@@ -9,9 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.rdss.envelope import (
-    sealed,
-)
 from drivers.rdss.mail import ENDS, MessageRefusedError
 from drivers.rdss.messages import (
     Feedback,
@@ -19,10 +16,13 @@ from drivers.rdss.messages import (
     Outcome,
     Text,
 )
-from drivers.rdss.outbox import MOST_ATTEMPTS, MOST_WAITING, Turns
-from drivers.rdss.report import REPORT, encode_report
+from drivers.rdss.outbox import MOST_ATTEMPTS, MOST_WAITING, StrideScheduler
+from drivers.rdss.position_report_coding import REPORT, encode_report
 from drivers.rdss.state_tables import SECOND, State
-from drivers.rdss.text_coding import mixed
+from drivers.rdss.text_coding import encode_bytes
+from drivers.rdss.vehicle_message_envelope import (
+    encode_envelope,
+)
 from tests.drivers.rdss.bench import FIX, OK, USER
 from tests.drivers.rdss.mail_bench import (
     HERE,
@@ -75,7 +75,7 @@ def test_without_messages_all_turns_are_fixes_and_the_other_way_round() -> None:
 @given(st.floats(0.05, 0.95), st.lists(st.booleans(), max_size=60))
 def test_nobody_saves_up_turns_while_the_other_is_alone(share: float, alone: list[bool]) -> None:
     """After any time with one of both alone, the shares hold from then on."""
-    turns = Turns(share)
+    turns = StrideScheduler(share)
     for message in alone:
         turns.took(message=message, other_waits=False)
     count = 0
@@ -265,7 +265,7 @@ texts = st.builds(
     payload=st.one_of(
         st.binary(max_size=40),
         st.binary(max_size=40).map(lambda b: b"\xa4" + b),
-        st.just(mixed(sealed(REPORT, encode_report(HERE))).payload),
+        st.just(encode_bytes(encode_envelope(REPORT, encode_report(HERE))).payload),
         st.just(asking(9, b"abc").payload),
     ),
     encoding=st.sampled_from(("chinese", "code", "mixed")),

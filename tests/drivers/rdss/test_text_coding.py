@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.rdss.text_coding import Wording, digits, level_bits, plain_text, worded
+from drivers.rdss.text_coding import (
+    EncodedText,
+    card_level_bits,
+    encode_digits,
+    encode_shortest,
+    printable_text,
+)
 
 
 @pytest.mark.parametrize(
@@ -19,27 +25,27 @@ from drivers.rdss.text_coding import Wording, digits, level_bits, plain_text, wo
     ],
 )
 def test_a_text_takes_the_encoding_that_needs_least(text: str, encoding: str, bits: int) -> None:
-    wording = worded(text)
+    wording = encode_shortest(text)
     assert (wording.encoding, wording.bits) == (encoding, bits)
-    assert plain_text(wording) == text
+    assert printable_text(wording) == text
 
 
 @given(st.text(max_size=60).filter(lambda t: t.isprintable()))
 def test_any_printable_text_comes_back(text: str) -> None:
-    assert plain_text(worded(text)) == text
+    assert printable_text(encode_shortest(text)) == text
 
 
 @given(st.binary(max_size=60), st.sampled_from(("chinese", "code", "mixed")), st.booleans())
 def test_any_bytes_are_read_as_a_line_that_can_be_shown_or_as_none(
     data: bytes, encoding: str, odd: bool
 ) -> None:
-    text = plain_text(Wording(data, encoding, odd and bool(data)))  # type: ignore[arg-type]
+    text = printable_text(EncodedText(data, encoding, odd and bool(data)))  # type: ignore[arg-type]
     assert text is None or text.isprintable()
 
 
 def test_levels_have_the_lesser_of_both_public_tables_and_level_0_has_nothing() -> None:
-    assert [level_bits(level) for level in range(7)] == [0, 110, 360, 580, 848, 848, 848]
+    assert [card_level_bits(level) for level in range(7)] == [0, 110, 360, 580, 848, 848, 848]
 
 
 def test_an_odd_number_of_digits_is_no_half_byte_more() -> None:
-    assert digits("123") == Wording(b"\x12\x30", "code", True)
+    assert encode_digits("123") == EncodedText(b"\x12\x30", "code", True)

@@ -22,7 +22,7 @@ from fusiond.configuration.load import load_config
 from fusiond.offline.can_log_reader import messages
 from fusiond.offline.can_through_drivers import CanLog, read_can_log
 from fusiond.offline.process import process
-from fusiond.studies.navigation_error import metres
+from fusiond.studies.navigation_error import metres_per_unit
 from tests.broker import Broker
 from tests.hil.heard import hearing
 from tests.hil.processes import DaemonProcess
@@ -68,7 +68,7 @@ def _config(path: Path, port: int) -> Path:
 def _across_m(log: CanLog, nav: list[dict[str, Any]]) -> NDArray[np.float64]:
     """Horizontal distance of solutions (n,) to the way from fix to fix."""
     fixes = [m for m in (row.measurement for row in log.arrivals) if isinstance(m, PositionFix)]
-    north, east, _ = metres(fixes[0].lat_rad, 100.0)
+    north, east, _ = metres_per_unit(fixes[0].lat_rad, 100.0)
     way = np.array([(m.lat_rad * north, m.lon_rad * east) for m in fixes])
     place = np.radians([(m["lat_deg"], m["lon_deg"]) for m in nav]) * (north, east)
     along = np.diff(way, axis=0)

@@ -31,7 +31,7 @@ from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import KNOT_M_S, latitude, longitude, sentence
 from fusiond.simulation.pty_line import PtyLine
-from fusiond.studies.navigation_error import metres
+from fusiond.studies.navigation_error import metres_per_unit
 from tests.broker import Broker
 from tests.hil.drives import imu_section
 from tests.hil.heard import hearing
@@ -151,7 +151,7 @@ def _differences(messages: list[dict[str, Any]], solution: Path) -> tuple[Any, A
         np.interp(t_s, table.t_s, column)
         for column in (table.lat_rad, table.lon_rad, table.height_m, np.unwrap(table.rpy[:, 2]))
     )
-    north, east, _ = metres(float(lat[0]), float(height[0]))
+    north, east, _ = metres_per_unit(float(lat[0]), float(height[0]))
     d_north = (np.radians([m["lat_deg"] for m in nav]) - lat) * north
     d_east = (np.radians([m["lon_deg"] for m in nav]) - lon) * east
     d_yaw = ([m["yaw_deg"] for m in nav] - np.degrees(yaw) + 180.0) % 360.0 - 180.0

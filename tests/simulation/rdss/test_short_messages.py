@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.envelope import TEXT, Receipted, carried, opened, read_receipt, sealed, text_body
 from drivers.rdss.messages import (
     Family,
     Feedback,
@@ -20,8 +19,17 @@ from drivers.rdss.messages import (
     Text,
     TextRequest,
 )
-from drivers.rdss.report import REPORT, decode_report
-from drivers.rdss.text_coding import Wording, digits, mixed, worded
+from drivers.rdss.position_report_coding import REPORT, decode_report
+from drivers.rdss.text_coding import EncodedText, encode_bytes, encode_digits, encode_shortest
+from drivers.rdss.vehicle_message_envelope import (
+    TEXT,
+    Receipt,
+    decode_receipt_body,
+    encode_envelope,
+    encode_text_body,
+    envelope_from_text,
+    envelope_to_text,
+)
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.rdss.short_messages import ConvoyVehicle, MessageNetwork
@@ -56,9 +64,15 @@ class Pair:
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize(
-    "wording", [worded("hello"), worded("你好"), digits("12345"), mixed(b"\xff$")]
+    "wording",
+    [
+        encode_shortest("hello"),
+        encode_shortest("你好"),
+        encode_digits("12345"),
+        encode_bytes(b"\xff$"),
+    ],
 )
-def test_a_message_comes_as_it_was_sent(truth: Truth, family: Family, wording: Wording) -> None:
+def test_a_message_comes_as_it_was_sent(truth: Truth, family: Family, wording: EncodedText) -> None:
     pair = Pair(truth, family)
     pair.ask(TextRequest(B, wording.payload, wording.encoding, A, odd=wording.odd), 10.0)
     (feedback,) = pair.hear(A, 20.0)
@@ -126,20 +140,20 @@ def test_the_other_vehicle_reports_orders_and_confirms(truth: Truth) -> None:
     options = RdssOptions(user=A, service_frequency_s=1, convoy=True)
     terminal = RdssTerminal(truth, options, np.random.default_rng(3), UTC_START_NS)
     convoy = ConvoyVehicle(truth, terminal)
-    envelope = sealed(TEXT, text_body(5, b"where are you"))
-    wording = carried(envelope, "binary")
+    envelope = encode_envelope(TEXT, encode_text_body(5, b"where are you"))
+    wording = envelope_to_text(envelope, "binary")
     terminal.receive(
         binary_4_0.encode(TextRequest(ConvoyVehicle.CARD, wording.payload, "mixed", A)), 3.0
     )
     for k in range(60):
         convoy.tick(float(k))
     texts = [m for m in binary_4_0.Decoder().feed(terminal.read(70.0)) if isinstance(m, Text)]
-    found = [opened(Wording(t.payload, t.encoding, t.odd)) for t in texts]
+    found = [envelope_from_text(EncodedText(t.payload, t.encoding, t.odd)) for t in texts]
     reports = [decode_report(e.kind, e.body) for e in found if e is not None and e.kind == REPORT]
     assert len(reports) == 6
     assert reports[-1].t_s == pytest.approx(UTC_START_NS * 1e-9 + 55.0)
     there = truth.at(np.array([47.0])).position[0]
     assert np.radians([reports[-1].lat_deg, reports[-1].lon_deg]) == pytest.approx(there[:2])
     (receipt,) = [e for e in found if e is not None and e.kind not in (REPORT, TEXT)]
-    assert read_receipt(receipt.body) == Receipted(5, int.from_bytes(envelope[-2:], "big"))
+    assert decode_receipt_body(receipt.body) == Receipt(5, int.from_bytes(envelope[-2:], "big"))
     assert found.count(None) == 1  # one order, in plain words

@@ -1,0 +1,142 @@
+r"""Constant range bias of each satellite while it is tracked.
+
+Of the errors e_k of `Rows.lasting` variance L the mean over the sky is a displacement or the
+clock's (fusiond.gnss.range_error_displacement); what of e_k is not shows in the innovations nu, for
+the others bound the place. Of each satellite a filter of one state
+
+    V <- min(V + max(L_before - L, 0) + 2 L dt / tau, L)             r, V = 0, L of a fresh one
+    nu = mean of its system's z less z_k,   R = c (w + u P u^T),   c = max(1, 2 T / dt)
+    K = f V / (f^2 V + R),   r <- r + K nu,   V <- (1 - K f) V,   f = 1 - its weight in the mean
+
+z_k is what the filter predicts less the range with r taken off, so that nu is what r lacks; w the
+variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
+errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
+stays alone goes on telling what it told among others. L falls where its two carriers learn the
+delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing.
+
+Source: Groves, 2nd edition, 3.2 and 9.4.4.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.carrier_phase import MULTIPATH_S, SLOTS
+from fusiond.gnss.ranges import Rows
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+LASTS_S = 1800.0
+"""Correlation time of orbit errors, as of `bias_correlation_s`."""
+EVERY_S = 0.9
+"""Innovations closer together say the same, as multipath lasts longer: those of each second."""
+FORGOTTEN_S = 300.0
+"""Time after which a satellite is treated as new; street corners hide it for less."""
+SIGMAS = 3.0
+# Of a satellite, by its slot: r (m), V and L (m^2), when it was last seen (GPS time, s; 0: never).
+# Slot 0 is no satellite's: when levels were last learned.
+COLUMNS = 4
+_OFFSET, _VARIANCE, _PRIOR, _T = range(COLUMNS)
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1], f8, f8[::1], f8[::1])")
+def _expect(levels: Array, values: Array, t_s: float, offset: Array, variance: Array) -> None:
+    """Write r (n,) and V (n,) of rows' `values` at `t_s`, and subtract them."""
+    for k in range(offset.shape[0]):
+        known = levels[int(values[rk.SLOT, k])]
+        prior = values[rk.LASTING, k]
+        offset[k], variance[k] = 0.0, prior
+        since = t_s - known[_T]
+        if known[_T] > 0.0 and 0.0 <= since <= FORGOTTEN_S:
+            more = max(known[_PRIOR] - prior, 0.0) + 2.0 * prior * since / LASTS_S
+            offset[k], variance[k] = known[_OFFSET], min(known[_VARIANCE] + more, prior)
+        values[rk.CORRECTED, k] -= offset[k]
+        values[rk.VARIANCE, k] += variance[k] - prior
+
+
+@compiled(
+    "void(f8[:, ::1], f8[:, ::1], i8[::1], f8, f8[::1], f8[::1], f8[::1], f8[::1])",
+    allocates=True,
+)
+def _learn(
+    levels: Array,
+    values: Array,
+    clock: npt.NDArray[np.int64],
+    t_s: float,
+    offset: Array,
+    variance: Array,
+    z: Array,
+    place: Array,
+) -> None:
+    """Store r and V of rows, updated by innovations z (n,) if any, whose position has the variances
+    `place` (n,)."""
+    n = clock.shape[0]
+    for k in range(n):
+        known = levels[int(values[rk.SLOT, k])]
+        known[_OFFSET], known[_VARIANCE] = offset[k], variance[k]
+        known[_PRIOR], known[_T] = values[rk.LASTING, k], t_s
+    if z.shape[0] != n or n == 0:
+        return
+    span = t_s - levels[0, _T] if levels[0, _T] > 0.0 else 0.0
+    times = max(1.0, 2.0 * MULTIPATH_S / max(span, EVERY_S))
+    levels[0, _T] = t_s
+    for system in range(3):
+        total, mean, many = 0.0, 0.0, 0
+        for k in range(n):
+            if clock[k] == system:
+                w = 1.0 / (values[rk.VARIANCE, k] + place[k])
+                total += w
+                mean += w * z[k]
+                many += 1
+        if many < 2:
+            continue
+        mean /= total
+        for k in range(n):
+            spread = values[rk.VARIANCE, k] + place[k]
+            nu = mean - z[k]
+            if clock[k] != system or nu * nu > SIGMAS * SIGMAS * spread:
+                continue
+            f = 1.0 - 1.0 / (spread * total)
+            gain = f * variance[k]
+            gain /= f * gain + times * max(spread - variance[k], 0.0)
+            known = levels[int(values[rk.SLOT, k])]
+            known[_OFFSET] = offset[k] + gain * nu
+            known[_VARIANCE] = (1.0 - gain * f) * variance[k]
+
+
+_NONE = np.zeros(0)
+
+
+class RangeBiases(NamedTuple):
+    """An epoch at `t_s`: levels (SLOTS, 4) before it, r and V (n,) of its `rows`, and where it may
+    teach: what its measurement will have `seen` of the filter, z and the place's variances (n,)."""
+
+    t_s: float
+    before: Array
+    rows: Rows
+    offset: Array
+    variance: Array
+    seen: list[tuple[Array, Array]] | None
+
+    def after(self) -> Array:
+        """Levels after the epoch, once the filter has processed it."""
+        found = self.before.copy()
+        z, place = self.seen[0] if self.seen else (_NONE, _NONE)
+        of = self.offset, self.variance
+        _learn(found, self.rows.values, self.rows.clock, self.t_s, *of, z, place)
+        return found
+
+
+def subtract_biases(last: RangeBiases | None, rows: Rows, t_s: float) -> RangeBiases:
+    """Subtract the levels from an epoch's rows; the variances keep the unknown part."""
+    before = np.zeros((SLOTS, COLUMNS)) if last is None else last.after()
+    n = len(rows.satellites)
+    offset, variance = np.empty(n), np.empty(n)
+    _expect(before, rows.values, t_s, offset, variance)
+    teaches = abs(t_s - before.item(_T)) >= EVERY_S
+    return RangeBiases(t_s, before, rows, offset, variance, [] if teaches else None)
