@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar, Generic, Literal, Protocol, TypeVar
 
+from can.typechecking import CanFilter
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from drivers.base import (
@@ -24,7 +25,7 @@ from drivers.base import (
     PermanentDriverError,
     monotonic_ns,
 )
-from drivers.can.bus import CanBus, CanFilter, CanFrame, Interface
+from drivers.can.bus import CanBus, CanFrame, Interface
 from drivers.can.errors import ControllerState
 from drivers.input_queue import Inputs
 from drivers.measurements import (

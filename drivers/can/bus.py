@@ -23,7 +23,9 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal, NamedTuple, TypedDict
+from typing import Literal, NamedTuple
+
+from can.typechecking import CanFilter
 
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.can.errors import ControllerState, controller_state, error_names
@@ -44,16 +46,7 @@ EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _FRAME = struct.Struct("=IB3x")
 _TIMESPEC = struct.Struct("@ll")
 _CANFD_MTU = 72
-_SO_TIMESTAMPNS = 35
-_SO_MEMINFO, _SK_MEMINFO_DROPS = 55, 8
-
-
-class CanFilter(TypedDict):
-    """Filter in python-can's form: a frame passes when `id & can_mask == can_id & can_mask`."""
-
-    can_id: int
-    can_mask: int
-    extended: bool
+_SO_TIMESTAMPNS, _SO_MEMINFO, _SK_MEMINFO_DROPS = 35, 55, 8
 
 
 class CanFrame(NamedTuple):
@@ -135,8 +128,7 @@ class CanBus:
                 bus = self._open()
             except (OSError, can.CanError, ValueError) as error:
                 self.counters["bus_open_failed"] += 1
-                why = self._explain(error)
-                if why != reported:
+                if (why := self._explain(error)) != reported:
                     on_link(False, why)
                     reported = why
                 await asyncio.sleep(self._backoff.next())
@@ -217,12 +209,10 @@ class CanBus:
         try:
             fd = bus.fileno()
         except NotImplementedError:
-            fd = -1
-        if fd < 0:
             return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
         read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
-        self._drain = partial(self._readable, fd, read, gone)
+        self._drain = partial(self._readable, read, gone)
         self._read_ns = self._now_ns()
         if not self.polled:
             loop.add_reader(fd, self._drain)
@@ -236,25 +226,25 @@ class CanBus:
             self._drain = None
             loop.remove_reader(fd)
 
-    def _readable(self, fd: int, read: Read, gone: asyncio.Future[str]) -> None:
-        """Drain the socket, bounded; a fault ends the watch at once."""
-        if gone.done():
-            return
+    def _readable(self, read: Read, gone: asyncio.Future[str]) -> None:
+        """Read what has come, the rest in the next turn of the loop."""
+        if self.drain(read, gone) and self.polled:
+            gone.get_loop().call_soon(self._readable, read, gone)
+
+    def drain(self, read: Read, gone: asyncio.Future[str]) -> bool:
+        """Deliver the next `FRAMES_PER_WAKEUP` frames; True if there may be more. A fault ends the
+        watch."""
         try:
-            for _ in range(FRAMES_PER_WAKEUP):
+            for _ in range(0 if gone.done() else FRAMES_PER_WAKEUP):
                 frame = read()
                 if frame is None:
-                    return
+                    return False
                 self.deliver(frame)
         except _BusFaultError as fault:
-            asyncio.get_running_loop().remove_reader(fd)
             gone.set_result(str(fault))
         except Exception as defect:
-            asyncio.get_running_loop().remove_reader(fd)
             gone.set_exception(defect)
-        else:
-            if self.polled:
-                asyncio.get_running_loop().call_soon(self._readable, fd, read, gone)
+        return not gone.done()
 
     def _arrived_ns(self, realtime_ns: int | None) -> int:
         """Monotonic instant of the arrival of a frame that is read now."""
@@ -367,14 +357,12 @@ class _ThreadReader:
         self._owner = owner
         self._bus = bus
         self._gone = gone
-        self._loop = gone.get_loop()
-        self._ring: deque[CanFrame] = deque(maxlen=RING_FRAMES)
+        self._ring: deque[CanFrame | _BusFaultError] = deque(maxlen=RING_FRAMES)
         self._scheduled = False
         self._stop = threading.Event()
 
     async def wait_until_gone(self) -> str:
-        name = f"can-{self._owner.channel}"
-        threading.Thread(target=self._pump, name=name, daemon=True).start()
+        threading.Thread(target=self._pump, name=f"can-{self._owner.channel}", daemon=True).start()
         try:
             return await self._gone
         finally:
@@ -388,32 +376,25 @@ class _ThreadReader:
                     if frame is not None:
                         self._push(frame)
             except _BusFaultError as fault:
-                self._loop.call_soon_threadsafe(self._end, str(fault))
+                self._push(fault)
 
-    def _push(self, frame: CanFrame) -> None:
+    def _push(self, item: CanFrame | _BusFaultError) -> None:
         if len(self._ring) == RING_FRAMES:
             self._owner.counters["ring_overflow"] += 1
-        self._ring.append(frame)
+        self._ring.append(item)
         if not self._scheduled:
             self._scheduled = True
-            self._loop.call_soon_threadsafe(self._drain)
+            self._gone.get_loop().call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
         """Callback of the loop; clears the flag first, so that no frame is left behind."""
         self._scheduled = False
-        try:
-            for _ in range(FRAMES_PER_WAKEUP):
-                if self._stop.is_set() or not self._ring:
-                    return
-                self._owner.deliver(self._ring.popleft())
-        except Exception as defect:
-            self._stop.set()
-            if not self._gone.done():
-                self._gone.set_exception(defect)
-            return
-        self._scheduled = True
-        self._loop.call_soon(self._drain)
+        if self._owner.drain(self._next, self._gone):
+            self._scheduled = True
+            self._gone.get_loop().call_soon(self._drain)
 
-    def _end(self, why: str) -> None:
-        if not self._gone.done():
-            self._gone.set_result(why)
+    def _next(self) -> CanFrame | None:
+        item = self._ring.popleft() if self._ring else None
+        if isinstance(item, _BusFaultError):
+            raise item
+        return item

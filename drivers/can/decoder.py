@@ -11,11 +11,12 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any, Generic, Protocol, TypeVar
 
+from can.typechecking import CanFilter
 from cantools.database.can.signal import Signal
 from pydantic import Field, model_validator
 
 from drivers.can.base_driver import BusOptions
-from drivers.can.bus import CanFilter, CanFrame
+from drivers.can.bus import CanFrame
 from drivers.can.dbc import (
     MessagePlan,
     RefusedFrameError,

@@ -21,11 +21,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Annotated, ClassVar, Literal
 
+from can.typechecking import CanFilter
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from drivers.base import DriverOptions
 from drivers.can.base_driver import BusOptions, CanDriver, Codec
-from drivers.can.bus import CanFilter, CanFrame
+from drivers.can.bus import CanFrame
 from drivers.measurements import Measurement, WheelSpeed
 from drivers.quantization import Rounding, rounded_speed
 

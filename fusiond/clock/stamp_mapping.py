@@ -267,13 +267,12 @@ class Clock:
         `utc_source_changed`, `utc_jumped`, and those of `UtcEnvelope`.
         """
         self.look()
+        utc_ns = plausible_dates.rolled_over(report.utc_ns)
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
             if report.source in self._utc:
-                utc_ns = plausible_dates.rolled_over(report.utc_ns)
                 self._utc[report.source].untrusted(utc_ns, report.t_seen_ns)
             return
-        utc_ns = plausible_dates.rolled_over(report.utc_ns)
         plausible = plausible_dates.plausible(utc_ns)
         self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
@@ -313,14 +312,12 @@ class Clock:
         """
         now_ns = self.now_ns()
         for each in known:
-            if not 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS:
-                continue
-            if not plausible_dates.plausible(each.utc_ns):
-                continue
-            envelope = self._envelope(self._utc, each.source)
-            envelope.resume(each)
-            self.counters["utc_resumed"] += 1
-            self._choose_reference(each.source, envelope)
+            new = 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS
+            if new and plausible_dates.plausible(each.utc_ns):
+                envelope = self._envelope(self._utc, each.source)
+                envelope.resume(each)
+                self.counters["utc_resumed"] += 1
+                self._choose_reference(each.source, envelope)
 
     def _jumped(self, jumped_ns: int, why: str) -> None:
         self.counters["utc_jumped"] += 1
@@ -329,9 +326,7 @@ class Clock:
     def _choose_reference(self, source: str, envelope: UtcEnvelope) -> None:
         """Select the reference: a source that reports, and among those that agree the least
         delayed."""
-        if source == self._reference:
-            return
-        if self._reference is None:
+        if self._reference is None or source == self._reference:
             self._reference = source
             return
         incumbent = self._utc[self._reference]

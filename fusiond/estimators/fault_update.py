@@ -189,41 +189,6 @@ def _of_row(
 
 
 @compiled(
-    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8, f4[::1])",
-)
-def _sign(
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    kind: int,
-    measures: int,
-    t_s: float,
-    nav: Array,
-    m: int,
-    columns: int,
-    work: Single,
-) -> None:
-    """Add D of the m rows of a measurement that a kind concerns: for each restart an offset, and
-    the growth since its onset for a slope."""
-    of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
-    back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
-    for a in range(m if size == 1 else min(m, size)):
-        offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
-        if offset == 0.0 and slope == 0.0:
-            continue
-        number, behind = RESTARTS * kind, RESTARTS * (kind + 1)
-        while number < behind:  # those of eight at once
-            at = group_at(bank, number)
-            count = min(behind - number, LANES - (at - GROUPS) % LANES)
-            onsets = bank[at + ONSET : at + ONSET + count]
-            first = a * columns + column_of(bank, number, 0 if size == 1 else a)
-            s = work[first : first + count]
-            for j in range(s.shape[0]):
-                s[j] += offset + slope * (t_s - onsets[j])
-            number += count
-
-
-@compiled(
     "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], f8[::1], f8[::1])",
 )
 def rows_of_fault(
@@ -297,7 +262,7 @@ def sensitivity_rows(
     """Write L^-1 (H V + D) of a measurement's rows at `t_ns` to `work`, one row for each column of
     V; their number. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav
     (10,)."""
-    m, kinds = h.shape[0], ints.shape[0]
+    m, kinds, t_s = h.shape[0], ints.shape[0], t_ns * 1e-9
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns: int = v.shape[0] // n
     of = np.empty(n, dtype=np.int64)
@@ -311,8 +276,25 @@ def sensitivity_rows(
             s[j] = 0.0
         add_rows(v, columns, 0, of, count, h[a], s)
     for kind in range(kinds):
-        if concerns(ints, kind, measures, device):
-            _sign(bank, ints, numbers, kind, measures, t_ns * 1e-9, nav, m, columns, work)
+        if not concerns(ints, kind, measures, device):
+            continue
+        size = ints[kind, SIZE]
+        back = _past(bank, t_s - numbers[kind, LAG]) if ints[kind, SIGNATURE] == DELAY else -1
+        for a in range(m if size == 1 else min(m, size)):
+            offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
+            if offset == 0.0 and slope == 0.0:
+                continue
+            # For each restart the offset, and the growth since its onset.
+            number, behind = RESTARTS * kind, RESTARTS * (kind + 1)
+            while number < behind:  # those of eight at once
+                at = group_at(bank, number)
+                fits = min(behind - number, LANES - (at - GROUPS) % LANES)
+                onsets = bank[at + ONSET : at + ONSET + fits]
+                first = a * columns + column_of(bank, number, 0 if size == 1 else a)
+                s = work[first : first + fits]
+                for j in range(s.shape[0]):
+                    s[j] += offset + slope * (t_s - onsets[j])
+                number += fits
     for a in range(m):
         s, along = work[a * columns : (a + 1) * columns], 0.0
         for i in range(n):

@@ -161,18 +161,13 @@ class InvariantFilter(TiltAxesFilter):
         one counts as at the gate, since the measurement may be wrong."""
 
     @property
-    def _known(self) -> bool:
+    def heading_known(self) -> bool:
         """True if the heading has been known since the start, to `PLAIN_SD_RAD`."""
         return self._knows.item(KNOWN) > 0.0
 
-    @_known.setter
-    def _known(self, true: bool) -> None:
+    @heading_known.setter
+    def heading_known(self, true: bool) -> None:
         self._knows[KNOWN] = true
-
-    @property
-    def heading_known(self) -> bool:
-        """True if the heading has been known since the start."""
-        return self._known
 
     def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
         """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""
@@ -200,12 +195,6 @@ class InvariantFilter(TiltAxesFilter):
         nothing = np.zeros(self.model.size)
         return 2.0 * np.eye(self.model.size) - self.jacobian(nothing, turning)
 
-    def vehicle(self, nav: Array, xi: Array) -> Array:
-        """Attitude C_nv (3, 3) of the vehicle, which moves the way it faces."""
-        axes = np.empty((3, 3))
-        vehicle_axes(nav, xi, self._mounts, axes)
-        return axes
-
     def without(self, nav: Array, xi: Array, error: Array, turning: Turning) -> tuple[Array, Array]:
         """The state (10,) and parameters (n,) less an `error` (n,) in xi."""
         nav, xi = nav.copy(), xi.copy()
@@ -220,7 +209,9 @@ class InvariantFilter(TiltAxesFilter):
 
     def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
         """Error (n,) in xi of this filter's state, if another's were true."""
-        mine, true = self.vehicle(self.nav, self.xi), self.vehicle(nav, xi)
+        mine, true = np.empty((3, 3)), np.empty((3, 3))
+        vehicle_axes(self.nav, self.xi, self._mounts, mine)
+        vehicle_axes(nav, xi, self._mounts, true)
         error, turn = xi - self.xi, true @ mine.T
         psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
         back, tilt = np.empty((3, 3)), np.empty(3)
@@ -237,7 +228,7 @@ class InvariantFilter(TiltAxesFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Initialise at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = self._known = self._bent = False
+        self.turns = self.heading_known = self._bent = False
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -248,8 +239,8 @@ class InvariantFilter(TiltAxesFilter):
         """Fold one measurement in, or name why not."""
         if self._settles and not self.turns:
             variance = self.covariance[PHI + 2, PHI + 2]
-            self.turns = self._known and bool(variance > LARGE_SD_RAD**2)
-            self._known |= bool(variance < PLAIN_SD_RAD**2)
+            self.turns = self.heading_known and bool(variance > LARGE_SD_RAD**2)
+            self.heading_known |= bool(variance < PLAIN_SD_RAD**2)
         return super().update(measurement, noise)
 
     def _turn_in(self, measurement: Linearised) -> Outcome:
@@ -387,11 +378,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self.undoubted, self._known, self._bent
+        return self.turns, self.undoubted, self.heading_known, self._bent
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self.undoubted, self._known, self._bent = extra
+        self.turns, self.undoubted, self.heading_known, self._bent = extra
 
 
 def _way(a: Array, b: Array) -> Array:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import can
 import numpy as np
+from can.typechecking import CanFilter
 
 from drivers.can.base_driver import CanDriver
-from drivers.can.bus import CanFilter
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Source
 from fusiond.files.measurement_csv import read_imu

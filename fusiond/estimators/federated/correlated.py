@@ -34,8 +34,6 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
 from fusiond.estimators.federated.continuing_base import CarriedFilter
-from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -82,13 +80,15 @@ class CorrelatedFilter(CarriedFilter):
     """`no_reset` with the covariances between the local filters
     (`fusiond.estimators.base.Estimator`)."""
 
-    def __init__(
-        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
-    ) -> None:
-        super().__init__(model, gap_s, names, options, 0)
-        width, count = model.width, len(names)
+    @property
+    def _estimates(self) -> int:
+        return 0
+
+    def _arrange(self, used: NDArray[np.bool_]) -> None:
+        super()._arrange(used)
+        width, count = self.model.width, len(self.names)
         self._joint: Array = np.zeros((count, count, width, width))
-        self._bank_dxs = np.zeros((count, model.size))
+        self._bank_dxs = np.zeros((count, self.model.size))
         self._members: list[int] = []
         self._combination = Fused(np.zeros((0, 0, 0)), np.zeros((0, 0)))
 

@@ -66,12 +66,7 @@ class FederatedFilter(Estimator):
     """
 
     def __init__(
-        self,
-        model: Model,
-        gap_s: float,
-        names: tuple[str, ...],
-        options: FederatedOptions,
-        estimates: int,
+        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
     ) -> None:
         super().__init__(model, gap_s)
         if not names:
@@ -86,11 +81,17 @@ class FederatedFilter(Estimator):
             len(names), options.false_alarm, options.window, options.readmit_after
         )
         self._local_of: dict[str, int | None] = {}
+        estimates = self._estimates
         self._bank: Array = np.zeros((estimates, model.width, model.width))
         self._bank_dxs: Array = np.zeros((estimates, model.size))
         self._weight: Array = np.zeros(estimates)
         self._arrange(model.active)
         self._share_out(self._nominal)
+
+    @property
+    def _estimates(self) -> int:
+        """Number of estimates in `_bank`."""
+        raise NotImplementedError
 
     def _arrange(self, used: NDArray[np.bool_]) -> None:
         """Lay out the work space: the used states, position and velocity last."""

@@ -32,8 +32,6 @@ from fusiond.estimators.federated.bank import (
     publish,
 )
 from fusiond.estimators.federated.continuing_base import CarriedFilter
-from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -48,12 +46,16 @@ class NoResetFilter(CarriedFilter):
     Bank: 0 ... N - 1 the local filters, N the master's own part in `rescale`.
     """
 
-    def __init__(
-        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
-    ) -> None:
-        self._rescales = options.mode == "rescale"
-        self._bank_shares: Array = np.ones(len(names) + self._rescales)
-        super().__init__(model, gap_s, names, options, len(names) + self._rescales)
+    _bank_shares: Array
+    """Sharing factors of the bank."""
+
+    @property
+    def _rescales(self) -> bool:
+        return self.options.mode == "rescale"
+
+    @property
+    def _estimates(self) -> int:
+        return len(self.names) + self._rescales
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -169,10 +171,10 @@ class NoResetFilter(CarriedFilter):
 
     def _share_out(self, parts: Array) -> None:
         super()._share_out(parts)
-        self._bank_shares[: len(self.names)] = self._factors
+        self._bank_shares = self._factors.copy()
         if self._rescales:
-            self._bank_shares[:-1] *= 1.0 - self.options.master_share
-            self._bank_shares[-1] = self.options.master_share
+            own = self.options.master_share
+            self._bank_shares = np.append(self._factors * (1.0 - own), own)
 
     # ------------------------------------------------------------------ faults, feedback, snapshots
 

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation
 from fusiond.estimators.federated.bank import publish
 from fusiond.estimators.federated.filter import FederatedFilter
-from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -36,10 +34,9 @@ UPDATED, OTHERS = 0, 1
 class ResetFilter(FederatedFilter):
     """`fusion_reset` and `zero_reset` (`fusiond.estimators.base.Estimator`)."""
 
-    def __init__(
-        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
-    ) -> None:
-        super().__init__(model, gap_s, names, options, 2)
+    @property
+    def _estimates(self) -> int:
+        return 2
 
     def _fold(self, local: int | None, i: Innovation) -> str:
         if local is None or self.options.mode == "zero_reset":

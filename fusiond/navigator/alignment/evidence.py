@@ -78,6 +78,13 @@ def _instant(fix: Fix) -> int:
     return fix.velocity.t_ns
 
 
+def _moved_m(first: PositionCandidate, last: PositionCandidate) -> Array:
+    """Displacement north and east (2,) in m from one position to another."""
+    east = math.remainder(last.lon_rad - first.lon_rad, 2.0 * math.pi)
+    metres: Array = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
+    return np.array([last.lat_rad - first.lat_rad, east]) * metres
+
+
 @dataclass(slots=True)
 class Standstill:
     """Sums over the quiet windows since the vehicle came to rest."""
@@ -142,8 +149,8 @@ class AlignmentEvidence:
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
-        self._position: PositionCandidate | None = None
         self._positions: list[PositionCandidate] = []
+        """The last positions in order of validity."""
         self._by_source: dict[str, PositionCandidate] = {}
         """The last position of each source."""
 
@@ -166,10 +173,8 @@ class AlignmentEvidence:
         turning = latest.quiet and self._turns(latest)
         if turning:
             self.unexplained = np.maximum(self.unexplained, np.abs(latest.mean_rate))
-        if not latest.quiet or turning or self._speed > self._options.rest_speed_m_s:
-            s = self.levelled()
-            if s is not None:
-                self.left = s
+        if turning or not still:
+            self.left = self.levelled() or self.left
             self._at_rest = False
             self.ever_moved = True
             self._pending = None
@@ -190,9 +195,7 @@ class AlignmentEvidence:
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
         """Receive the aiding measurements of one device measurement."""
         self.rest_evidence.receive(measurements)
-        candidates = [
-            candidate for measurement in measurements for candidate in measurement.candidates()
-        ]
+        candidates = [candidate for each in measurements for candidate in each.candidates()]
         height = next((o for o in candidates if isinstance(o, HeightCandidate)), None)
         position: PositionCandidate | None = None
         velocity: VelocityCandidate | None = None
@@ -213,10 +216,6 @@ class AlignmentEvidence:
             self._by_source[measurements[0].source] = position
             insort(self._positions, position, key=lambda p: p.t_ns)
             del self._positions[:-MOST_POSITIONS]
-        if position is not None and (
-            self._position is None or position.t_ns >= self._position.t_ns
-        ):
-            self._position = position
         if velocity is not None:
             self._speed = math.hypot(*velocity.v_ned[:2])
             if position is not None:
@@ -246,20 +245,16 @@ class AlignmentEvidence:
 
     def confirmed_rest(self, s: Standstill) -> bool:
         """True if speeds confirm an uncontradicted standstill."""
-        if self.seen_at_rest(s):
-            return True
-        return CONTRADICTION_SIGMAS * self._way(s.start_ns, s.end_ns)[1] < SLOWEST_M_S
+        span = s.start_ns, s.end_ns
+        return self.seen_at_rest(s) or CONTRADICTION_SIGMAS * self._way(*span)[1] < SLOWEST_M_S
 
     def _way(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
         """Slope (m/s) of a line through the positions of a span, and its sigma."""
-        trend, first = NO_TREND, None
-        for p in self._positions:
-            if begin_ns <= p.t_ns <= end_ns:
-                first = first or p
-                metres = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
-                east = math.remainder(p.lon_rad - first.lon_rad, 2.0 * math.pi)
-                n, e = (np.array([p.lat_rad - first.lat_rad, east]) * metres).tolist()
-                trend = trend.with_one(Offset(n, e, max(p.sd[:2])), (p.t_ns - begin_ns) * 1e-9)
+        trend = NO_TREND
+        within = [p for p in self._positions if begin_ns <= p.t_ns <= end_ns]
+        for p in within:
+            n, e = _moved_m(within[0], p).tolist()
+            trend = trend.with_one(Offset(n, e, max(p.sd[:2])), (p.t_ns - begin_ns) * 1e-9)
         return trend.slope
 
     def seen_at_rest(self, s: Standstill) -> bool:
@@ -288,7 +283,6 @@ class AlignmentEvidence:
             return False
         way, before, trend = np.zeros(2), fixes[0], NO_TREND
         first = before.position
-        metres = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
         moved, count = np.zeros(2), 0
         for fix in fixes:
             position = fix.position
@@ -297,8 +291,7 @@ class AlignmentEvidence:
             since_s = (position.t_ns - first.t_ns) * 1e-9
             v = np.add(fix.velocity.v_ned[:2], before.velocity.v_ned[:2])
             way += 0.5 * (position.t_ns - before.position.t_ns) * 1e-9 * v
-            east = math.remainder(position.lon_rad - first.lon_rad, 2.0 * math.pi)
-            moved = np.array([position.lat_rad - first.lat_rad, east]) * metres
+            moved = _moved_m(first, position)
             north_m, east_m = (moved - way).tolist()
             trend = trend.with_one(Offset(north_m, east_m, max(position.sd[:2])), since_s)
             before, count = fix, count + 1
@@ -350,15 +343,7 @@ class AlignmentEvidence:
 
     def place(self) -> Place | None:
         """Position (rad, rad, m) to start at, its fix, and its sigmas."""
-        if self._position is not None:
-            return self.place_of(self._position)
-        reported = self._reported()
-        if reported is None:
-            return None
-        (lat, lon, height), sd = reported
-        if height is None:
-            return Place(None, np.array([lat, lon, 0.0]), sd, UNKNOWN_HEIGHT_SD_M)
-        return Place(None, np.array([lat, lon, height]), sd, sd)
+        return self.place_of(self._positions[-1]) if self._positions else self._told()
 
     def place_of(self, p: PositionCandidate, velocity: VelocityCandidate | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
@@ -386,26 +371,29 @@ class AlignmentEvidence:
                 largest = max(largest, away)
         return largest
 
-    def _reported(self) -> tuple[tuple[float, float, float | None], float] | None:
-        """Position (rad, rad, m) by the configuration or the saved state, and one sigma (m)."""
+    def _told(self) -> Place | None:
+        """Place by the configuration or the saved state."""
+        height: float | None
         if self._options.position is not None:
-            return self._options.position, self._options.position_sd_m
-        if self._saved is not None:
-            return self._saved.position, self._saved.sd_position_m
-        return None
+            (lat, lon, height), sd = self._options.position, self._options.position_sd_m
+        elif self._saved is not None:
+            (lat, lon, height), sd = self._saved.position, self._saved.sd_position_m
+        else:
+            return None
+        if height is None:
+            return Place(None, np.array([lat, lon, 0.0]), sd, UNKNOWN_HEIGHT_SD_M)
+        return Place(None, np.array([lat, lon, height]), sd, sd)
 
     def _height_at(self, p: PositionCandidate) -> tuple[float, float]:
         """Height (m) of a fix and one sigma; where it has none, that of the place that was told, as
         far as roads climb on the way from there; 0 where nothing has told any."""
         if p.height_m is not None:
             return p.height_m, p.sd[2]
-        reported = self._reported()
-        if reported is None:
-            return 0.0, UNKNOWN_HEIGHT_SD_M
-        (lat, lon, height), sd = reported
-        if height is None:
-            return 0.0, UNKNOWN_HEIGHT_SD_M
-        separation = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
-        way_m = math.hypot(*(separation / as_geodetic(np.ones(3), lat)[:2]).tolist())
-        sd = math.hypot(sd, SLOPE_SD * way_m)
-        return (height, sd) if sd < UNKNOWN_HEIGHT_SD_M else (0.0, UNKNOWN_HEIGHT_SD_M)
+        if (told := self._told()) is not None:
+            lat, lon, height = told.where.tolist()
+            separation = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
+            way_m = math.hypot(*(separation / as_geodetic(np.ones(3), lat)[:2]).tolist())
+            sd = math.hypot(told.sd_height, SLOPE_SD * way_m)
+            if sd < UNKNOWN_HEIGHT_SD_M:
+                return height, sd
+        return 0.0, UNKNOWN_HEIGHT_SD_M
