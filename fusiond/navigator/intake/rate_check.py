@@ -76,7 +76,7 @@ class Pace:
             return None
         rate_hz, what = RATES[kind]
         key = m.source, kind
-        match m.stamp:
+        match getattr(m, "stamp", None):
             case UtcStamp(utc_ns):
                 said_s = utc_ns * 1e-9
             case TimeOfDayStamp(time_of_day_s):
