@@ -207,7 +207,11 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
     ("MTK's binary protocol", _framed(b"\x04\x24", _mtk), _SWITCH),
     ("Zodiac's binary protocol", _framed(b"\xff\x81", _zodiac), _SWITCH),
     ("Motorola's OnCore protocol", _framed(b"@@", _oncore), _SWITCH),
-    ("GREIS, Topcon's and JAVAD's protocol,", _framed(b"~~005", _greis), _SWITCH),
+    (
+        "GREIS, Topcon's and JAVAD's protocol,",
+        lambda d: FEWEST * _framed(b"~~005", _greis)(d),  # each is three messages, of kilobytes
+        _SWITCH,
+    ),
     ("NavCom's binary protocol", _framed(b"\x02\x99\x66", _navcom), _SWITCH),
     ("iTalk, Fastrax' binary protocol,", _framed(b"<!", _italk), _SWITCH),
     ("GeoStar's binary protocol", _framed(b"PSGG", _geostar), _SWITCH),
