@@ -32,6 +32,10 @@ from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 REFUSALS = {
     "no_fix": "the receiver has no fix",
     "dead_reckoning_refused": "only the receiver's own dead reckoning, which is not fused",
+    "time_only_refused": "the receiver repeats a surveyed place and gives the time alone: switch "
+    "its time mode off",
+    "limits_exceeded": "the receiver does not stand by its fixes, which are beyond its limits of "
+    "DOP and accuracy: give the antenna more sky",
     "inertial_refused": "the receiver's own inertial solution, which is not fused",
     "manual_refused": "the receiver repeats a position that was put in by hand",
     "simulator_refused": "the receiver simulates: allow_simulator would accept it",

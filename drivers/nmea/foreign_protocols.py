@@ -4,7 +4,8 @@ A name is given where two messages in it verify, by their checksum where it is c
 must stand at their end. Sources: u-blox, Septentrio (SBF reference guide), NovAtel OEM7 and Unicore
 command manuals, SiRF Binary Protocol Reference Manual, Trimble (TSIP) and Garmin (device interface
 specification), SkyTraq AN0003, Allystar, CASIC and MTK protocol specifications, Rockwell Zodiac
-interface guide, gpsd_json(5).
+interface guide, GREIS reference guide (Topcon, JAVAD), NavCom technical reference, iTalk,
+SuperStar II and GeoS-1M protocol specifications, RTCM 10402.3, gpsd_json(5).
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ _AIS = re.compile(rb"![A-Z]{2}VD[MO],[\x20-\x7e]{5,90}\*[0-9A-F]{2}")
 _ACTISENSE = re.compile(rb"\x10\x02[\x93-\x95\xa0\xd0](?:[^\x10]|\x10\x10){5,250}\x10\x03")
 _TSIP = re.compile(rb"(?<!\x10)\x10[^\x03\x10](?:[^\x10]|\x10\x10){1,250}\x10\x03")
 _GPSD = re.compile(rb'\{"class":"[A-Z]+"')
+_GREIS = re.compile(rb"[\r\n]*[0-~]{2}([0-9A-F]{3})")
 _SENTENCE = re.compile(rb"\$([A-Z]{4,5},[\x20-\x7e]{0,100}?)\*([0-9A-F]{2})")
 _BARE = re.compile(rb"(?:^|[\r\n])[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG),[^\r\n$]*[\r\n]")
 
@@ -123,6 +125,59 @@ def _oncore(d: bytes, at: int) -> int:
     return end + 2 - at if good and reduce(xor, d[at + 2 : end], 0) == 0 else 0
 
 
+def _navcom(d: bytes, at: int) -> int:
+    """02 99 66 id length16 payload xor 03: the length is from id to xor."""
+    n = int.from_bytes(d[at + 4 : at + 6], "little")
+    said = d[at + 3 : at + 3 + n]
+    good = n >= 4 and d[at + 3 + n : at + 4 + n] == b"\x03"
+    return n + 4 if good and reduce(xor, said, 0) == 0 else 0
+
+
+def _italk(d: bytes, at: int) -> int:
+    """3C 21, four bytes, words8, so many words, sum16, 3E."""
+    n = 2 * int.from_bytes(d[at + 6 : at + 7], "little") + 9
+    return n + 1 if d[at + n : at + n + 1] == b">" else 0
+
+
+def _geostar(d: bytes, at: int) -> int:
+    """PSGG command16 words16, so many words, xor32: the length leads to the next."""
+    n = 12 + 4 * int.from_bytes(d[at + 6 : at + 8], "little")
+    return n if d[at + n : at + n + 4] == b"PSGG" else 0
+
+
+def _superstar(d: bytes, at: int) -> int:
+    """01 id and its complement, length8 payload sum16."""
+    if len(d) < at + 6 or d[at + 1] ^ d[at + 2] != 0xFF:
+        return 0
+    n = 4 + d[at + 3]
+    check = int.from_bytes(d[at + n : at + n + 2], "little")
+    return n + 2 if sum(d[at : at + n]) & 0xFFFF == check else 0
+
+
+def _greis(d: bytes, at: int) -> int:
+    """~~005, the time: messages of two letters, length in three hexadecimal digits, and text or
+    bytes; two lengths lead on to a third message."""
+    end = at + 10
+    for _ in range(2):
+        head = _GREIS.match(d, end)
+        if head is None:
+            return 0
+        end = head.end() + int(head[1], 16)
+    return end - at if _GREIS.match(d, end) else 0
+
+
+FEWEST_RTCM_2 = 100
+"""Bytes of RTCM 2 that name it, some twenty words; all begin with the bits 01, as no other text or
+protocol does: letters, without a space or a digit."""
+
+
+def _rtcm_2(data: bytes) -> int:
+    """Number of messages of RTCM 2, by its six bits of eight: all or none."""
+    words = data.translate(None, b"\r\n")
+    of_it = sum(byte >> 6 == 1 for byte in words)
+    return FEWEST * (of_it >= FEWEST_RTCM_2 and of_it >= MOSTLY * len(words))
+
+
 _SWITCH = "switch on NMEA (GGA, RMC, GST) at the receiver"
 
 
@@ -153,6 +208,16 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
     ("Zodiac's binary protocol", _framed(b"\xff\x81", _zodiac), _SWITCH),
     ("Motorola's OnCore protocol", _framed(b"@@", _oncore), _SWITCH),
     (
+        "GREIS, Topcon's and JAVAD's protocol,",
+        lambda d: FEWEST * _framed(b"~~005", _greis)(d),  # each is three messages, of kilobytes
+        _SWITCH,
+    ),
+    ("NavCom's binary protocol", _framed(b"\x02\x99\x66", _navcom), _SWITCH),
+    ("iTalk, Fastrax' binary protocol,", _framed(b"<!", _italk), _SWITCH),
+    ("GeoStar's binary protocol", _framed(b"PSGG", _geostar), _SWITCH),
+    ("SuperStar II's binary protocol", _framed(b"\x01", _superstar), _SWITCH),
+    ("RTCM 2", _rtcm_2, "these are corrections for a receiver: take the receiver's own output"),
+    (
         "AIS (!AIVDM)",
         lambda d: len(_AIS.findall(d)),
         "it tells where others are: take the receiver's own output",
@@ -181,12 +246,17 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
 )
 
 
-def protocol_sentence(data: bytes) -> str:
-    """Sentence on the protocol of these bytes; "" if unknown."""
+def verified_protocol(data: bytes) -> str:
+    """Sentence on the protocol of which messages in these bytes verify; "" if none."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
             return f"{name} arrives, which is not read here: {remedy}"
-    return _text(data)
+    return ""
+
+
+def protocol_sentence(data: bytes) -> str:
+    """Sentence on the protocol of these bytes; "" if unknown."""
+    return verified_protocol(data) or _text(data)
 
 
 def _text(data: bytes) -> str:

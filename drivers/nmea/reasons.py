@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 
-from drivers.nmea.foreign_protocols import protocol_sentence
+from drivers.nmea.foreign_protocols import protocol_sentence, verified_protocol
 
 REFUSALS = {
     "no_fix": "the receiver has no fix",
@@ -80,6 +80,10 @@ MANY = 3
 """Sentences without a checksum before a report; a single one may have lost its own."""
 FIRST_FIXES = 10
 """First fixes of a cold receiver, which may be two-dimensional for a while."""
+UBX = (
+    "UBX frames arrive, but no NMEA: switch on NMEA output on this port, or have UBX read: "
+    'driver = "ubx" (process: --aid ubx=FILE)'
+)
 CHECKSUMS = (
     "sentences come without a checksum and are not used, for a damaged digit would pass: switch "
     "checksums on at the receiver"
@@ -133,18 +137,16 @@ def wrong_checksums(counters: Counter[str]) -> str:
 
 def nothing_verified(counters: Counter[str], unread: bytes) -> str:
     """Reason why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
-    if wrong := wrong_checksums(counters):
-        return wrong
+    # In a binary protocol some bytes look like sentences without a checksum, or with a wrong one.
+    if found := verified_protocol(unread) or wrong_checksums(counters):
+        return found
     if counters["address_bad"] >= MANY:
         return (
             "sentences arrive whose names are none of NMEA (small letters?), and are not read: "
             "take them as the receiver sends them, or set it to GGA and RMC"
         )
     if counters["ubx_frames"]:
-        return (
-            "UBX frames arrive, but no NMEA: switch on NMEA output on this port, or have UBX read: "
-            'driver = "ubx" (process: --aid ubx=FILE)'
-        )
+        return UBX
     if counters["rtcm_frames"]:
         return "RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
     if counters["ubx_damaged"] >= MANY:
@@ -176,6 +178,8 @@ def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
         )
     if counters["checksum_missing"] >= MANY:
         return CHECKSUMS
+    if counters["ubx_frames"] > counters["sentences"] and not POSITIONS & set(received.used):
+        return UBX  # and a text now and then
     if counters["untimed_epoch"] and POSITIONS & set(received.used):
         return "positions arrive without a time of day, and are not used: give the antenna more sky"
     if counters["bad_field"] and not POSITIONS & set(received.used):

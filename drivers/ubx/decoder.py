@@ -19,6 +19,7 @@ from drivers.ubx.messages import (
     MESSAGES,
     RELPOSNED,
     THREE_D,
+    TIME_ONLY,
     TWO_D,
     NavEpoch,
     UnreadableError,
@@ -132,8 +133,13 @@ def _refusal(epoch: NavEpoch) -> str | None:
         return "status_missing"
     if epoch.fix == DEAD_RECKONING:
         return "dead_reckoning_refused"
-    good = epoch.fix_ok and epoch.fix in (TWO_D, THREE_D, COMBINED)
-    return None if good and epoch.position_valid and epoch.rank else "no_fix"
+    if epoch.fix == TIME_ONLY:
+        return "time_only_refused"
+    if epoch.fix not in (TWO_D, THREE_D, COMBINED) or not epoch.rank:
+        return "no_fix"
+    if not epoch.fix_ok:
+        return "limits_exceeded"
+    return None if epoch.position_valid else "no_fix"
 
 
 def _solution(e: NavEpoch) -> Solution:

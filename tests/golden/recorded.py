@@ -26,7 +26,7 @@ from tests.clock.host_time import Host, S, utc
 from tests.places import DATA, REPOSITORY
 from tests.recording.rig import Rig
 
-RAWX = b"\xb5\x62\x02\x15"
+RAWX, SFRBX = b"\xb5\x62\x02\x15", b"\xb5\x62\x02\x13"
 LATENCY_NS = S // 10
 """From an epoch to its last byte."""
 WALK_NS = utc("2023-08-24T23:59:42")
@@ -85,7 +85,8 @@ class Walk(Rig):
         self._samples = iter(
             zip(table.t_s[first:], table.gyro[first:], table.accel[first:], strict=True)
         )
-        self._epochs = epochs((DATA / "walk_0827" / "gnss.ubx").read_bytes())
+        stream = epochs((DATA / "walk_0827" / "gnss.ubx").read_bytes())
+        self._epochs = _from(begin_s, stream)
         self._sample, self._epoch = next(self._samples), next(self._epochs)
         self._encoder, self._count = CanImu(SIM_IMU), 0
         begin_ns = round(begin_s * 1e9)
@@ -109,11 +110,29 @@ class Walk(Rig):
             self._epoch = next(self._epochs)
 
 
+def _from(begin_s: float, stream: Iterator[tuple[float, bytes]]) -> Iterator[tuple[float, bytes]]:
+    """The stream from an epoch on, with what the satellites broadcast before it."""
+    broadcast = b""
+    for t_s, data in stream:
+        if t_s >= begin_s:
+            yield t_s, broadcast + data
+            broadcast = b""
+        else:
+            broadcast += b"".join(data[at:end] for at, end in frames(data, SFRBX))
+
+
 def epochs(stream: bytes) -> Iterator[tuple[float, bytes]]:
     """The stream cut behind each RXM-RAWX, with its receiver time (s of GPS week)."""
     begin = 0
-    while (at := stream.find(RAWX, begin)) >= 0:
-        (length,) = struct.unpack_from("<H", stream, at + 4)
-        end = at + 8 + length
+    for at, end in frames(stream, RAWX):
         yield struct.unpack_from("<d", stream, at + 6)[0], stream[begin:end]
         begin = end
+
+
+def frames(stream: bytes, of: bytes) -> Iterator[tuple[int, int]]:
+    """Begin and end of each UBX frame of one kind."""
+    end = 0
+    while (at := stream.find(of, end)) >= 0:
+        (length,) = struct.unpack_from("<H", stream, at + 4)
+        end = at + 8 + length
+        yield at, end

@@ -18,6 +18,8 @@ from drivers.measurements import (
     Measurement,
     MonotonicStamp,
     PositionFix,
+    TimeOfDayStamp,
+    UtcStamp,
     WheelSpeed,
 )
 from fusiond.aiding.position import PositionMeasurement
@@ -165,6 +167,28 @@ def test_a_kilohertz_of_fixes_is_left_out_and_named() -> None:
     assert after == {"too_often": 5, "aids": 15}  # for a second it is not believed
     outcomes_of(intake, FIX, rate_of(1000.0, 0.1, 12.0))
     assert len(told) == 2
+
+
+def test_a_backlog_is_not_haste_and_costs_itself_alone() -> None:
+    """What a radio or a server kept comes at once, before its UTC is known: at one instant."""
+    told: list[tuple[str, str]] = []
+    intake = Intake({}, report=lambda code, text: told.append((code, text)))
+
+    def stamped(at_s: float, interval_s: float, *, dated: bool = True) -> Counter[str]:
+        found: Counter[str] = Counter()
+        for k in range(20):
+            utc = UtcStamp(round((1e9 + k * interval_s) * SECOND))
+            stamp = utc if dated else TimeOfDayStamp(7200.0 + k * interval_s)
+            measurements = intake.measurements_of(replace(FIX, stamp=stamp), round(at_s * 1e9), 0.0)
+            found[measurements if isinstance(measurements, str) else "aids"] += 1
+        return found
+
+    assert stamped(3.0, 0.25) == {"aids": 5, "backlog": 15}
+    assert outcomes_of(intake, FIX, rate_of(4.0, 2.0, 3.25)) == {"aids": 8}  # at once again
+    assert stamped(6.0, 0.02, dated=False) == {"aids": 5, "backlog": 15}
+    assert told == []
+    assert stamped(9.0, 0.001)["too_often"] >= 15  # as many a second as they came
+    assert [code for code, _ in told] == ["source_too_fast"]
 
 
 def test_order_of_arrival_and_repetition_are_no_haste() -> None:

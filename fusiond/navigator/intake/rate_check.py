@@ -10,10 +10,15 @@ between them: nobody can tell which, and the mean of repetitions has no smaller 
 
 t is the instant of validity, so that a backlog in which each has its own stamp is as good as one
 that came in time; the sign of a difference is not looked at, since late ones come out of order.
+
+A backlog that comes before the source's UTC is known has one instant, that of its arrival, and
+stamps that advance as they should. Of which instants it is will never be known: what is beyond the
+burst is refused as `backlog`, and the source is not too fast.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 from drivers.measurements import (
@@ -25,6 +30,8 @@ from drivers.measurements import (
     MagneticHeading,
     Measurement,
     PositionFix,
+    TimeOfDayStamp,
+    UtcStamp,
     WheelSpeed,
 )
 from drivers.raw.messages import RawGnssEpoch
@@ -47,6 +54,9 @@ RATES: Mapping[type, tuple[float, str]] = {
 """Largest rate (measurements a second) and description of a source's kind."""
 BURST = 5.0
 """Measurements allowed at once: arrival stamps jitter, and a line that paused delivers a burst."""
+STAMPED = 0.99
+"""Least advance of a device's own stamps in intervals of the rate; seconds since 1970 are known to
+a quarter of a microsecond."""
 CALM_NS = 1_000_000_000
 
 
@@ -55,20 +65,31 @@ class Pace:
 
     def __init__(self, report: Callable[[str, str], None]) -> None:
         self._report = report
-        self._buckets: dict[tuple[str, type], tuple[float, int]] = {}
+        self._buckets: dict[tuple[str, type], tuple[float, int, float]] = {}
         self._fast_ns: dict[tuple[str, type], int] = {}
 
     def refusal(self, m: Measurement | RawGnssEpoch, t_ns: int) -> str | None:
-        """Refusal `too_often`, or None if `m`, valid at `t_ns`, respects its kind's rate."""
+        """Refusal `too_often` or `backlog`, or None if `m`, valid at `t_ns`, respects its kind's
+        rate."""
         kind = type(m)
         if kind not in RATES:
             return None
         rate_hz, what = RATES[kind]
         key = m.source, kind
-        tokens, before_ns = self._buckets.get(key, (BURST, t_ns))
+        match getattr(m, "stamp", None):
+            case UtcStamp(utc_ns):
+                said_s = utc_ns * 1e-9
+            case TimeOfDayStamp(time_of_day_s):
+                said_s = time_of_day_s
+            case _:
+                said_s = math.inf
+        tokens, before_ns, said_before_s = self._buckets.get(key, (BURST, t_ns, math.inf))
         tokens = min(BURST, tokens + abs(t_ns - before_ns) * 1e-9 * rate_hz) - 1.0
-        self._buckets[key] = max(tokens, 0.0), t_ns
+        self._buckets[key] = max(tokens, 0.0), t_ns, said_s
         fast_ns = self._fast_ns.get(key)
+        advanced = math.isfinite(said_s) and (said_s - said_before_s) * rate_hz >= STAMPED
+        if tokens < 0.0 and fast_ns is None and advanced:
+            return "backlog"
         if tokens >= 0.0 and (fast_ns is None or abs(t_ns - fast_ns) >= CALM_NS):
             self._fast_ns.pop(key, None)
             return None

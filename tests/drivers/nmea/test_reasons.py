@@ -123,6 +123,32 @@ def oncore(payload: bytes) -> bytes:
     return b"@@" + body + bytes([reduce(xor, body, 0)]) + b"\r\n"
 
 
+def navcom(payload: bytes) -> bytes:
+    body = b"\xb1" + (len(payload) + 4).to_bytes(2, "little") + payload
+    return b"\x02\x99\x66" + body + bytes([reduce(xor, body, 0)]) + b"\x03"
+
+
+def italk(payload: bytes) -> bytes:
+    return b"<!#\x7f\x03\x00" + bytes([len(payload) // 2]) + payload + b"\x12\x34>"
+
+
+def geostar(payload: bytes) -> bytes:
+    return b"PSGG\x20\x00" + (len(payload) // 4).to_bytes(2, "little") + payload + bytes(4)
+
+
+def superstar(payload: bytes) -> bytes:
+    body = b"\x01\x71\x8e" + bytes([len(payload)]) + payload
+    return body + (sum(body) & 0xFFFF).to_bytes(2, "little")
+
+
+def greis(payload: bytes) -> bytes:
+    return b"~~005" + payload[:5] + b"\nPV%03X" % len(payload) + payload
+
+
+def rtcm_2(payload: bytes) -> bytes:
+    return bytes(0x40 | byte & 0x3F for byte in payload)
+
+
 def tsip(payload: bytes) -> bytes:
     return b"\x10\x8f" + payload.replace(b"\x10", b"\x10\x10") + b"\x10\x03"
 
@@ -161,6 +187,12 @@ def stripped(payload: bytes) -> bytes:
         (mtk, "MTK"),
         (zodiac, "Zodiac"),
         (oncore, "OnCore"),
+        (navcom, "NavCom"),
+        (italk, "iTalk"),
+        (geostar, "GeoStar"),
+        (superstar, "SuperStar"),
+        (greis, "GREIS"),
+        (rtcm_2, "RTCM 2"),
         (tsip, "TSIP"),
         (gpsd, "gpsd's JSON"),
         (stripped, "without its $"),
@@ -179,6 +211,18 @@ def test_a_protocol_that_is_not_read_is_named(make: Callable[[bytes], bytes], na
     assert one.cause == fed(stream).cause
 
 
+def test_what_looks_like_sentences_in_a_binary_protocol_is_not_the_cause() -> None:
+    """gpsd's logs bu303-climbing (SiRF), greis-reset and trimble-res720-dr."""
+    bad = b"$GPGGA,1*00\r\n$GPGGA,1\r\n"
+    for make in (sirf, greis, tsip):
+        assert "protocol" in fed(make(bad) * 2 + bad + make(bad) * 4).cause
+
+
+def test_a_text_now_and_then_beside_ubx_is_not_what_to_switch_on() -> None:
+    """gpsd's log ublox-neo-m8l: TXT of the start, and UBX."""
+    assert 'driver = "ubx"' in fed(made("GNTXT,01,01,02,PF=3FF").encode() + b"\r\n" + UBX * 3).cause
+
+
 @given(st.binary(max_size=4000))
 def test_noise_is_no_protocol_and_costs_little(data: bytes) -> None:
     assert isinstance(protocol_sentence(data), str)
@@ -186,7 +230,20 @@ def test_noise_is_no_protocol_and_costs_little(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "sync", [b"\xa0\xa2", b"\xf1\xd9", b"\xaa\x44\x12", b"$@", b"#AAAA,", b"@@AA"]
+    "sync",
+    [
+        b"~~005",
+        b"<!",
+        b"PSGG",
+        b"\x02\x99\x66",
+        b"\x01\x02\xfd",
+        b"\xa0\xa2",
+        b"\xf1\xd9",
+        b"\xaa\x44\x12",
+        b"$@",
+        b"#AAAA,",
+        b"@@AA",
+    ],
 )
 def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
     assert protocol_sentence((sync + b"\x0f\xff\x0f") * 400) == ""

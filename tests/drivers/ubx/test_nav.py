@@ -127,9 +127,10 @@ def test_velocity_of_sol_is_turned_from_earth_axes() -> None:
 @pytest.mark.parametrize(
     ("frame", "name"),
     [
-        (pvt(flags=0), "no_fix"),
+        (pvt(flags=0), "limits_exceeded"),  # gpsd's log ublox-glo: 275 of 299 epochs
         (pvt(fix=0), "no_fix"),
-        (pvt(fix=5), "no_fix"),
+        (pvt(fix=0, flags=0), "no_fix"),
+        (pvt(fix=5), "time_only_refused"),  # gpsd's logs ublox-lea-m8f, ublox-neo-m8t-s
         (pvt(fix=9), "no_fix"),
         (pvt(flags3=1), "no_fix"),
         (hpposllh(flags=1) + status(), "no_fix"),
