@@ -11,8 +11,9 @@ import json
 import math
 import tomllib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from fusiond.configuration.si_units import sensor_to_body
 from fusiond.files.measurement_csv import read_gnss, read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_from_rpy, rpy_from_dcm
-from fusiond.offline.calibrate import calibrate, files
+from fusiond.offline.calibrate import Calibration, calibrate, files
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
@@ -91,17 +92,40 @@ def typed_rms_m(tmp_path_factory: pytest.TempPathFactory) -> float:
     return outage_rms_m(merged(KNOWN, TYPED), IMU, tmp_path_factory.mktemp("typed"))
 
 
+class Calibrated(NamedTuple):
+    """The drive's samples with the sensor turned, the turn (3, 3), and what was found of it."""
+
+    imu: Path
+    turn: Any
+    found: Calibration
+
+
+@pytest.fixture(scope="module")
+def turned_drive(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[tuple[float, float, float]], Calibrated]:
+    """The drive with its sensor turned, calibrated once for each turn."""
+
+    @cache
+    def made(rpy_deg: tuple[float, float, float]) -> Calibrated:
+        imu = tmp_path_factory.mktemp("turned") / "imu.csv"
+        turn = turned(imu, rpy_deg)
+        found = calibrate(Config.model_validate(KNOWN), files(imu, [("gnss", GNSS)]))
+        return Calibrated(imu, turn, found)
+
+    return made
+
+
 TURNS = pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 0.0), (5.0, 5.0, 5.0)])
 
 
 @recorded
 @TURNS
 def test_a_drive_tells_how_its_sensor_is_mounted(
-    rpy_deg: tuple[float, float, float], tmp_path: Path
+    rpy_deg: tuple[float, float, float],
+    turned_drive: Callable[[tuple[float, float, float]], Calibrated],
 ) -> None:
-    imu = tmp_path / "imu.csv"
-    turn = turned(imu, rpy_deg)
-    found = calibrate(Config.model_validate(KNOWN), files(imu, [("gnss", GNSS)]))
+    _, turn, found = turned_drive(rpy_deg)
     toml = tomllib.loads(found.toml)
     calibrated = merged(KNOWN, toml)
 
@@ -118,11 +142,12 @@ def test_a_drive_tells_how_its_sensor_is_mounted(
 @recorded
 @TURNS
 def test_what_was_calibrated_bridges_outages_as_what_was_typed(
-    rpy_deg: tuple[float, float, float], typed_rms_m: float, tmp_path: Path
+    rpy_deg: tuple[float, float, float],
+    typed_rms_m: float,
+    turned_drive: Callable[[tuple[float, float, float]], Calibrated],
+    tmp_path: Path,
 ) -> None:
-    imu = tmp_path / "imu.csv"
-    turned(imu, rpy_deg)
-    found = calibrate(Config.model_validate(KNOWN), files(imu, [("gnss", GNSS)]))
+    imu, _, found = turned_drive(rpy_deg)
     calibrated = merged(KNOWN, tomllib.loads(found.toml))
     assert outage_rms_m(calibrated, imu, tmp_path) < 1.2 * typed_rms_m
 

@@ -11,8 +11,10 @@ and a class of sensor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -39,19 +41,37 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def _process(
-    folder: Path, outages: list[tuple[float, float]], smooth: bool = False
-) -> tuple[dict[str, Any], Path]:
+class Processed(NamedTuple):
+    """What `process` said, and its table."""
+
+    result: dict[str, Any]
+    solution: TrajectoryTable
+
+
+Outages = Callable[[float, bool], Processed]
+
+
+def _process(out: Path, outages: list[tuple[float, float]], smooth: bool = False) -> Processed:
     """Smoothed, the fixes' errors count as white: the track is the receiver's own, so that what its
     fixes share is in it, and the comparison cannot see what sigma allows for it."""
-    out = folder / "solution.csv"
     config = load_config(REPOSITORY / "config" / "drive_0708.toml")
     if smooth:
         white = config.aiding["gnss"].model_copy(update={"bias_sd_m": 0.0})
         config = config.model_copy(update={"aiding": {**config.aiding, "gnss": white}})
     measurements = [("gnss", DRIVE / "gnss.csv")]
     result = process(config, DRIVE / "imu.csv", measurements, outages, out, smooth=smooth)
-    return result, out
+    return Processed(result, read_solution(out))
+
+
+@pytest.fixture(scope="module")
+def with_outages(tmp_path_factory: pytest.TempPathFactory) -> Outages:
+    """The drive with outages shifted by so many seconds, smoothed or not: processed once each."""
+    out = tmp_path_factory.mktemp("outages") / "solution.csv"
+    return cache(lambda shift_s, smooth: _process(out, _shifted(shift_s), smooth))
+
+
+def _shifted(shift_s: float) -> list[tuple[float, float]]:
+    return [(start + shift_s, length) for start, length in OUTAGES]
 
 
 def _errors(solution: TrajectoryTable, track: GnssTable, rows: Any) -> tuple[Any, Any]:
@@ -66,18 +86,18 @@ def _errors(solution: TrajectoryTable, track: GnssTable, rows: Any) -> tuple[Any
 
 
 def test_follows_the_track_from_nothing_but_the_data(tmp_path: Path) -> None:
-    result, out = _process(tmp_path, [])
+    result, solution = _process(tmp_path / "solution.csv", [])
     assert result["aligned"] == "GNSS course, on the move"
     assert result["mode"] == "navigating"
-    report = compare(read_solution(out), read_truth(DRIVE / "gnss.csv"), after_s=60.0)
+    report = compare(solution, read_truth(DRIVE / "gnss.csv"), after_s=60.0)
     assert report["horizontal_rms_m"] <= 0.10
 
 
-def _in_outages(out: Path, outages: list[tuple[float, float]]) -> tuple[Any, Any]:
+def _in_outages(solution: TrajectoryTable, shift_s: float) -> tuple[Any, Any]:
     """The largest error (m) in each outage, and by epoch whether the track is inside two sigma."""
-    solution, track = read_solution(out), read_gnss(DRIVE / "gnss.csv")
+    track = read_gnss(DRIVE / "gnss.csv")
     largest, inside = [], []
-    for start, length in outages:
+    for start, length in _shifted(shift_s):
         rows = (track.t_s >= start) & (track.t_s < start + length)
         error, sigma = _errors(solution, track, rows)
         largest.append(np.hypot(*error.T).max())
@@ -85,13 +105,12 @@ def _in_outages(out: Path, outages: list[tuple[float, float]]) -> tuple[Any, Any
     return np.array(largest), np.concatenate(inside)
 
 
-def test_outages_and_their_stated_sigma(tmp_path: Path) -> None:
+def test_outages_and_their_stated_sigma(with_outages: Outages) -> None:
     inside = []
     for shift_s in SHIFTS_S:
-        outages = [(start + shift_s, length) for start, length in OUTAGES]
-        result, out = _process(tmp_path, outages)
+        result, solution = with_outages(shift_s, False)
         assert result["sources"]["gnss"]["withheld"] == 8 * 60  # 4 Hz
-        largest, inside_now = _in_outages(out, outages)
+        largest, inside_now = _in_outages(solution, shift_s)
         assert np.sqrt(np.mean(np.square(largest))) <= 5.0
         inside.append(inside_now)
     assert np.concatenate(inside).mean() >= 0.90
@@ -103,18 +122,15 @@ WIDE = pytest.mark.xfail(
 
 
 @pytest.mark.parametrize("smooth", [pytest.param(False, marks=WIDE), True])
-def test_sigma_in_outages_is_not_too_wide(tmp_path: Path, smooth: bool) -> None:
-    inside = []
-    for shift_s in (0.0,) if smooth else SHIFTS_S:
-        outages = [(start + shift_s, length) for start, length in OUTAGES]
-        _, out = _process(tmp_path, outages, smooth=smooth)
-        inside.append(_in_outages(out, outages)[1])
+def test_sigma_in_outages_is_not_too_wide(with_outages: Outages, smooth: bool) -> None:
+    shifts_s = (0.0,) if smooth else SHIFTS_S
+    inside = [_in_outages(with_outages(s, smooth).solution, s)[1] for s in shifts_s]
     assert np.concatenate(inside).mean() <= 0.995
 
 
-def test_smoothed_outages_and_their_stated_sigma(tmp_path: Path) -> None:
-    result, out = _process(tmp_path, OUTAGES, smooth=True)
+def test_smoothed_outages_and_their_stated_sigma(with_outages: Outages) -> None:
+    result, solution = with_outages(0.0, True)
     assert result["smoothed"]["rows"] == result["solution_rows"]
-    largest, inside = _in_outages(out, OUTAGES)
+    largest, inside = _in_outages(solution, 0.0)
     assert np.sqrt(np.mean(np.square(largest))) <= 0.5
     assert inside.mean() >= 0.80

@@ -6,7 +6,7 @@ The whole matrix is run by `make faults`; docs/faults.md has what it found.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path as File
 
 import numpy as np
@@ -16,7 +16,13 @@ from drivers.measurements import PositionFix
 from fusiond.navigation.solution import Solution
 from fusiond.simulation.imu_truth import metres_to_geodetic
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.error_sigma_score import LIE_S, NAVIGATING, Sample, longest_lie_s
+from fusiond.studies.faults.error_sigma_score import (
+    LIE_S,
+    NAVIGATING,
+    Course,
+    Sample,
+    longest_lie_s,
+)
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.hours import hour_of, rates
 from fusiond.studies.faults.library import FAULTS, Fault
@@ -138,6 +144,12 @@ def test_what_is_not_told_yet_is_left_open(fault: str, phase: str, drive: int) -
     assert found["verdict"] == "degraded and said so", found
 
 
+@cache
+def course_on_drawn(fault: str, phase: str, drive: int) -> Course:
+    of = on_random_drive(FAULTS[fault], drive)
+    return run_course(of, phase, seed=drive % 65)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("fault", "phase", "drive"),
     [
@@ -152,8 +164,7 @@ def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) 
     """A slow drift before it can be told, and one that came back while it went on; a fix that is
     the same to the bit at rest; a start of velocities of which two were reversed; a position that
     was blamed by a velocity that had just come back. Town has none of them."""
-    of = on_random_drive(FAULTS[fault], drive)
-    found = run_course(of, phase, seed=drive % 65)  # type: ignore[arg-type]
+    found = course_on_drawn(fault, phase, drive)
     assert found.crash is None
     assert longest_lie_s(found.samples) <= LIE_S
 
@@ -178,7 +189,7 @@ def twice_carried_off(whole: Recording) -> Recording:
 )
 def test_what_lies_while_coasting_is_not_vouched_for(fault: str, phase: str, drive: int) -> None:
     """Mode `navigating` comes when sigma holds again."""
-    found = run_course(on_random_drive(FAULTS[fault], drive), phase, seed=drive % 65)  # type: ignore[arg-type]
+    found = course_on_drawn(fault, phase, drive)
     vouched = [s if s.mode == NAVIGATING else replace(s, ratios=()) for s in found.samples]
     assert longest_lie_s(vouched) <= LIE_S
 
