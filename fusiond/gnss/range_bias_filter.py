@@ -12,7 +12,7 @@ z_k is what the filter predicts less the range with r taken off, so that nu is w
 variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
 errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
 stays alone goes on telling what it told among others. L falls where its two carriers learn the
-delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing.
+delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing, and is out of the mean.
 
 Source: Groves, 2nd edition, 3.2 and 9.4.4.
 """
@@ -85,27 +85,38 @@ def _learn(
     span = t_s - levels[0, _T] if levels[0, _T] > 0.0 else 0.0
     times = max(1.0, 2.0 * MULTIPATH_S / max(span, EVERY_S))
     levels[0, _T] = t_s
+    fits = np.ones(n, np.bool_)
     for system in range(3):
-        total, mean, many = 0.0, 0.0, 0
+        total, mean, many, worst = 0.0, 0.0, 0, 0
+        while worst >= 0:  # the farthest one goes first: it draws the mean
+            total, mean, many, worst = 0.0, 0.0, 0, -1
+            for k in range(n):
+                if clock[k] == system and fits[k]:
+                    w = 1.0 / (values[rk.VARIANCE, k] + place[k])
+                    total += w
+                    mean += w * z[k]
+                    many += 1
+            if many < 2:
+                break
+            mean /= total
+            most = SIGMAS * SIGMAS
+            for k in range(n):
+                if clock[k] == system and fits[k]:
+                    nu = mean - z[k]
+                    square = nu * nu / (values[rk.VARIANCE, k] + place[k])
+                    if square > most:
+                        worst, most = k, square
+            if worst >= 0:
+                fits[worst] = False
         for k in range(n):
-            if clock[k] == system:
-                w = 1.0 / (values[rk.VARIANCE, k] + place[k])
-                total += w
-                mean += w * z[k]
-                many += 1
-        if many < 2:
-            continue
-        mean /= total
-        for k in range(n):
-            spread = values[rk.VARIANCE, k] + place[k]
-            nu = mean - z[k]
-            if clock[k] != system or nu * nu > SIGMAS * SIGMAS * spread:
+            if many < 2 or clock[k] != system or not fits[k]:
                 continue
+            spread = values[rk.VARIANCE, k] + place[k]
             f = 1.0 - 1.0 / (spread * total)
             gain = f * variance[k]
             gain /= f * gain + times * max(spread - variance[k], 0.0)
             known = levels[int(values[rk.SLOT, k])]
-            known[_OFFSET] = offset[k] + gain * nu
+            known[_OFFSET] = offset[k] + gain * (mean - z[k])
             known[_VARIANCE] = (1.0 - gain * f) * variance[k]
 
 

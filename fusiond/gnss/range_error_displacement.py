@@ -54,6 +54,11 @@ it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
+APART_M = 5.0 * 2.0 * PLACE_M
+"""Largest difference of two ranges' errors: five sigma of such a position, between opposite
+satellites."""
+FRESH = 0.5
+"""A satellite's errors are others where two carriers have learned half of their variance."""
 LEAST_M = 1e-3
 """Least K along an axis (m); a sky with less displaces nothing and ends the state."""
 FLOOR_M = 0.2
@@ -63,6 +68,25 @@ HOLDS_S = 30.0
 FLICKERS_S = 3.0
 """Time within which satellites that disappear and return belong to one sky, with unchanged errors.
 """
+
+
+@compiled("i8(f8[:, ::1], i8[::1], b1[::1])")
+def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
+    """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
+
+    One does not that is `APART_M` from more than half of them. Its range is gated, and what is left
+    displaces by itself."""
+    n, odd = clock.shape[0], 0
+    for k in range(n):
+        own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
+        apart = others = 0
+        for j in range(n):
+            if j != k and clock[j] == clock[k]:
+                others += 1
+                apart += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > APART_M
+        marked[k] = others < 2 or 2 * apart <= others
+        odd += not marked[k]
+    return odd
 
 
 @compiled("void(f8[:, ::1], i8)", forceinline=True)
@@ -176,7 +200,9 @@ def displace(
 class Displacement(NamedTuple):
     """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
     two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
-    3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states."""
+    3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states; `gain` (3, n + 2) as
+    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors, and by satellite the
+    least there has been of them."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -185,26 +211,38 @@ class Displacement(NamedTuple):
     root: Array
     back: Array
     shape: Array
+    gain: Array
+    lasting: Array
+    least: dict[str, float]
 
     @classmethod
-    def of(cls, rows: Rows, t_s: float, variance: Array) -> Displacement:
-        """Displacement for an epoch's rows, with residual `variance` (n,) m^2 of lasting errors."""
+    def of(
+        cls, rows: Rows, t_s: float, variance: Array, before: Displacement | None = None
+    ) -> Displacement:
+        """Displacement for an epoch's rows, with residual `variance` (n,) m^2 of lasting errors,
+        after the sky `before`."""
         n = len(rows.satellites)
-        effect, out, left = np.empty((3, n + 2)), np.empty((6, 3)), np.empty((6, 3))
+        gain, effect = np.empty((3, n + 2)), np.empty((3, n + 2))
+        out, left = np.empty((6, 3)), np.empty((6, 3))
         clocks = int(rows.clock.max(initial=0)) + 1
         lasting, of = rows.values[rk.LASTING].copy(), (rows.values, rows.clock, clocks)
         noise = rows.values[rk.VARIANCE] - variance + lasting
         # Fewer satellites than unknowns leave the clock as it was: free, it would take a direction
         # of the place that the displacement of the sky before has.
         free = FREE_M if n >= 3 + clocks else CLOCK_M
-        displace(*of, noise, lasting, free, effect, out)
+        displace(*of, noise, lasting, free, gain, out)
         unknown = variance + FLOOR_M**2
         displace(*of, unknown, unknown, CLOCK_M, effect, left)
         known = np.sqrt(variance / rows.values[rk.LASTING])
         for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
             effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
-        root = out[:3]
-        return cls(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA)
+        root, least = out[:3], {} if before is None else before.least.copy()
+        for name, own in zip(rows.satellites, lasting.tolist(), strict=True):
+            least[name] = min(own, least.get(name, math.inf))
+        return cls(
+            *(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA),
+            *(gain, lasting, least),
+        )
 
     def holds(self, rows: Rows, t_s: float) -> bool:
         """True if the rows have the same satellites within its validity."""
@@ -228,7 +266,29 @@ class Displacement(NamedTuple):
             g = self.effect[:, n + k] - before.effect[:, last + k]
             new += np.multiply.outer(g, g)
         kept: Array = _times(self.back, before.root)
-        return kept, _times(_times(self.back, new), self.back)
+        new = _times(_times(self.back, new), self.back)
+        if any(own < FRESH * before.least.get(name, math.inf) for name, own in self.least.items()):
+            kept, new = self._mixed(before, kept, new)
+        return kept, new
+
+    def _mixed(self, before: Displacement, kept: Array, new: Array) -> tuple[Array, Array]:
+        """Transition and noise with what fresh errors tell, as far as levels know nothing."""
+        n, last = len(self.satellites), len(before.satellites)
+        at = {name: k for k, name in enumerate(before.satellites)}
+        both = np.zeros((3, 3))
+        known: list[float] = []
+        for k, name in enumerate(self.satellites):
+            j = at.get(name)
+            if j is not None:
+                same = min(float(self.lasting[k]), float(before.lasting[j]))
+                both += same * np.multiply.outer(self.gain[:, k], before.gain[:, j])
+                known.append(float(self.variance[k] / self.lasting[k]))
+        for k in range(2):
+            both += np.multiply.outer(self.gain[:, n + k], before.gain[:, last + k])
+        told = _times(_times(self.back, both), before.back)
+        part = sum(known) / len(known) if known else 1.0
+        drawn = np.eye(3) - _times(told, told.T)
+        return kept + part * (told - kept), new + part * (drawn - new)
 
 
 def _times(a: Array, b: Array) -> Array:

@@ -17,7 +17,12 @@ import math
 from drivers.immutable import immutable
 from fusiond.navigation.error_model import FORCE_ERROR, FORCE_SCALE, RATE_ERROR, RATE_SCALE
 
-CLOCK_OFFSET, CLOCK_DRIFT = "clock_offset", "clock_drift"
+CLOCK_OFFSET, CLOCK_DRIFT, CLOCK_RAMP = "clock_offset", "clock_drift", "clock_ramp"
+RAMP_M_S2, RAMP_S = 0.2, 1000.0
+"""One sigma and correlation time of how a clock's drift runs on while its crystal warms or cools: a
+temperature-compensated one is held to 0.5 ppm over 70 K, and by so steep a curve in places that a
+tenth of a kelvin a second is half a ppb a second. A receiver on a walk had 0.17 m/s^2 for two
+minutes; what is left beside it is the drift's walk."""
 CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
 """Antenna position (ECEF, m) at the epoch from which carriers are counted, and the carriers' clock
 since (m): fusiond.aiding.carrier_anchor."""
@@ -167,6 +172,12 @@ def clock_blocks(
             steady=n.drift_steady,
         ),
     ]
+
+
+def clock_ramp() -> Block:
+    """The rate of a clock's drift."""
+    sd = RAMP_M_S2
+    return Block(CLOCK_RAMP, "m/s^2", ("ramp",), (-1,), initial=sd, tau_s=RAMP_S, steady=sd)
 
 
 def carrier_blocks(noise: ClockNoise) -> list[Block]:

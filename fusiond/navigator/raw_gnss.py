@@ -29,7 +29,7 @@ from fusiond.gnss.best_four_satellites import best_four
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.range_bias_filter import RangeBiases, subtract_biases
-from fusiond.gnss.range_error_displacement import Displacement
+from fusiond.gnss.range_error_displacement import Displacement, plausible
 from fusiond.gnss.range_kernel import (
     CARRIER_VARIANCE,
     RANGE_VALUES,
@@ -53,7 +53,10 @@ Array = NDArray[np.float64]
 REMEMBERED_NS = 12_000_000_000
 """Age beyond which epochs are too old for the timeline, which rewinds by ten seconds."""
 NOTHING = np.zeros((3, 3))
-NOWHERE = Displacement(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING)
+NOWHERE = Displacement(
+    *(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING),
+    *(np.zeros((3, 2)), np.zeros(0), {}),
+)
 """Rows of an epoch without satellites."""
 
 
@@ -319,12 +322,15 @@ class RawGnss:
         all."""
         if not rows.satellites:
             return NOWHERE, None
-        memory, t_s = measurement.memory, levels.t_s
+        memory, t_s, variance = measurement.memory, levels.t_s, levels.variance
         memory.levels = levels
+        fits = np.empty(len(rows.satellites), bool)
+        if 0 < plausible(rows.values, rows.clock, fits) < len(fits):
+            rows, variance = rows.only(fits), variance[fits]
         if before is not None and before.holds(rows, t_s):
             memory.displacement = before
             return before, None
-        memory.displacement = now = Displacement.of(rows, t_s, levels.variance)
+        memory.displacement = now = Displacement.of(rows, t_s, variance, before)
         return now, None if before is None else now.carried(before)
 
     def judged(

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.models.blocks import CLOCK_RAMP
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.intake.raw import CLOCK_RAMP
 from fusiond.studies.bds_tight import runs
 from fusiond.studies.daemon_fed_filter import DaemonFedFilter, drive_samples, drive_truth
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error

@@ -111,8 +111,7 @@ def test_a_number_that_has_become_another_satellites() -> None:
     others = tuple(s for s in epoch.signals if s.satellite != name)
     measurement = raw.measurement(replace(epoch, signals=others), 0)
     clean.update(measurement.at(clean.nav))
-    # Within 2 mm: how a sky displaces is reckoned of it as it came in, the gated one among it.
-    assert off(estimator) == pytest.approx(off(clean), abs=2e-3)
+    assert off(estimator) == pytest.approx(off(clean), abs=1e-3)
     # The other way round: the old one's of the next two hours, and then the new one's.
     mended = RawGnss("raw", RawAiding())
     mended.learn(another(sim, int(name[1:]), 7200.0))

@@ -9,7 +9,15 @@ from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.si_units import clock_noise
-from fusiond.models.blocks import Block, carrier_blocks, clock_blocks, position_bias, shared_error
+from fusiond.models.blocks import (
+    CLOCK_RAMP,
+    Block,
+    carrier_blocks,
+    clock_blocks,
+    clock_ramp,
+    position_bias,
+    shared_error,
+)
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
@@ -33,20 +41,6 @@ height. An epoch alone says little of them beyond their sigma. What lasts is in 
 (fusiond.gnss.range_error_displacement)."""
 
 
-CLOCK_RAMP = "clock_ramp"
-RAMP_M_S2, RAMP_S = 0.2, 1000.0
-"""One sigma and correlation time of how a clock's drift runs on while its crystal warms or cools: a
-temperature-compensated one is held to 0.5 ppm over 70 K, and by so steep a curve in places that a
-tenth of a kelvin a second is half a ppb a second. A receiver on a walk had 0.17 m/s^2 for two
-minutes; what is left beside it is the drift's walk."""
-
-
-def ramp() -> Block:
-    """The rate of a clock's drift."""
-    sd = RAMP_M_S2
-    return Block(CLOCK_RAMP, "m/s^2", ("ramp",), (-1,), initial=sd, tau_s=RAMP_S, steady=sd)
-
-
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     """Blocks of raw ranges: a clock offset for each system, drift, shared errors of ranges, and the
     carrier anchor."""
@@ -59,7 +53,7 @@ def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     offsets, drift = clock_blocks(section.systems, clock)
     found = [offsets, drift]
     if section.clock_drift_tau_s is None:
-        found = [offsets, replace(drift, rate=CLOCK_RAMP), ramp()]
+        found = [offsets, replace(drift, rate=CLOCK_RAMP), clock_ramp()]
     if section.bias_sd_m > 0.0:
         tau_s = section.bias_correlation_s
         level, down = RANGE_BIAS
