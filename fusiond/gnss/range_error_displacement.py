@@ -54,7 +54,7 @@ it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
-APART_M = 5.0 * 2.0 * PLACE_M
+OUTLYING_M = 5.0 * 2.0 * PLACE_M
 """Largest difference of two ranges' errors: five sigma of such a position, between opposite
 satellites."""
 FRESH = 0.5
@@ -74,17 +74,17 @@ FLICKERS_S = 3.0
 def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
     """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
 
-    One does not that is `APART_M` from more than half of them. Its range is gated, and what is left
+    One does not that is `OUTLYING_M` from more than half of them. Its range is gated, and what is left
     displaces by itself."""
     n, odd = clock.shape[0], 0
     for k in range(n):
         own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
-        apart = others = 0
+        outlying = others = 0
         for j in range(n):
             if j != k and clock[j] == clock[k]:
                 others += 1
-                apart += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > APART_M
-        marked[k] = others < 2 or 2 * apart <= others
+                outlying += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > OUTLYING_M
+        marked[k] = others < 2 or 2 * outlying <= others
         odd += not marked[k]
     return odd
 
@@ -285,10 +285,10 @@ class Displacement(NamedTuple):
                 known.append(float(self.variance[k] / self.lasting[k]))
         for k in range(2):
             both += np.multiply.outer(self.gain[:, n + k], before.gain[:, last + k])
-        told = _times(_times(self.back, both), before.back)
+        recalled = _times(_times(self.back, both), before.back)
         part = sum(known) / len(known) if known else 1.0
-        drawn = np.eye(3) - _times(told, told.T)
-        return kept + part * (told - kept), new + part * (drawn - new)
+        drawn = np.eye(3) - _times(recalled, recalled.T)
+        return kept + part * (recalled - kept), new + part * (drawn - new)
 
 
 def _times(a: Array, b: Array) -> Array:
