@@ -30,7 +30,8 @@ ONE_THREAD = dict.fromkeys(
 MOST_FALSE_STARTS = 3
 """Deaths in a row before the first item of a chunk: a machine on which nothing can be loaded."""
 _START = (
-    "import sys; sys.path[:] = {path!r}; from fusiond.workers.process import serve; serve({fd})"
+    "import sys; sys.path[:] = {path!r}; "
+    "from fusiond.workers.process import serve_items; serve_items({fd})"
 )
 
 
