@@ -168,7 +168,7 @@ async def retained_messages(
         from fusiond.outputs import broker_access  # noqa: PLC0415
 
         what = broker_access.advice(error, host, port)
-        raise UnansweredError("no_broker", f"no answer of the broker: {what}") from error
+        raise UnansweredError("no_broker", what) from error
     return vehicles
 
 
