@@ -85,7 +85,9 @@ def batch(
     cluster: ClusterAddress = None,
     timeout: Timeout = None,
 ) -> None:
-    """Navigate through many drives, a row of figures each; goes on where it was stopped."""
+    """Navigate through many drives, a row of figures each.
+
+    A batch that was stopped goes on where it was."""
     with compiling():
         from fusiond.batch.batch import run_batch  # noqa: PLC0415
 

@@ -76,7 +76,9 @@ def init(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file.")] = False,
 ) -> None:
-    """Write a first configuration: look at ports and buses, ask for the rest.
+    """Write a first configuration from the devices it finds.
+
+    It looks at ports and buses, and asks for the rest.
 
     Nothing is sent to a device unless --ask-terminal (or your answer) allows it. The file is
     commented and passes `fusiond check`, whose doubts are printed.

@@ -45,7 +45,9 @@ def demo(
         str | None, typer.Option(metavar="NUMBER", help="A paper's model and devices: 000 to 004.")
     ] = None,
 ) -> None:
-    """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
+    """Run the real daemon on a simulated vehicle.
+
+    The last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
 
     with compiling() as widths:
@@ -109,7 +111,9 @@ def doctor(
         bool, typer.Option("--transmit", help="Let an RDSS terminal ask for fixes: it transmits.")
     ] = False,
 ) -> None:
-    """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
+    """Open every port for some seconds and report what is wrong.
+
+    For each port: what arrives, how often, how old, and what is wrong."""
     settings = load_or_exit(config)
     from fusiond.doctor.doctor import doctor as run_doctor  # noqa: PLC0415
 

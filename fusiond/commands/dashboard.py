@@ -39,7 +39,7 @@ def dashboard(
         bool, typer.Option("--commands", help="Whoever has the token may send commands.")
     ] = False,
 ) -> None:
-    """Show a vehicle in the browser: from its broker, or from a recording."""
+    """Show a vehicle in the browser, live or from a recording."""
     import secrets  # noqa: PLC0415
 
     from fusiond.dashboard.serve import (  # noqa: PLC0415

@@ -152,7 +152,7 @@ def model(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Print an error-state model: states, units, noise and initial sigma."""
+    """Print an error-state model: states, units, noise, sigma."""
     from fusiond.commands.model_report import model_report, print_model  # noqa: PLC0415
     from fusiond.models.catalogue import MODELS  # noqa: PLC0415
 

@@ -82,7 +82,7 @@ def process(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Navigate through recorded files with the daemon's own navigator."""
+    """Run the daemon's navigator on recorded files."""
     measurements = [_measurement_argument(text) for text in aid or []]
     outages = [_outage_argument(text) for text in outage or []]
     if out is not None and str(out) == "-" == json_path:
@@ -143,8 +143,9 @@ def calibrate(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Estimate mounting, lever arms, offsets and scales from one recorded drive, as TOML; input:
-    files or a recording of the daemon."""
+    """Estimate mounting, lever arms, offsets, scales from a drive.
+
+    Input: files, or a recording of the daemon. Output: TOML."""
     measurements = [_measurement_argument(text) for text in aid or []]
     if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and measurements):
         raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
@@ -198,8 +199,10 @@ def simulate(
         typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
     ] = None,
 ) -> None:
-    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle; or be its
-    devices, for a daemon of its own."""
+    """Simulate a vehicle: write its files, or act as its devices.
+
+    Files: imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv. With --live it serves as the
+    devices of a daemon."""
     if live is not None:
         if out is not None or gnss_raw is not None or gnss_mask or scenario != "drive":
             raise typer.BadParameter("--live: the scenario drive, without --out and --gnss-...")
@@ -242,7 +245,7 @@ def compare(
     ] = 0.0,
     json_path: JsonPath = None,
 ) -> None:
-    """Compare a solution with a truth: errors, and their ratio to the stated sigma."""
+    """Compare a solution with a truth: errors, and errors by sigma."""
     from fusiond.commands.compare_report import print_report  # noqa: PLC0415
     from fusiond.files.csv_tables import file_report  # noqa: PLC0415
     from fusiond.files.measurement_csv import read_solution, read_truth  # noqa: PLC0415

@@ -64,7 +64,9 @@ def replay(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Run a recording through the daemon's own parts; exit 1 where the bits are not the same."""
+    """Run a recording through the daemon's own parts.
+
+    Exit code 1: the bits differ from the recorded ones."""
     with compiling():
         from fusiond.replay.run import ReplayOptions  # noqa: PLC0415
         from fusiond.replay.run import replay as run_replay  # noqa: PLC0415
@@ -137,7 +139,9 @@ def trim(
     begin: Annotated[float, typer.Option("--from", metavar="S", help="Seconds from its start.")],
     end: Annotated[float, typer.Option("--to", metavar="S", help="Seconds from its start.")],
 ) -> None:
-    """Cut a part out, to replay by itself: it begins at a state of the log before it."""
+    """Cut a part out of a log, to be replayed by itself.
+
+    The part begins at the last state that the log holds before it."""
     from fusiond.recording.edit import trim as cut  # noqa: PLC0415
 
     if end <= begin:
@@ -181,7 +185,7 @@ def export(
         float, typer.Option(metavar="S", min=0.0, help="Least time between points of a track.")
     ] = 0.0,
 ) -> None:
-    """Hand a log on: the track, the measurements as CSV tables, or a bag for ROS."""
+    """Export the track, the measurements as CSV, or a ROS bag."""
     from fusiond.recording.reader import Log  # noqa: PLC0415
     from fusiond.recording.track_export import export as write_track  # noqa: PLC0415
 

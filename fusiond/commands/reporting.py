@@ -34,7 +34,9 @@ def report(
         typer.Option(metavar="F.html", help="The page; here, by the first file's name, if none."),
     ] = None,
 ) -> None:
-    """Write a report of one drive, or of many, as one HTML file that needs no network."""
+    """Write a report of one drive, or of many, as one HTML file.
+
+    The file needs no network."""
     if (batch is None) == (not run) or (batch is not None and (truth or beside)):
         raise typer.BadParameter("a log or a solution, or --batch with rows and nothing else")
     if out is None:

@@ -77,7 +77,9 @@ def status(
     ] = 3.0,
     json_path: JsonPath = None,
 ) -> None:
-    """Ask the running daemon over MQTT: 0 with a usable solution, 1 without, 69 no answer."""
+    """Ask the running daemon for its state, over MQTT.
+
+    Exit codes: 0 a usable solution, 1 none, 69 no answer."""
     import asyncio  # noqa: PLC0415
 
     access = None
@@ -166,7 +168,7 @@ async def retained_messages(
         from fusiond.outputs import broker_access  # noqa: PLC0415
 
         what = broker_access.advice(error, host, port)
-        raise UnansweredError("no_broker", f"no answer of the broker: {what}") from error
+        raise UnansweredError("no_broker", what) from error
     return vehicles
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import ssl
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,7 +81,9 @@ def advice(error: aiomqtt.MqttError, host: str, port: int) -> str:
         if "expired" in why or "not yet valid" in why:
             return f"{why}: renew the broker's certificate, or set this computer's clock"
         return f"{why}: set mqtt.ca_file to the authority that signed the broker's certificate"
-    return f"{why}: is a broker running there (systemctl status mosquitto), is {where} right?"
+    why = re.sub(r"^\[Errno -?\d+\] ", "", why)
+    remedy = "start one (systemctl status mosquitto), or correct its address"
+    return f"no broker answers at {where} ({why}): {remedy}"
 
 
 def _unusable(key: str, path: Path, error: Exception) -> ConfigError:

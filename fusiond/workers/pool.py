@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from fusiond.workers.process import STARTED
+from fusiond.workers.process import STARTED, serve_items
 from fusiond.workers.runner_interface import Ended, Outcome, R, T
 
 ONE_THREAD = dict.fromkeys(
@@ -30,7 +30,9 @@ ONE_THREAD = dict.fromkeys(
 MOST_FALSE_STARTS = 3
 """Deaths in a row before the first item of a chunk: a machine on which nothing can be loaded."""
 _START = (
-    "import sys; sys.path[:] = {path!r}; from fusiond.workers.process import serve; serve({fd})"
+    "import sys; sys.path[:] = {path!r}; "
+    f"from {serve_items.__module__} import {serve_items.__name__}; "
+    f"{serve_items.__name__}({{fd}})"
 )
 
 

@@ -139,7 +139,7 @@ async def test_no_daemon_and_no_broker(tmp_path: Path) -> None:
     port = free_port()
     done = await asked("--mqtt", f"127.0.0.1:{port}", "--json", "-")
     assert done.exit_code == 69
-    assert f"is 127.0.0.1:{port} right?" in done.stderr
+    assert f"no broker answers at 127.0.0.1:{port}" in done.stderr
     assert json.loads(done.stdout)["state"] == "no_broker"
 
 
