@@ -1,5 +1,5 @@
-"""What holds for all tests: how properties are judged, how often garbage is collected, and which
-files come first."""
+"""What holds for all tests: how properties are judged, how often garbage is collected, and in which
+order files come."""
 
 from __future__ import annotations
 
@@ -26,31 +26,57 @@ def pytest_unconfigure() -> None:
     gc.freeze()
 
 
-LONG = (
-    "studies/test_bds_tight",
-    "studies/test_studies",
+COMPUTING = (
     "commands/test_kernel_cache",
+    "studies/test_faults_matrix",
+    "studies/test_bds_tight",
+    "studies/test_reduced_order",
+    "estimators/test_nees_clock",
     "studies/",
     "estimators/test_federated_faults",
-    "live/",
     "offline/",
     "commands/",
-    "estimators/",
     "navigator/",
+    "estimators/",
     "navigation/test_compiled",
-    "demo/",
 )
-"""Files that take ten seconds or more come first, the longest at the head, so that all cores end at
-about the same time."""
+"""Files that compute for ten seconds or more come first, the longest at the head, so that all cores
+end at about the same time."""
+WAITING = (
+    "live/test_messages",
+    "demo/test_papers",
+    "live/test_warm_restart",
+    "demo/",
+    "doctor/test_forward_axis",
+    "live/test_daemon",
+    "live/",
+    "doctor/",
+    "simulation/test_live",
+    "outputs/",
+    "dashboard/",
+)
+"""Files whose devices, brokers and cards keep real time leave their core idle: one comes after two
+that compute, so that seldom more than one of the processes waits."""
+
+
+def file_of(item: pytest.Item) -> str:
+    return item.path.relative_to(Path(__file__).parent).as_posix()
+
+
+def place(file: str, among: tuple[str, ...]) -> int:
+    return next((k for k, begin in enumerate(among) if file.startswith(begin)), len(among))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those of `LONG` first; the tests of a file keep their order."""
-
-    here = Path(__file__).parent
-
-    def place(item: pytest.Item) -> int:
-        name = item.path.relative_to(here).as_posix()
-        return next((k for k, long in enumerate(LONG) if name.startswith(long)), len(LONG))
-
-    items.sort(key=place)
+    """Files in the order above; the tests of a file keep theirs."""
+    files = list(dict.fromkeys(map(file_of, items)))
+    waiting = [file for file in files if file.startswith(WAITING)]
+    computing = [file for file in files if not file.startswith(WAITING)]
+    waiting.sort(key=lambda file: place(file, WAITING))
+    computing.sort(key=lambda file: place(file, COMPUTING))
+    order: list[str] = []
+    while waiting or computing:
+        order += [*waiting[:1], *computing[:2]]
+        del waiting[:1], computing[:2]
+    rank = {file: k for k, file in enumerate(order)}
+    items.sort(key=lambda item: rank[file_of(item)])

@@ -55,6 +55,12 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 reply = await ask("request_fix", {})
                 assert reply["ok"], reply
                 assert reply["text"]
+                reply = await ask("inject", {"source": "roof", "fault": "drop", "duration_s": 1.0})
+                assert (reply["ok"], "there are imu, gnss, rdss" in reply["text"]) == (False, True)
+                reply = await ask("inject", {"source": "imu", "fault": "drop", "duration_s": 1.0})
+                assert (reply["ok"], reply["text"]) == (True, "imu: drop for 1 s")
+                await bench.mode(Mode.INVALID)
+                await until(lambda: bench.events("injection_ended") != [])
                 reply = await ask("reset_filter", {})
                 assert (reply["ok"], reply["text"]) == (True, "aligning again")
                 await bench.mode(Mode.ALIGNING)
@@ -78,12 +84,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["text"] == "position taken: aligning from it"
                 await bench.mode(Mode.ALIGNING)
                 await ask("set_position", here)
-                reply = await ask("inject", {"source": "roof", "fault": "drop", "duration_s": 1.0})
-                assert (reply["ok"], "there are imu, gnss, rdss" in reply["text"]) == (False, True)
-                reply = await ask("inject", {"source": "imu", "fault": "drop", "duration_s": 1.0})
-                assert (reply["ok"], reply["text"]) == (True, "imu: drop for 1 s")
-                await bench.mode(Mode.INVALID)
-                await until(lambda: bench.events("injection_ended") != [])
+                await listener.until(lambda li: "gated" in _judged(li))
                 reply = await ask("stop_recording", {})
                 assert reply["ok"], reply
                 reply = await ask("start_recording", {})
@@ -93,12 +94,11 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
     status = [json.loads(p) for p in listener.payloads("fusiond/test/status")]
     assert ["imu: drop for 1 s"] in [m["injected"] for m in status]
     assert {"recording", "off"} >= {m["recording"] for m in status}
-    bundles = [json.loads(p) for p in listener.payloads("fusiond/test/innovations")]
-    told = [one for bundle in bundles for one in bundle["innovations"]]
-    fixes = {one["outcome"]: one for one in told if one["source"] == "operator"}
+    fixes = _judged(listener)
     assert {"fused", "gated"} <= fixes.keys()
     assert fixes["gated"]["nis"] > 1e6 > fixes["fused"]["nis"] >= 0.0
-    assert not any("zero" in one["source"] for one in told)  # constraints are not told
+    sources = {one["source"] for one in _innovations(listener)}
+    assert not any("zero" in source for source in sources)  # constraints are not told
     first, second = sorted((tmp_path / "logs").iterdir(), key=lambda p: p.stat().st_mtime)
     again = replay([first], ReplayOptions())  # commands and all
     assert again["identical"] is True, again["first_difference"]
@@ -107,6 +107,17 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
     channels = {message.topic for message in Log([first]).messages()}
     assert "/innovation" in channels
     assert "/innovations" not in channels
+
+
+def _innovations(listener: Listener) -> list[dict[str, Any]]:
+    bundles = [json.loads(p) for p in listener.payloads("fusiond/test/innovations")]
+    return [one for bundle in bundles for one in bundle["innovations"]]
+
+
+def _judged(listener: Listener) -> dict[str, dict[str, Any]]:
+    """The operator's fixes, as innovations tell of them, by their outcome."""
+    told = _innovations(listener)
+    return {one["outcome"]: one for one in told if one["source"] == "operator"}
 
 
 async def _ask(

@@ -7,6 +7,8 @@ import json
 import struct
 import tracemalloc
 import zlib
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -52,32 +54,47 @@ def lz4(data: bytes) -> bytes:
     return bytes(importlib.import_module("lz4.frame").compress(data))
 
 
-HUGE = bytes(400 * MEGABYTE)
 LITTLE = 1000
 
-HOSTILE = {
-    "says much": (chunk(len(HUGE), zstd(HUGE, sized=True)), "at most"),
-    "says all that there is": (chunk((1 << 63) - 1, b""), "at most"),
-    "says little": (chunk(LITTLE, zstd(HUGE, sized=True)), "1001 bytes when decompressed"),
-    "says little, and its frame nothing": (chunk(LITTLE, zstd(HUGE, sized=False)), "1001 bytes"),
-    "says little in lz4": (chunk(LITTLE, lz4(HUGE), b"lz4"), "1001 bytes"),
-    "has less than it says": (chunk(LITTLE, zstd(b"ab", sized=True)), "2 bytes when decompressed"),
+
+@cache
+def huge() -> bytes:
+    return bytes(400 * MEGABYTE)
+
+
+# Made when a test asks: to compress it takes seconds, in every process that collects the tests.
+HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
+    "says much": (lambda: chunk(len(huge()), zstd(huge(), sized=True)), "at most"),
+    "says all that there is": (lambda: chunk((1 << 63) - 1, b""), "at most"),
+    "says little": (
+        lambda: chunk(LITTLE, zstd(huge(), sized=True)),
+        "1001 bytes when decompressed",
+    ),
+    "says little, and its frame nothing": (
+        lambda: chunk(LITTLE, zstd(huge(), sized=False)),
+        "1001 bytes",
+    ),
+    "says little in lz4": (lambda: chunk(LITTLE, lz4(huge()), b"lz4"), "1001 bytes"),
+    "has less than it says": (
+        lambda: chunk(LITTLE, zstd(b"ab", sized=True)),
+        "2 bytes when decompressed",
+    ),
     "is long for what it is made of": (
-        chunk(RATIO_FREE * 2, zstd(bytes(RATIO_FREE * 2), sized=True)),
+        lambda: chunk(RATIO_FREE * 2, zstd(bytes(RATIO_FREE * 2), sized=True)),
         "at most",
     ),
-    "is compressed by what we lack": (chunk(1, b"a", b"brotli"), "'brotli'"),
-    "has another checksum": (chunk(2, b"ab", b"", crc=1), "checksum"),
-    "is no frame of zstd": (chunk(2, b"ab"), "damaged chunk"),
+    "is compressed by what we lack": (lambda: chunk(1, b"a", b"brotli"), "'brotli'"),
+    "has another checksum": (lambda: chunk(2, b"ab", b"", crc=1), "checksum"),
+    "is no frame of zstd": (lambda: chunk(2, b"ab"), "damaged chunk"),
 }
 
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_chunk_that_is_none_is_left_out_and_costs_no_memory(case: str, tmp_path: Path) -> None:
-    record, why = HOSTILE[case]
+    make, why = HOSTILE[case]
     sound = b"\x05" + struct.pack("<QHIQQ", 24, 1, 0, 9, 9) + b"{}"
     last = chunk(len(sound), sound, b"", zlib.crc32(sound))
-    path = log_with(tmp_path / "a.mcap", record, last)
+    path = log_with(tmp_path / "a.mcap", make(), last)
     tracemalloc.start()
     try:
         log = Log([path])
