@@ -1,7 +1,13 @@
 r"""Zero-velocity and zero-rate updates, once the vehicle is confirmed at rest.
 
     z = v^ - 0 = dv + v
-    z = mean of w^ over the window - C^T w_ie = e + v
+    z = mean of w^ over the window - C^T w_ie = e + C^T (w_ie x phi) + v
+
+e is what the gyros are wrong by, and what turns a vehicle at rest in the navigation equations is
+phi' = -(C e + w_ie x phi) = -C z: no heading is in it. A row of e alone takes what the Earth puts
+on level gyros for theirs, and then the level, which turns with it, tells the heading of any gyro,
+5 deg to 4.4 in 200 s. With its column only what is known of e by itself tells a heading, as a
+gyrocompass does: sigma_e / (w_ie cos lat), 6 deg for 1 deg/h.
 
 The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill).
 Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a hypothesis, which
@@ -58,6 +64,8 @@ from fusiond.aiding.base import (
 from fusiond.aiding.rest_evidence import Measured, RestEvidence
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
+from fusiond.navigation.error_model import PHI
+from fusiond.navigation.rotation import skew
 from fusiond.navigation.standstill import Window
 from fusiond.navigation.strapdown import LAT, VN
 
@@ -75,12 +83,16 @@ CREEP_LASTS_S = 3.0
 SCATTERS = 0.95
 
 
+def _earth_rate(state: State) -> Array:
+    """w_ie (3,), north, east, down."""
+    lat = state.nav[LAT]
+    return EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
+
+
 def _rate_error(state: State, mean_rate: Array) -> Array:
     """Mean rates (3,) or (k, 3) less the estimated bias and the Earth's rate."""
-    lat = state.nav[LAT]
     bias = np.array([sum(state.xi[s] for s in state.model.parameters(9 + j)) for j in range(3)])
-    earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
-    error: Array = mean_rate - bias - state.dcm.T @ earth
+    error: Array = mean_rate - bias - state.dcm.T @ _earth_rate(state)
     return error
 
 
@@ -227,5 +239,6 @@ class ZeroAngularRateUpdate(AidingMeasurement):
         model = state.model
         h = np.zeros((3, model.size))
         rate_columns(h, slice(None), model, np.eye(3))
+        h[:, PHI : PHI + 3] = state.dcm.T @ skew(_earth_rate(state))
         z = _rate_error(state, np.array(self.mean_rate))
         return Innovation(z, h, self.sd_rad_s**2 + self.rest.creeps(state))

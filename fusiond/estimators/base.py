@@ -76,7 +76,8 @@ class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
     L^-1 nu with S = L L^T). `rows`: of a screened measurement, what became of each row
     (fusiond.estimators.update_with_exclusion); `whitened` is then 0 where a row was left out.
-    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts."""
+    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts.
+    `first`: innovation of the first row of one that a Kalman filter has fused at once, else NaN."""
 
     name: str
     nis: float = float("nan")
@@ -84,6 +85,7 @@ class Outcome(NamedTuple):
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
     lasting: tuple[float, ...] = ()
+    first: float = float("nan")
 
 
 class Snapshot(NamedTuple):

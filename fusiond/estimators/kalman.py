@@ -93,7 +93,7 @@ class KalmanEstimator(Estimator):
             if nis < math.inf and of_bank[0].size:
                 account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_bank)
         if nis <= threshold:
-            return Outcome("fused", nis, degrees, tuple(y.tolist()))
+            return Outcome("fused", nis, degrees, tuple(y.tolist()), first=z.item(0))
         if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
         return Outcome("gated", nis, degrees)

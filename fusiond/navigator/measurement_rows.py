@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -119,15 +120,17 @@ class MeasurementRows:
     def went_on(self, entries: Sequence[Entry], results: Array) -> list[Outcome]:
         """Update the series of a batch with its results; the outcomes."""
         outcomes = []
-        for entry, result in zip(entries, results[:, :INNOVATION].tolist(), strict=True):
-            became, nis, moves, count, *whitened = result
+        for entry, result in zip(entries, results[:, : INNOVATION + 1].tolist(), strict=True):
+            became, nis, moves, count, *whitened, first = result
             if (span := entry.span) is not None:
                 span.t_ns, span.value = entry.key[0], entry.value
                 if moves:
                     span.moved += 1
             name, degrees = ENDS[int(became)], int(count)
-            shown = tuple(whitened[:degrees]) if name == "fused" else ()
-            outcomes.append(Outcome(name, nis, degrees, shown))
+            fused = name == "fused"
+            shown = tuple(whitened[:degrees]) if fused else ()
+            of_first = first if fused else math.nan
+            outcomes.append(Outcome(name, nis, degrees, shown, first=of_first))
         for span in self._spans:
             if (one := span.one) is not None and span.t_ns:
                 one.went_on(span.t_ns, span.value, span.moved)

@@ -25,6 +25,8 @@ from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 GATE = 0.9999
 """Gate probability, as the measured measurements' default."""
 
+NO_SLIDING = "non_holonomic"
+
 
 class Sensed(NamedTuple):
     """The windows that have ended, and the measurements that hold."""
@@ -51,7 +53,7 @@ class ConstraintMaker:
     """Maker of the constraints of `[constraints]` from samples in chunks of any size.
 
     `noise` is the IMU's; `rest_evidence` hears of what is measured; `drifts` say how much of the
-    typed side drift counts.
+    typed side drift and its white noise counts.
     """
 
     def __init__(self, options: Constraints, noise: ImuNoise, drifts: DriftLevels) -> None:
@@ -98,16 +100,19 @@ class ConstraintMaker:
         while (row := next_cell(imu.times, row, imu.end, width, self._last_cell)) >= 0:
             self._last_cell = int(imu.times[row]) // width
             rows.append(row)
-        return [
-            NonHolonomicConstraint(
-                "non_holonomic",
-                int(imu.times[row]),
-                GATE,
-                o.sd_m_s,
-                o.sd_down_m_s,
-                o.min_speed_m_s,
-                o.lever_arm_m,
-                self._drifts.counts(SIDE_DRIFT, int(imu.times[row])),
+        found: list[AidingMeasurement] = []
+        for row in rows:
+            t_ns, white = int(imu.times[row]), self._drifts.white
+            found.append(
+                NonHolonomicConstraint(
+                    NO_SLIDING,
+                    t_ns,
+                    GATE,
+                    o.sd_m_s * white.counts(NO_SLIDING, t_ns, o.sd_m_s, o.drift_s),
+                    o.sd_down_m_s,
+                    o.min_speed_m_s,
+                    o.lever_arm_m,
+                    self._drifts.counts(SIDE_DRIFT, t_ns),
+                )
             )
-            for row in rows
-        ]
+        return found

@@ -104,16 +104,16 @@ class Navigator:
         self.verdicts = verdicts_of(config, self.model, self._event)
         self._failed = FailedMeasurements(self._event)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
+        self._drifts = DriftLevels(self.model)
         self.trial = StartTrial(self._options, self._event)
         self.outcome_watch = OutcomeWatch(
             *(round(e.coast_after_s * 1e9), self.trial, self._protection, self._failed),
-            *(self.verdicts, on_outcome),
+            *(self.verdicts, self._drifts.white, on_outcome),
         )
         self.timeline = Timeline(
             *(self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self.outcome_watch.receive),
             kinds if self.estimator.hypotheses is not None else (),
         )
-        self._drifts = DriftLevels(self.model)
         self._intake.count_drifts(self._drifts)
         self._constraints = ConstraintMaker(config.constraints, self._noise, self._drifts)
         self._service_events = ServiceEvents(self.timeline, self._event)
@@ -148,11 +148,13 @@ class Navigator:
             self._intake.take_up(noise.fixes)
             self._imu_noise.take_up(self.imu, noise.predictions, noise.shares)
             self._drifts.take_up(noise.drifts)
+            self._drifts.white.take_up(noise.whites)
 
     def shown_noise(self, utc_s: float | None) -> SavedNoise:
         """Observed noise of receivers, inertial unit and vehicle until that time (POSIX)."""
         of_samples = self._imu_noise.shown
-        return SavedNoise(utc_s, self._intake.fixes_shown, *of_samples, self._drifts.shown)
+        of_vehicle = self._drifts.shown, self._drifts.white.shown
+        return SavedNoise(utc_s, self._intake.fixes_shown, *of_samples, *of_vehicle)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""

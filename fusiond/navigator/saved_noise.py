@@ -2,10 +2,10 @@
 
 Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
 divide (fusiond.aiding.fix_errors), which share of what the samples show is noise
-(fusiond.navigator.imu_noise_share), and how much of typed drifts there is
-(fusiond.navigator.sensor_drift_magnitudes). The next drive is through other streets, so no more
-than `CARRIED` of it counts: two of ten minutes, which two minutes of it outweigh. A week on,
-antenna and load may be others: less by e.
+(fusiond.navigator.imu_noise_share), and how much of typed drifts and white noise there is
+(fusiond.navigator.sensor_drift_magnitudes, fusiond.navigator.sensor_white_noise). The next drive is
+through other streets, so no more than `CARRIED` of it counts: two of ten minutes, which two minutes
+of it outweigh. A week on, antenna and load may be others: less by e.
 """
 
 from __future__ import annotations
@@ -30,20 +30,23 @@ Sum = Annotated[float, Field(ge=-MOST_SHOWN, le=MOST_SHOWN)]
 Sums = Annotated[tuple[Sum, ...], Field(min_length=SHOWN, max_length=SHOWN)]
 Shown = Annotated[tuple[Sum, ...], Field(min_length=3 * len(GRID), max_length=3 * len(GRID))]
 
+Pairs = Annotated[tuple[Sum, ...], Field(min_length=2, max_length=2)]
 Level = Annotated[tuple[Sum, ...], Field(min_length=1 + len(LEVELS), max_length=1 + len(LEVELS))]
 
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedNoise:
     """Sums of each receiver's fixes by name; log likelihoods of shares of the samples' noise, of
-    how many predictions; of levels of drifts by block, after the number of instants; POSIX time
-    (s), where it was known. Raises pydantic's `ValidationError` for what is none."""
+    how many predictions; of levels of drifts by block, after the number of instants; number and sum
+    of a sensor's pairs of innovations by source; POSIX time (s), where it was known. Raises
+    pydantic's `ValidationError` for what is none."""
 
     utc_s: Annotated[float, Field(ge=0.0, le=1e11)] | None
     fixes: Annotated[dict[Name, Sums], Field(max_length=64)]
     predictions: Annotated[float, Field(ge=0.0, le=1e3)]
     shares: Shown
     drifts: Annotated[dict[Name, Level], Field(max_length=64)] = field(default_factory=dict)
+    whites: Annotated[dict[Name, Pairs], Field(max_length=64)] = field(default_factory=dict)
 
     def at(self, now_utc_s: float | None) -> SavedNoise:
         """The part that counts for a start at that time; where nobody knows how old it is, as of a
@@ -55,5 +58,7 @@ class SavedNoise:
         fixes = {name: tuple(weight * x for x in sums) for name, sums in self.fixes.items()}
         shares = tuple(weight * x for x in self.shares)
         drifts = {name: tuple(weight * x for x in level) for name, level in self.drifts.items()}
+        whites = {name: tuple(weight * x for x in pairs) for name, pairs in self.whites.items()}
         known = weight * self.predictions
-        return replace(self, fixes=fixes, predictions=known, shares=shares, drifts=drifts)
+        found = replace(self, fixes=fixes, predictions=known, shares=shares)
+        return replace(found, drifts=drifts, whites=whites)

@@ -41,6 +41,7 @@ from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
 from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
+from fusiond.navigator.sensor_white_noise import WhiteNoise
 
 Array = NDArray[np.float64]
 
@@ -89,6 +90,9 @@ class DriftLevels:
 
     def __init__(self, model: Model) -> None:
         self._drifts: dict[str, _Drift] = {}
+        self.white = WhiteNoise()
+        """White noise of the same sensors."""
+        self._moved = False
         for block in model.blocks:
             if block.name.startswith(TYPED) and block.steady > 0.0:
                 weight = min(1.0, 0.5e-9 * EVERY_NS / block.tau_s)
@@ -117,7 +121,9 @@ class DriftLevels:
     def look(self, e: Estimator) -> None:
         """Evaluate the filter's state at an instant of the grid, once nothing earlier can
         arrive."""
-        if speed_of(e.nav) < MOVES_M_S:
+        moved, self._moved = self._moved, speed_of(e.nav) >= MOVES_M_S
+        self.white.settle(e.t_ns, e.t_ns + COUNTS_NS, moved and self._moved)
+        if not self._moved:
             return
         for drift in self._drifts.values():
             p, s2 = float(e.covariance[drift.slot, drift.slot]), drift.variance

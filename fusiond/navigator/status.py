@@ -26,6 +26,7 @@ from fusiond.navigator.imu_screening import BEARABLE_YAW_RAD, ImuScreening
 from fusiond.navigator.imu_unit_check import RateUnits
 from fusiond.navigator.mode_reasons import joined, reason
 from fusiond.navigator.protection_events import ProtectionWatch
+from fusiond.navigator.sensor_white_noise import WhiteNoise
 from fusiond.navigator.timeline import JUDGED, Entry
 
 COURSE_M_S = 3.0
@@ -123,10 +124,12 @@ class OutcomeWatch:
         protection: ProtectionWatch,
         failed: FailedMeasurements,
         verdicts: Verdicts,
+        white: WhiteNoise,
         on_outcome: Callable[[Entry], None] | None,
     ) -> None:
         self._coast_after_ns, self._trial, self._protection = coast_after_ns, trial, protection
         self._failed, self.verdicts, self._on_outcome = failed, verdicts, on_outcome
+        self._white = white
         self.refused: dict[str, Counter[str]] = {}
         """Refusals at the door by source and name."""
         self.fused_ns: dict[str, int] = {}
@@ -153,6 +156,7 @@ class OutcomeWatch:
         if outcome is None:
             return
         name, source = outcome.name, measurement.source
+        self._white.receive(source, entry.key[0], outcome.first)
         if self._trial.warm is not None and measurement.locates:
             self._trial.warm.judge(source, name)
         if name == "fused":

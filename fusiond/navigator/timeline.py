@@ -283,7 +283,9 @@ class Timeline:
                 measurement = measurement.at(estimator.nav)
             entry.raw = raw_innovation(measurement, estimator) if self.keeps_raw else None
             if self._isolates:
-                return estimator.update(measurement)
+                outcome = estimator.update(measurement)
+                self._rests(measurement, outcome)
+                return outcome
             one = diagnosis.comes(measurement, estimator)
             if one.stale and not one.out:
                 return Outcome("repeated")
@@ -293,8 +295,7 @@ class Timeline:
                 )
             else:
                 outcome = estimator.update(measurement, one.noise)
-            if measurement.constraint and measurement.rests_s:
-                estimator.step[STEP_RESTS_S] = measurement.rests_s * (outcome.name == "fused")
+            self._rests(measurement, outcome)
             if outcome.name in JUDGED:
                 correction = diagnosis.judge(measurement, one, outcome, estimator)
                 if correction is not None:
@@ -303,6 +304,11 @@ class Timeline:
             entry.error = repr(error)
             return Outcome("failed")
         return outcome
+
+    def _rests(self, measurement: AidingMeasurement, outcome: Outcome) -> None:
+        """Keep what a measurement of rest proves, for the propagation from here on."""
+        if measurement.constraint and measurement.rests_s:
+            self.estimator.step[STEP_RESTS_S] = measurement.rests_s * (outcome.name == "fused")
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome

@@ -24,7 +24,6 @@ from fusiond.navigator.alignment.start import (
     Start,
     as_geodetic,
     build_start,
-    turned_at_rest,
 )
 from fusiond.navigator.mode_reasons import reason
 
@@ -75,7 +74,7 @@ def _at_standstill(
         heading=candidate,
         grades=by.known.unit.grades(standstill, *bias, gravity(lat, float(place[1][2]))),
     )
-    return turned_at_rest(by.model, start, place, dcm) if wide else start
+    return replace(start, turns=wide)
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:

@@ -4,7 +4,7 @@ covariance."""
 from __future__ import annotations
 
 import math
-from dataclasses import field, replace
+from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
@@ -199,9 +199,9 @@ def build_start(
     p[2, 2] = sd_yaw**2
     p[3:6, 3:6] = np.diag(np.maximum(sd_velocity, LEAST_VELOCITY_SD) ** 2)
     p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, sd_height**2])
-    xi = np.zeros(model.size)
+    xi, by = np.zeros(model.size), np.eye(model.size)
     if bias is not None:
-        _start_biases(model, p, xi, *bias)
+        _start_biases(model, p, xi, by, dcm if levelled is None else levelled.dcm, lat, *bias)
     if unexplained is not None:
         for axis in range(3):
             slot = model.parameters(9 + axis)[0]
@@ -213,7 +213,6 @@ def build_start(
         _correlate(model, p, levelled.dcm, lat, height, compassed)
     if heading is not None and heading.shared:
         _by_heading(model, p, heading)
-    by = np.eye(model.size)
     if fix is not None:
         _by_fix(model, by, fix, dcm, velocity)
     if moves is not None:
@@ -302,33 +301,26 @@ def _take_fitted(
                 p[slot, scale] = p[scale, slot] = shared
 
 
-def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
-    """Start at rest with an unknown heading.
+def _start_biases(
+    model: Model, p: Array, xi: Array, by: Array, dcm: Array, lat: float, bias: Array, sd: float
+) -> None:
+    """Set the rate bias at rest, where it is better known than by the data sheet.
 
-    The rate that was felt is that of a vehicle at rest, whatever its heading: as much of the
-    Earth's level rate w as psi puts on the east axis is in the bias, db = w psi (C^T)_E, or
-    standing still would tell the heading of the start.
+    The rate that was felt is that of a vehicle at rest, whatever its attitude `dcm`: as much of the
+    Earth's as phi puts on other axes is in the bias, db = -C^T (w_ie x phi), rows of `by` (n, n).
+    Without it standing still would tell the heading of the start (fusiond.aiding.standstill).
     """
-    by_turn = np.eye(len(start.xi))
-    for axis in range(3):
-        slot = model.parameters(9 + axis)[0]
-        prior = start.grades[axis] * model.initial[slot] ** 2
-        taken = 1.0 - float(start.covariance[slot, slot] / prior)
-        rate = EARTH_RATE_RAD_S * math.cos(float(place[1][0])) * float(dcm[1, axis])
-        by_turn[slot, PHI + 2] = taken * rate
-    p = by_turn @ start.covariance @ by_turn.T
-    return replace(start, covariance=p, turns=True)
-
-
-def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> None:
-    """Set the rate bias at rest, where it is better known than by the data sheet."""
+    earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
+    by_attitude = dcm.T @ skew(earth)
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
         prior = p[slot, slot]
         floor = LEVEL_SD_RAD / BIAS_SETTLING_S
         variance = sd**2 + floor**2
-        xi[slot] = bias[axis] * prior / (prior + variance)
-        p[slot, slot] = prior * variance / (prior + variance)
+        taken = prior / (prior + variance)
+        xi[slot] = bias[axis] * taken
+        p[slot, slot] = taken * variance
+        by[slot, PHI : PHI + 3] = -taken * by_attitude[axis]
 
 
 def _correlate(

@@ -44,7 +44,9 @@ def measurements_of(
     found = _declination(o, sections)
     if isinstance(found, str):
         return found
-    sd_rad = math.hypot(o.sd_deg * DEG * o.sigma_scale, m.rounding_sd_rad)
+    own_rad, rounding_rad = o.sd_deg * DEG * o.sigma_scale, m.rounding_sd_rad
+    counted = m.source, when.t_ns, own_rad, o.disturbance_s, rounding_rad
+    sd_rad = math.hypot(own_rad * sections.white_counts(*counted), rounding_rad)
     names = _names(m.source, o, sections)
     counts = sections.drift_counts(names[1], when.t_ns)
     lasting = math.hypot(o.deviation_sd_deg, o.disturbance_sd_deg * counts) * DEG

@@ -72,6 +72,14 @@ class Sections:
         """Factor of a typed drift that counts for a measurement of `t_ns`."""
         return 1.0 if self.drifts is None else self.drifts.counts(block, t_ns)
 
+    def white_counts(
+        self, source: str, t_ns: int, sd: float, lasts_s: float, rounding_sd: float
+    ) -> float:
+        """Factor of a typed white noise that counts for a measurement of `t_ns`."""
+        if self.drifts is None:
+            return 1.0
+        return self.drifts.white.counts(source, t_ns, sd, lasts_s, rounding_sd)
+
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """Set `gate_probability` by section for further measurements."""
         changed = {

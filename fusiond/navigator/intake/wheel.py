@@ -29,10 +29,12 @@ _ERRORS = WHEEL_DRIFT, WHEEL_SCALE, WHEEL_LATENCY, WHEEL_ROUNDING
 def measurements_of(m: WheelSpeed, sections: Sections, when: Instants) -> list[AidingMeasurement]:
     """Speed, with the section's sigma where the device states none, and its rounding error."""
     o = sections.of(m.source, WheelAiding)
-    sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
     drift, scale, latency, rounding = sections.each_own(_ERRORS, m.source, o)
     t_ns = when.t_ns - round(o.latency_s * 1e9)
     counts = sections.drift_counts(drift, t_ns)
+    sd_m_s = (m.sd_m_s or o.sd_m_s) * o.sigma_scale
+    sd_m_s *= sections.white_counts(m.source, t_ns, sd_m_s, o.drift_s, m.rounding_sd_m_s)
+    sd_m_s = math.hypot(sd_m_s, m.rounding_sd_m_s)
     return [
         WheelSpeedMeasurement(
             m.source,
