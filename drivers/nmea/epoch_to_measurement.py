@@ -23,7 +23,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.epoch_assembly import INTEGRATED, Epoch
-from drivers.nmea.geoid_fallback import Geoid
+from drivers.nmea.geoid_fallback import Geoid, states_geoid
 from drivers.nmea.reasons import Received, count_name
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
@@ -176,7 +176,7 @@ class EpochConverter:
             self.counters["height_not_measured"] += 1
         else:
             height, geoid_sd_m = self._geoid.height(altitude, separation, lat_deg, lon_deg)
-            if not separation:
+            if not states_geoid(separation):
                 self.counters["height_above_sea"] += 1
         sd_ned_m = epoch.sd_ned_m
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:

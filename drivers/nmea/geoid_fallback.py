@@ -2,10 +2,11 @@
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
-N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. 0 to the
-last digit says that a receiver has no model of the geoid: the places where that is N are one in a
-thousand, those whose altitude is one above the ellipsoid cannot be told from the others. A receiver
-that has printed N once is remembered: on the way since it has changed by the slope of the geoid.
+N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. What lies
+beyond is none (999.9, of a receiver without a model). 0 to the last digit says that, too: the
+places where that is N are one in a thousand, those whose altitude is one above the ellipsoid cannot
+be told from the others. A receiver that has printed N once is remembered: on the way since it has
+changed by the slope of the geoid.
 Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
 """
 
@@ -17,10 +18,17 @@ from drivers.plausible import HEIGHT_M, within
 
 BOUND_M = 107.0
 GEOID_SD_M = BOUND_M / math.sqrt(3.0)
+MOST_M = 110.0
+"""Most that is taken for a geoid height: the bound, and what models differ by."""
 SLOPE_SD = 5e-5
 """One sigma of the slope of the geoid: deflections of the vertical are 5 to 10 arc seconds outside
 high mountains."""
 EARTH_M = 6_371_000.0
+
+
+def states_geoid(separation_m: float | None) -> bool:
+    """True if a printed separation can be the geoid's height."""
+    return bool(separation_m) and abs(separation_m or 0.0) <= MOST_M
 
 
 class Geoid:
@@ -34,9 +42,9 @@ class Geoid:
     ) -> tuple[float, float]:
         """Height above the ellipsoid (m), and one sigma (m) of the geoid height in it, 0 where
         printed; the height above the sea where the geoid is unknown."""
-        if separation_m:
-            if abs(separation_m) <= BOUND_M:
-                self._known = separation_m, lat_deg, lon_deg
+        if states_geoid(separation_m):
+            assert separation_m is not None
+            self._known = separation_m, lat_deg, lon_deg
             return altitude_m + separation_m, 0.0
         if self._known is None:
             return altitude_m, GEOID_SD_M

@@ -229,7 +229,7 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
     if counters["height_above_sea"] > counters["fixes"] // 2:
         found["height_above_sea"] = (
             "the receiver does not say how high the geoid is: its altitude above the sea is used, "
-            "with one sigma of 62 m (GGA's separation is empty, or 0)"
+            "with one sigma of 62 m (GGA's separation is empty, 0, or none)"
         )
     if counters["height_not_measured"] > max(counters["fixes"] // 2, FIRST_FIXES):
         found["height_not_measured"] = (

@@ -149,6 +149,7 @@ def test_what_is_no_fix_is_one_sentence(
         ("02", field("GGA", 11, ""), 403.0, False, "height_above_sea"),
         ("02", field("GGA", 11, "0.0"), 403.0, False, "height_above_sea"),
         ("02", field("GGA", 11, "0"), 403.0, False, "height_above_sea"),
+        ("02", field("GGA", 11, "999.9"), 403.0, False, "height_above_sea"),
         ("02", field("GGA", 9, ""), None, True, "height_missing"),
         ("02", gns, 403.0, False, "height_above_sea"),
         ("03", beside("RMC", GSA_2D), 450.0, True, ""),
