@@ -24,8 +24,13 @@ from fusiond.models.vehicle import (
     fix_markov_block,
     time_offset,
 )
-from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
-from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
+from fusiond.navigator.intake.kind import (
+    LEAST_SPEED_SD_M_S,
+    Instants,
+    Kind,
+    Sections,
+    shown_as,
+)
 
 # Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
 ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
