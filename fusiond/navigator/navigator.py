@@ -376,7 +376,7 @@ class Navigator:
         if earlier and t_ns < self.timeline.oldest_ns:
             return Solution(t_ns, Mode.INVALID, reason("before_history"))
         with self.timeline.past(t_ns) if earlier else nullcontext():
-            mode, why = self.mode(t_ns)
+            mode, why = self._status.of(t_ns, True, "")
             bound = self._protection.bound() if self._protection.watches else NO_BOUND
             worse = 1.0 if self._units.fits else self._units.unproven(self.estimator)[1]
             unshown = None if (check := self.trial.check) is None else check.unshown

@@ -231,27 +231,26 @@ class NavigationStatus:
             if wrong := trial.check.refuted(e, axes, -backward, diagnosis, measured):
                 return Failure(*wrong, wrong[1])
             trial.look()
-        if why := self._diverged(math.hypot(v_n, v_e), diagnosis):
+        speed, variance, why = math.hypot(v_n, v_e), e.covariance.item(2, 2), ""
+        if speed > self._max_speed_m_s:
+            why = reason("too_fast", speed=speed)
+        # Two sigma of what an error state bears: what was felt meanwhile lies on an arc.
+        elif 4.0 * variance > BEARABLE_YAW_RAD**2 and speed > COURSE_M_S and e.heading_known:
+            why = reason("heading_lost", sd=math.degrees(math.sqrt(variance)))
+        elif diagnosis.positions_out:
+            why = self._unaided(diagnosis)
+        if why:
             return Failure("diverged", f"{why}: aligning again", why)
         if trial.warm is not None and trial.warm.refused_by is not None:
             why = reason("warm_start_wrong", source=trial.warm.refused_by)
             return Failure("warm_start_refused", f"{why}: aligning again", why)
         return None
 
-    def _diverged(self, speed: float, diagnosis: Diagnosis) -> str:
-        """Reason why the solution cannot be right at that horizontal speed (m/s), or empty."""
-        e = self._estimator
-        if speed > self._max_speed_m_s:
-            return reason("too_fast", speed=speed)
-        # Two sigma of what an error state bears: what was felt meanwhile lies on an arc.
-        variance = e.covariance.item(2, 2)
-        if 4.0 * variance > BEARABLE_YAW_RAD**2 and speed > COURSE_M_S and e.heading_known:
-            return reason("heading_lost", sd=math.degrees(math.sqrt(variance)))
-        if not diagnosis.positions_out:
-            return ""
+    def _unaided(self, diagnosis: Diagnosis) -> str:
+        """Reason why a solution without positions in service cannot go on, or empty."""
         if (device := diagnosis.contradicts) is not None:
             return reason("filter_disagrees", device=device)
-        sd = e.sigmas()
+        sd = self._estimator.sigmas()
         if not math.hypot(sd.item(0), sd.item(1)) <= self._limits.invalid_sd_m:
             return reason("nothing_in_service")
         return ""

@@ -213,8 +213,7 @@ class WithoutImu:
         north, east, down = s.sd_ned_m
         # The position is that of the antennas, as far as nobody knows where they point.
         arm = self._arm_m
-        return replace(
-            s,
+        return s._replace(
             rpy_rad=(math.nan,) * 3,
             sd_ned_m=(math.hypot(north, arm), math.hypot(east, arm), down),
             gyro_bias_rad_s=(math.nan,) * 3,
