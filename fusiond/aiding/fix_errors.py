@@ -39,7 +39,6 @@ nothing beside a uniform slab).
 from __future__ import annotations
 
 import math
-from bisect import insort
 from collections import deque
 from typing import NamedTuple
 
@@ -301,23 +300,21 @@ class FixErrors:
     error lasts for `LASTS_S`. Fixes may arrive in any order: a fix uses those valid `SETTLES_NS`
     before it."""
 
-    __slots__ = ("_found", "_known", "_offset_sd_s", "_packed", "_waiting", "_wanders")
+    __slots__ = ("_found", "_known", "_offset_sd_s", "_packed", "_wanders", "waiting")
 
     def __init__(self, offset_sd_s: float, wanders: bool = True) -> None:
         self._offset_sd_s, self._wanders = offset_sd_s, wanders
         self._packed, self._found = np.zeros(_SIZE), np.empty(3)
-        self._waiting: list[Fix] = []
+        self.waiting: list[Fix] = []
+        """Fixes of the receiver with a velocity, to be added by the next `shares`."""
         self._known: deque[tuple[int, Shares]] = deque([(_BEFORE_ALL_NS, self._now())])
-
-    def take(self, fix: Fix) -> None:
-        """Add a fix of the receiver, with its velocity."""
-        insort(self._waiting, fix)
 
     def shares(self, t_ns: int) -> Shares:
         """Shares for a fix of `t_ns`."""
         settled, known = t_ns - SETTLES_NS, self._known
+        self.waiting.sort()
         due = 0
-        for fix in self._waiting:
+        for fix in self.waiting:
             if fix.t_ns > settled:
                 break
             due += 1
@@ -327,7 +324,7 @@ class FixErrors:
                 place = fix.lat_rad, fix.lon_rad, fix.variance
                 _take(self._packed, fix.t_ns, *place, *fix.v, fix.sd_v)
                 known.append((fix.t_ns, self._now()))
-        del self._waiting[:due]
+        del self.waiting[:due]
         while len(known) > 1 and known[1][0] <= known[-1][0] - 2 * SETTLES_NS:
             known.popleft()
         return next((shares for at, shares in reversed(known) if at <= settled), known[0][1])

@@ -66,9 +66,11 @@ class Drive:
         """Advance to `until_s`, the instant of the next epoch."""
         until = round(until_s * RATE_HZ)
         while self._row < until:
+            self.to_next_fix()
             self.fix()
             self._wheel()
-            self._feed(SAMPLES)
+            self._row += TICK_SAMPLES
+            self.navigator.advance()
         assert self.navigator.started is not None
 
     def tick(self) -> None:
@@ -79,7 +81,7 @@ class Drive:
     def to_next_fix(self) -> None:
         """Add the samples up to and including the next epoch, and run the filter up to the tick
         before."""
-        self._feed(SAMPLES - TICK_SAMPLES)
+        self._feed(SAMPLES - TICK_SAMPLES - self._row % SAMPLES)
         rows = slice(self._row, self._row + TICK_SAMPLES)
         self.navigator.add_imu(self._times[rows], self._samples[rows])
 

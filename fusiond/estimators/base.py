@@ -14,7 +14,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ from fusiond.estimators.corrected_imu import sensor_estimates
 from fusiond.estimators.error_decorrelation import renew
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.fault_bank_interface import Hypotheses
-from fusiond.estimators.measurement_run import MeasurementRun
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
@@ -41,7 +40,8 @@ from fusiond.estimators.propagation import (
 )
 from fusiond.estimators.published_state import WIDER, Published, sigmas, surely_moves, widen
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.state_array import AHEAD, GAP, memory
+from fusiond.estimators.row_kernels import KNOWS, RESULT, TURNED, run_for
+from fusiond.estimators.state_array import AHEAD, memory
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.estimators.update_with_exclusion import KEPT, Screened, screened
 from fusiond.models.model import Model
@@ -86,6 +86,15 @@ class Outcome(NamedTuple):
     rows: tuple[int, ...] = ()
     lasting: tuple[float, ...] = ()
     first: float = float("nan")
+
+
+class Ran(NamedTuple):
+    """Result of a run of packed measurements: number of those that are finished, `DONE` or the
+    reason of its end, results (k, RESULT)."""
+
+    done: int
+    how: int
+    results: Array
 
 
 class Snapshot(NamedTuple):
@@ -143,15 +152,15 @@ class Estimator:
         """Bank of fault hypotheses; None without one."""
         self._holding = False
         self._carrying = False
+        self._run_with: tuple[NDArray[Any], ...] = ()
+        """Arrays of `run`; none for an estimator that takes measurements one by one."""
+        self._knows = np.zeros(KNOWS)
+        self.turns = False
+        """True while the heading may be far off, and updates have another form."""
         self.turned = 0.0
         """Rotation (rad) by the last fused update of the axes in which P has the tilt."""
         self.kernel_options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(model.width)
-
-    @property
-    def gap_ns(self) -> int:
-        """No sample may stand for longer."""
-        return int(self._memory.head[GAP])
 
     @property
     def covariance(self) -> Array:
@@ -169,9 +178,10 @@ class Estimator:
         return False
 
     @property
-    def runs(self) -> MeasurementRun | None:
-        """Measurements in one call; None while it takes them one by one."""
-        return None
+    def runs(self) -> bool:
+        """True if it takes packed measurements in one call: not while an estimate is held, or
+        updates turn."""
+        return bool(self._run_with) and not (self._holding or self.turns)
 
     @property
     def isolated(self) -> dict[str, str]:
@@ -222,6 +232,21 @@ class Estimator:
         self.sample, self.t_ns = self._kernel(
             self._array, imu.packed, self.sample, self.t_ns, target_ns, options
         )
+
+    def run(
+        self, imu: ImuBuffer, rows: Array, series: Array, record: bool, kept: tuple[int, int]
+    ) -> Ran:
+        """Apply packed measurements `rows` (k, SIZE), each at its instant, with the noise of their
+        `series` (s, .); `kept`: instant (ns) of the last checkpoint, and the interval to the next.
+        """
+        results = np.empty((len(rows), RESULT))
+        options = self.kernel_options | (RECORD if record else 0)
+        self.sample, self.t_ns, done, how = run_for(self.model.width)(
+            *(self._array, imu.packed, rows, results, series, *self._run_with),
+            *(self.sample, self.t_ns, options, self.model.hold_height, self.passing, *kept),
+        )
+        self.passing, self.turned = False, self._knows.item(TURNED)
+        return Ran(done, how, results)
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one measurement in, or name why not; the variances of its rows, up to three, count
@@ -337,8 +362,7 @@ class Estimator:
 
     def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
         """The measurement's innovation, linear in the error state."""
-        rows = measurement.innovation(self._view)
-        return self._weighed(measurement, rows) if measurement.robust else rows
+        return self._weighed(measurement, measurement.innovation(self._view))
 
     def _weighed(
         self, measurement: Linearised, rows: Innovation | NotApplicable

@@ -18,8 +18,7 @@ from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gated_update import account_for, fold_and_account
-from fusiond.estimators.measurement_run import MeasurementRun
-from fusiond.estimators.row_kernels import KNOWS, NO_AXES, Axes
+from fusiond.estimators.row_kernels import AT_H, NO_AXES, Axes
 from fusiond.estimators.update import fuse, whiten, work
 from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
@@ -35,7 +34,7 @@ class KalmanEstimator(Estimator):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
     packs: ClassVar[bool] = True
-    """True if an update is that of fusiond.estimators.measurement_run."""
+    """True if an update is that of fusiond.estimators.row_kernels."""
 
     def __init__(
         self,
@@ -46,23 +45,18 @@ class KalmanEstimator(Estimator):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
-        self.turns = False
-        """True while the heading may be far off, and updates have another form."""
-        self._knows = np.zeros(KNOWS)
-        self._runs = self._new_run(NO_AXES)
+        self._run_by(NO_AXES)
 
-    def _new_run(self, axes: Axes) -> MeasurementRun | None:
-        """Run of packed measurements with axes of its updates; None without a bank, whose one fix a
-        second costs less than a run, and for a filter with other updates."""
-        bank = self.hypotheses
-        if bank is None or not self.packs:
-            return None
-        return MeasurementRun(self, self._memory, self.model, bank, axes, self._knows)
-
-    @property
-    def runs(self) -> MeasurementRun | None:
-        """Measurements in one call; None while an estimate is held, or updates turn."""
-        return None if self._holding or self.turns else self._runs
+    def _run_by(self, axes: Axes) -> None:
+        """Run packed measurements with axes of its updates; not without a bank, whose one fix a
+        second costs less than a run, and not a filter with other updates."""
+        bank, model = self.hypotheses, self.model
+        if bank is not None and self.packs:
+            work = np.zeros(AT_H + LENT_ROWS * (model.size + model.width))
+            self._run_with = (
+                *(*bank.table[:3], model.column_of, model.initial, *axes),
+                *(bank.mounting, work, bank.rows, bank.work, self._knows, bank.found),
+            )
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one measurement in, or name why not; `noise` (3,) times its variances."""

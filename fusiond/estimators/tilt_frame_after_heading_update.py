@@ -114,7 +114,7 @@ class TiltAxesFilter(KalmanEstimator):
         self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._time = antenna_slots(model)
         self._astray = self._lever.size > 0
-        self._runs = self._new_run(Axes(self._biases, self._gyros, self._lever, self._time))
+        self._run_by(Axes(self._biases, self._gyros, self._lever, self._time))
         self.undoubted = True
         if known:
             self.kernel_options |= TURN_TILT

@@ -24,7 +24,7 @@ Source: as of fusiond.estimators.fault_odds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ from fusiond.integrity.series_states import (
     REPEATS,
     STILL,
     Series,
-    Service,
+    ServiceTable,
     value_of,
 )
 
@@ -68,17 +68,13 @@ class Memory(NamedTuple):
     lasting: Mapping[str, Lasting]
 
 
-class Diagnosis:
+class Diagnosis(ServiceTable):
     """Diagnosis of each measurement after its innovation; depends only on the measurements in
     order."""
 
     def __init__(self, kinds: Sequence[Kind] = ()) -> None:
+        super().__init__()
         self._kinds = tuple(kinds)
-        self._series: dict[str, Series] = {}
-        self._shared: set[str] = set()
-        """Series that a checkpoint has too: copied before they are changed."""
-        self._agreement: Mapping[str, Agreement] = {}
-        """Agreement of each excluded device; replaced, never changed."""
         self._lasting: Mapping[str, Lasting] = {}
         """Last reason of exclusion by series; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
@@ -103,22 +99,6 @@ class Diagnosis:
     # ------------------------------------------------------------------ what others ask
 
     @property
-    def series(self) -> Mapping[str, Series]:
-        """Series by source; read-only."""
-        return self._series
-
-    @property
-    def excluded(self) -> dict[str, str]:
-        """Series that are out, and why."""
-        return {name: s.reason for name, s in self._series.items() if s.out}
-
-    @property
-    def positions_out(self) -> bool:
-        """True if position series exist and none is in service."""
-        positions = [s for s in self._series.values() if s.locates]
-        return bool(positions) and all(s.out for s in positions)
-
-    @property
     def contradicts(self) -> str | None:
         """Device whose positions and velocities agree with each other and contradict the filter;
         None without one."""
@@ -134,27 +114,6 @@ class Diagnosis:
         return None
 
     # ------------------------------------------------------------------ judgement
-
-    def own(self, measurement: AidingMeasurement) -> Series:
-        """Series of a measurement, for a change."""
-        one = self._series.get(measurement.source)
-        if one is not None and measurement.source not in self._shared:
-            return one
-        self._shared.discard(measurement.source)
-        one = self._series[measurement.source] = (
-            Series.of(measurement) if one is None else one.copied()
-        )
-        return one
-
-    def plain(self, measurement: AidingMeasurement) -> Series | None:
-        """Series of a measurement that needs only gate and hypotheses: nominal, with no excluded
-        series of its device; else None. The caller may change it."""
-        one = self._series.get(measurement.source)
-        if one is None or one.state is not Service.NOMINAL or one.failed:
-            return None
-        if one.device in self._agreement:
-            return None
-        return self.own(measurement) if measurement.source in self._shared else one
 
     def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
         """Series of a measurement, before its update; a repeating series leaves service, with all
@@ -336,18 +295,6 @@ class Diagnosis:
             for restart in range(RESTARTS)
             if explains[row, restart] and log_odds[row, restart] > odds - ALIKE
         ]
-
-    def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
-        """Exclude the series that faults affect."""
-        for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
-            self._changed(name).exclude(t_ns, reason)
-
-    def _changed(self, name: str) -> Series:
-        """A series that may be changed."""
-        if name in self._shared:
-            self._shared.discard(name)
-            self._series[name] = self._series[name].copied()
-        return self._series[name]
 
     def _goes_its_own_way(self, one: Series) -> bool:
         """True if the filter, not the device, is somewhere else.

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 
@@ -44,6 +44,7 @@ from fusiond.aiding.initialisation import (
     VelocityCandidate,
 )
 from fusiond.estimators.noise_scale import forget_lately, learn, unlearned
+from fusiond.integrity.position_velocity_agreement import Agreement
 
 Array = NDArray[np.float64]
 
@@ -225,6 +226,66 @@ class Series:
 
 
 _EACH = attrgetter(*(each.name for each in fields(Series)))
+
+
+class ServiceTable:
+    """Series of all sources by name, and how those of a device agree that is or was excluded."""
+
+    def __init__(self) -> None:
+        self._series: dict[str, Series] = {}
+        self._shared: set[str] = set()
+        """Series that a checkpoint has too: copied before they are changed."""
+        self._agreement: Mapping[str, Agreement] = {}
+        """Agreement of each excluded device; replaced, never changed."""
+
+    @property
+    def series(self) -> Mapping[str, Series]:
+        """Series by source; read-only."""
+        return self._series
+
+    @property
+    def excluded(self) -> dict[str, str]:
+        """Series that are out, and why."""
+        return {name: s.reason for name, s in self._series.items() if s.out}
+
+    @property
+    def positions_out(self) -> bool:
+        """True if position series exist and none is in service."""
+        positions = [s for s in self._series.values() if s.locates]
+        return bool(positions) and all(s.out for s in positions)
+
+    def own(self, measurement: AidingMeasurement) -> Series:
+        """Series of a measurement, for a change."""
+        one = self._series.get(measurement.source)
+        if one is not None and measurement.source not in self._shared:
+            return one
+        self._shared.discard(measurement.source)
+        one = self._series[measurement.source] = (
+            Series.of(measurement) if one is None else one.copied()
+        )
+        return one
+
+    def plain(self, measurement: AidingMeasurement) -> Series | None:
+        """Series of a measurement that needs only gate and hypotheses: nominal, with no excluded
+        series of its device; else None. The caller may change it."""
+        one = self._series.get(measurement.source)
+        if one is None or one.state is not Service.NOMINAL or one.failed:
+            return None
+        if one.device in self._agreement:
+            return None
+        return self.own(measurement) if measurement.source in self._shared else one
+
+    def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
+        """Exclude the series that faults affect."""
+        for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
+            self._changed(name).exclude(t_ns, reason)
+
+    def _changed(self, name: str) -> Series:
+        """A series that may be changed."""
+        if name in self._shared:
+            self._shared.discard(name)
+            self._series[name] = self._series[name].copied()
+        return self._series[name]
 
 
 def value_of(candidates: Sequence[Candidate]) -> tuple[float, ...] | None:

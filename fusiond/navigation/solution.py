@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from enum import StrEnum
 from math import nan
+from typing import NamedTuple
 
 from drivers.immutable import immutable
 
@@ -55,8 +55,7 @@ class Bound:
     vpl_m: float = nan
 
 
-@immutable()
-class Solution:
+class Solution(NamedTuple):
     """Navigation state of the body origin at one instant, with one sigma each.
 
     `t_ns` host monotonic. Position geodetic (rad, rad, m, WGS 84); velocity NED (m/s); attitude
@@ -77,6 +76,6 @@ class Solution:
     sd_ned_m: Vector3 = _UNKNOWN
     sd_v_ned_m_s: Vector3 = _UNKNOWN
     sd_rpy_rad: Vector3 = _UNKNOWN
-    gyro_bias_rad_s: Vector3 = field(default=_UNKNOWN)
-    accel_bias_m_s2: Vector3 = field(default=_UNKNOWN)
+    gyro_bias_rad_s: Vector3 = _UNKNOWN
+    accel_bias_m_s2: Vector3 = _UNKNOWN
     bound: Bound = Bound()

@@ -42,7 +42,9 @@ class ImuNoise:
         """Grade of the unit; None without evidence of its quality."""
         self._square_rad2 = self._sheet_rad2 = (imu.misalignment_deg * DEG) ** 2
         """Variance of the angles by which axes of its class are out of square, and its sheet's."""
-        self._cell = self._at_ns = -1
+        self._at_ns = -1
+        self.due_ns = 0
+        """Instant of the filter from which `look` has something to do."""
 
     @property
     def shown(self) -> tuple[float, tuple[float, ...]]:
@@ -60,7 +62,7 @@ class ImuNoise:
     def restart(self) -> None:
         """Restart with the filter."""
         self._shares.restart()
-        self._cell = self._at_ns = -1
+        self._at_ns, self.due_ns = -1, 0
         self._grade = self._unit
 
     def started(self, start: Start, estimator: Estimator, imu: ImuBuffer) -> None:
@@ -85,12 +87,12 @@ class ImuNoise:
         self._grade = None
 
     def look(self, timeline: Timeline, imu: ImuBuffer) -> None:
-        """The filter has been run."""
-        settled_ns = timeline.estimator.t_ns - SETTLES_NS
-        cell, vibration = settled_ns // STEP_NS, imu.vibration
-        if cell == self._cell or vibration is None:
+        """The filter has been run up to `due_ns` or later."""
+        settled_ns, vibration = timeline.estimator.t_ns - SETTLES_NS, imu.vibration
+        cell = settled_ns // STEP_NS
+        self.due_ns = (cell + 1) * STEP_NS + SETTLES_NS
+        if vibration is None:
             return
-        self._cell = cell
         at_ns = settled_ns // EVERY_NS * EVERY_NS
         self._shares.carry(imu, at_ns if at_ns > self._at_ns else cell * STEP_NS)
         if at_ns == self._at_ns:

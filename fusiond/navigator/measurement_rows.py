@@ -51,8 +51,7 @@ class MeasurementRows:
     """Rows for one estimator; none for one that takes measurements one by one."""
 
     def __init__(self, estimator: Estimator) -> None:
-        runs = estimator.runs
-        self._bank = None if runs is None else estimator.hypotheses
+        self._bank = estimator.hypotheses if estimator.runs else None
         self._model = estimator.model
         self._noise = np.zeros((0, NOISE_SIZE))
         self._known: dict[str, Span] = {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,12 +48,16 @@ from fusiond.navigator.intake.gnss import operator_position
 from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.motion_constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.protection_events import NO_BOUND, ProtectionWatch
-from fusiond.navigator.published_solution import publish_by_own_clock, solution_of
+from fusiond.navigator.published_solution import (
+    NavigationStatus,
+    OutcomeWatch,
+    publish_by_own_clock,
+    solution_of,
+)
 from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 from fusiond.navigator.source_status import SourceService
-from fusiond.navigator.status import NavigationStatus, OutcomeWatch, StartedNavigation
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.navigator.without_imu import WithoutImu, counted_together
 
@@ -126,9 +131,8 @@ class Navigator:
         self._calibration: SavedCalibration | None = None
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._latency = LatencySearch(self._options, self._noise, self.model, self._event)
-        self._status = NavigationStatus(
-            config, self.estimator, self.imu, self._screening, self._units
-        )
+        of_navigation = self.estimator, self.imu, self._screening, self._units
+        self._status = NavigationStatus(config, *of_navigation, self.trial, self.outcome_watch)
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -229,7 +233,7 @@ class Navigator:
             return self.outcome_watch.refuse(m.source, "failed")
         if isinstance(measurements, str):
             return self.outcome_watch.refuse(m.source, measurements)
-        self.without_imu.receive(measurements, seen_ns)
+        self.without_imu.arrived.append((measurements, seen_ns))
         if self.started is not None and m.source in self._latency.on_time:
             self._latency.waiting.append((m.source, measurements))
         else:
@@ -302,23 +306,15 @@ class Navigator:
                 self.calibrating.corrected()
                 self._imu_noise.corrected(e)
         diagnosis, rest = self.timeline.diagnosis, self._constraints.rest_evidence
-        if (check := self.trial.check) is not None and (wrong := check.refuted(e, diagnosis, rest)):
-            self._event(*wrong)  # before it is a failure, of which it would be the reason
-            self.reset(wrong[1])
-            self._aligner.known.reported.add(wrong[0])
-            return
-        if (failure := self._status.failure(diagnosis)) is not None:
-            self._event("diverged", f"{failure}: aligning again")
-            self.reset(failure)
-            return
-        if (warm := self.trial.warm) is not None and warm.refused_by is not None:
-            why = reason("warm_start_wrong", source=warm.refused_by)
-            self._event("warm_start_refused", f"{why}: aligning again")
-            self.reset(why)
+        if (failed := self._status.failure(diagnosis, rest)) is not None:
+            self._event(failed.code, failed.text)
+            self.reset(failed.why)
+            self._aligner.known.reported.add(failed.code)
             return
         if self._protection.watches:
             self._protection.report()
-        self._imu_noise.look(self.timeline, self.imu)
+        if e.t_ns >= self._imu_noise.due_ns:
+            self._imu_noise.look(self.timeline, self.imu)
         if e.t_ns >= self.calibrating.due_ns or self.calibrating.turned:
             self._calibrate()
 
@@ -376,31 +372,24 @@ class Navigator:
         """
         if self.without_imu.estimator is not None:
             return self.without_imu.solution(t_ns, self.mode(t_ns)[1], self._protection.unknown())
-        if self.started is None or t_ns >= self.estimator.t_ns:
-            return self._present(t_ns)
-        if t_ns < self.timeline.oldest_ns:
-            return Solution(t_ns, Mode.INVALID, reason("before_history"))
-        with self.timeline.past(t_ns):
-            return self._present(t_ns)
-
-    def _present(self, t_ns: int) -> Solution:
-        mode, reason = self.mode(t_ns)
         if self.started is None:
-            return Solution(t_ns, mode, reason, bound=self._protection.unknown())
-        bound = self._protection.bound() if self._protection.watches else NO_BOUND
-        worse = 1.0 if self._units.fits else self._units.unproven(self.estimator)[1]
-        unshown = None if (check := self.trial.check) is None else check.unshown
-        return solution_of(
-            *(self.estimator, self.imu, t_ns, self._gap_ns, mode, reason, bound),
-            *(self._limits, unshown, worse),
-        )
+            return Solution(t_ns, *self.mode(t_ns), bound=self._protection.unknown())
+        earlier = t_ns < self.estimator.t_ns
+        if earlier and t_ns < self.timeline.oldest_ns:
+            return Solution(t_ns, Mode.INVALID, reason("before_history"))
+        with self.timeline.past(t_ns) if earlier else nullcontext():
+            mode, why = self._status.of(t_ns, True, "")
+            bound = self._protection.bound() if self._protection.watches else NO_BOUND
+            worse = 1.0 if self._units.fits else self._units.unproven(self.estimator)[1]
+            unshown = None if (check := self.trial.check) is None else check.unshown
+            return solution_of(
+                *(self.estimator, self.imu, t_ns, self._gap_ns, mode, why, bound),
+                *(self._limits, unshown, worse),
+            )
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """Mode at `t_ns`, and why."""
-        known, started = self.outcome_watch, None
-        if self.started is not None:
-            started = StartedNavigation(known.basis, self.trial.unconfirmed, known.position_ns)
-        return self._status.of(t_ns, started, self._aligner.reason)
+        return self._status.of(t_ns, self.started is not None, self._aligner.reason)
 
     @property
     def active_filter(self) -> Estimator:

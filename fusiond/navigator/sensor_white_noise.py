@@ -83,13 +83,14 @@ class WhiteNoise:
     """White noise of the series of one vehicle, by source; those that ask for it are learned."""
 
     def __init__(self) -> None:
-        self._series: dict[str, _Series] = {}
+        self.series: dict[str, _Series] = {}
+        """By source, of those that are learned."""
         self._saved: Mapping[str, tuple[float, ...]] = {}
 
     @property
     def shown(self) -> dict[str, tuple[float, ...]]:
         """Number of pairs and their sum by source, for the next start."""
-        return {name: (each.count, each.total) for name, each in self._series.items()}
+        return {name: (each.count, each.total) for name, each in self.series.items()}
 
     def take_up(self, shown: Mapping[str, tuple[float, ...]]) -> None:
         """Resume series that nothing has come of with those of another drive."""
@@ -99,10 +100,10 @@ class WhiteNoise:
         self, source: str, t_ns: int, sd: float, lasts_s: float, rounding_sd: float = 0.0
     ) -> float:
         """c of a measurement of `t_ns` with typed `sd`, whose drift lasts for `lasts_s`."""
-        one = self._series.get(source)
+        one = self.series.get(source)
         if one is None:
             lag_ns = round(PART * lasts_s * 1e9)
-            one = self._series[source] = _Series(sd * sd, lag_ns, rounding_sd * rounding_sd)
+            one = self.series[source] = _Series(sd * sd, lag_ns, rounding_sd * rounding_sd)
             if source in self._saved:
                 one.count, one.total = self._saved[source]
                 one.counted = [(0, one.found)]
@@ -110,7 +111,7 @@ class WhiteNoise:
 
     def receive(self, source: str, t_ns: int, innovation: float) -> None:
         """A measurement has been applied, or again after a rewind; NaN: it was not fused."""
-        one = self._series.get(source)
+        one = self.series.get(source)
         if one is None:
             return
         if math.isnan(innovation):
@@ -122,7 +123,7 @@ class WhiteNoise:
         """Nothing comes any more that is earlier than `t_ns`; what is found counts from `counts_ns`
         on. Without `moving` what was valid since the last time shows nothing: at rest wheels and
         tyres do not slip."""
-        for one in self._series.values():
+        for one in self.series.values():
             due = sorted(at for at in one.waiting if at <= t_ns)
             if not moving:
                 one.last = None

@@ -231,14 +231,14 @@ class Timeline:
     def _run_rows(self, end: int, record: bool) -> bool:
         """Run the estimator over the next packed entries before `end` that need gate and hypotheses
         only; False if the next one needs more."""
-        runs, kept_ns = self.estimator.runs, self._checkpoints[-1].snapshot.t_ns
-        if runs is None:
+        estimator, kept_ns = self.estimator, self._checkpoints[-1].snapshot.t_ns
+        if not estimator.runs:
             return False
         which, until_ns = range(self._next, end), kept_ns + self._checkpoint_ns
         batch = self._rows.batch(self._entries, which, self.diagnosis, until_ns)
         if batch is None:
             return False
-        ran = runs(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
+        ran = estimator.run(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
         entries = self._entries[self._next : self._next + ran.done]
         outcomes = self._rows.went_on(entries, ran.results[: ran.done])
         for k, (entry, outcome) in enumerate(zip(entries, outcomes, strict=True)):

@@ -48,7 +48,7 @@ from fusiond.navigator.assembly import estimator_without_imu, fitting
 from fusiond.navigator.imu_screening import BEARABLE_GAP_S
 from fusiond.navigator.mode_reasons import joined, reason
 from fusiond.navigator.published_solution import solution_of
-from fusiond.navigator.timeline import Entry, Timeline
+from fusiond.navigator.timeline import MOST_WAITING, Entry, Timeline
 
 Array = NDArray[np.float64]
 
@@ -110,6 +110,8 @@ class WithoutImu:
         self.estimator: Estimator | None = None
         """Estimator of the published solution while active."""
         self._ended: dict[str, Counter[str]] = {}
+        self.arrived: deque[tuple[Sequence[AidingMeasurement], int]] = deque(maxlen=MOST_WAITING)
+        """Measurements with the instant (ns) at which they came, until the next tick."""
         self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
         self._way = HeadingHistory(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None
@@ -130,7 +132,12 @@ class WithoutImu:
         """True while it navigates."""
         return self.estimator is not None
 
-    def receive(self, measurements: Sequence[AidingMeasurement], seen_ns: int) -> None:
+    def _catch_up(self) -> None:
+        """Take in what has arrived."""
+        while self.arrived:
+            self._receive(*self.arrived.popleft())
+
+    def _receive(self, measurements: Sequence[AidingMeasurement], seen_ns: int) -> None:
         """Measurements have come at `seen_ns`."""
         self._recent.extend(map(_Received, measurements))
         if self._first_ns is None and measurements:
@@ -152,8 +159,9 @@ class WithoutImu:
 
     def take_position(self, fix: AidingMeasurement, t_ns: int) -> str | None:
         """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
+        self._catch_up()
         if self.estimator is None:
-            self.receive([fix], t_ns)
+            self._receive([fix], t_ns)
             return None
         self._run(self.estimator, t_ns)
         entry = self._insert(replace(fix, t_ns=self._imu.latest_ns))
@@ -163,6 +171,7 @@ class WithoutImu:
     def tick(self, t_ns: int, imu: ImuBuffer, navigating: bool) -> None:
         """Start, continue or end navigation at `t_ns`. `navigating`: inertial navigation has
         started."""
+        self._catch_up()
         since_ns = imu.latest_ns if imu.end else self._first_ns
         if since_ns is None:
             return
@@ -180,6 +189,7 @@ class WithoutImu:
 
     def stop(self) -> None:
         """End, for a restart or another navigation."""
+        self._catch_up()
         self._ended, self.estimator = self.counted(), None
         self._recent.clear()
 
@@ -203,8 +213,7 @@ class WithoutImu:
         north, east, down = s.sd_ned_m
         # The position is that of the antennas, as far as nobody knows where they point.
         arm = self._arm_m
-        return replace(
-            s,
+        return s._replace(
             rpy_rad=(math.nan,) * 3,
             sd_ned_m=(math.hypot(north, arm), math.hypot(east, arm), down),
             gyro_bias_rad_s=(math.nan,) * 3,

@@ -64,7 +64,7 @@ def _receiver(
         lon -= 2.0 * math.pi if lon > math.pi else 0.0
         north, east = v[k].tolist()
         t_ns = round(t_s[k] * 1e9)
-        shown.take(Fix(t_ns, lat, lon, variance, (north, east), velocity_sd_m_s))
+        shown.waiting.append(Fix(t_ns, lat, lon, variance, (north, east), velocity_sd_m_s))
     shown.shares(round(t_s[-1] * 1e9) + SETTLES_NS)
     return shown
 
@@ -152,7 +152,7 @@ def test_the_order_in_which_fixes_come_leaves_no_trace() -> None:
     for late in (lambda k: 0, lambda k: 8 * (k % 3 == 0), lambda k: 5 * (k % 2)):
         errors, shares = FixErrors(OFFSET_SD_S), {}
         for k, fix in sorted(enumerate(fixes), key=lambda one: (one[0] + late(one[0]), one[0])):
-            errors.take(fix)
+            errors.waiting.append(fix)
             shares[k] = errors.shares(fix.t_ns)
         found.append([shares[k] for k in range(len(fixes))])
     assert found[0] == found[1] == found[2]
@@ -164,11 +164,11 @@ def test_a_fix_that_comes_twice_or_far_too_late_tells_nothing() -> None:
     end_ns = 29_000_000_000 + SETTLES_NS
     once, again = FixErrors(OFFSET_SD_S), FixErrors(OFFSET_SD_S)
     for fix in fixes:
-        once.take(fix)
+        once.waiting.append(fix)
     for fix in (*fixes[:5], fixes[4], *fixes[5:]):
-        again.take(fix)
+        again.waiting.append(fix)
     assert once.shares(end_ns) == again.shares(end_ns)
-    again.take(fixes[3])
+    again.waiting.append(fixes[3])
     assert once.shares(end_ns) == again.shares(end_ns)
 
 

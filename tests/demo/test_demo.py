@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from urllib.error import URLError
@@ -156,7 +155,7 @@ def test_score_against_the_truth(tmp_path: Path) -> None:
             rpy_rad=(0.0, 0.0, float(truth.rpy[0, 2]) + np.radians(0.5) - 2.0 * np.pi),
         )
         score.add(solution, covariance)
-        score.add(replace(solution, mode=Mode.INVALID), covariance)
+        score.add(solution._replace(mode=Mode.INVALID), covariance)
     result = score.against(vehicle)
     assert result["horizontal_rms_m"] == pytest.approx(5.0, abs=2e-3)
     assert result["yaw_rms_deg"] == pytest.approx(0.5, abs=1e-3)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -85,7 +84,7 @@ def test_reports_go_out_at_their_interval_and_the_newest_waits() -> None:
     t_ns = desk.clock.now_ns()
     for k in range(25):
         now = t_ns + k * S
-        desk.messaging.tick(now, replace(SOLUTION, t_ns=now, height_m=float(k)))
+        desk.messaging.tick(now, SOLUTION._replace(t_ns=now, height_m=float(k)))
     (report,) = posted(desk)
     assert report.height_m == 20.0
     assert report.t_s == pytest.approx(UTC_NS / S + 20.0, abs=1.0)
@@ -99,12 +98,12 @@ def test_an_event_is_reported_with_the_next_solution_that_has_a_place() -> None:
     desk = Desk(card=OTHER, events=["mode_coasting"])
     t_ns = desk.clock.now_ns()
     desk.messaging.note_event("mode_navigating")
-    desk.messaging.tick(t_ns, replace(SOLUTION, t_ns=t_ns))
+    desk.messaging.tick(t_ns, SOLUTION._replace(t_ns=t_ns))
     assert not posted(desk)
     desk.messaging.note_event("mode_coasting")
     desk.messaging.tick(t_ns, Solution(t_ns, Mode.WAITING, "no IMU data yet"))
     assert not posted(desk)
-    desk.messaging.tick(t_ns, replace(SOLUTION, t_ns=t_ns, height_m=math.nan))
+    desk.messaging.tick(t_ns, SOLUTION._replace(t_ns=t_ns, height_m=math.nan))
     (report,) = posted(desk)
     assert report.height_m is None
 
@@ -114,7 +113,7 @@ def test_a_card_that_may_not_report_says_so_once() -> None:
     desk.drivers["rdss"].outbox.comm_level = 0
     t_ns = desk.clock.now_ns()
     for k in range(5):
-        desk.messaging.tick(t_ns + k * S, replace(SOLUTION, t_ns=t_ns))
+        desk.messaging.tick(t_ns + k * S, SOLUTION._replace(t_ns=t_ns))
     assert [code for _, code, _ in desk.events] == ["report_refused"]
     assert desk.drivers["rdss"].counters["message_forbidden"] == 5
 

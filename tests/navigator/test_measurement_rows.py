@@ -62,8 +62,8 @@ def test_rows_are_what_measurements_are_one_by_one(
     one, other = by_rows.navigator.estimator, singly.navigator.estimator
     assert isinstance(one, InvariantFilter)
     assert isinstance(other, InvariantFilter)
-    assert one.runs is not None
-    assert other.runs is None
+    assert one.runs
+    assert not other.runs
     assert [str(entry.outcome) for entry in entries] == [str(entry.outcome) for entry in others]
     assert one.snapshot().kept.tobytes() == other.snapshot().kept.tobytes()
     diagnosis, reference = by_rows.navigator.timeline.diagnosis, singly.navigator.timeline.diagnosis

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.state_array import GAP
 from fusiond.estimators.unscented.propagation import propagate_points, turn_attitude
 from fusiond.estimators.unscented.sigma_points import factor, linear_form, spread_states
 from fusiond.models.model import Model
@@ -149,7 +150,7 @@ class UnscentedEstimator(KalmanEstimator):
             imu.end,
             self.t_ns,
             target_ns,
-            min(self.gap_ns, imu.hold_ns),
+            min(int(self._memory.head[GAP]), imu.hold_ns),
             record,
             imu.nav,
             imu.sigmas,

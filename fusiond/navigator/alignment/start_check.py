@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.aiding.rest_evidence import RestEvidence
@@ -16,8 +14,8 @@ from fusiond.integrity.catalogue import SENSOR
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_elements, wrap_angle
-from fusiond.navigation.strapdown import LAT, LON, Q0, VN
+from fusiond.navigation.rotation import wrap_angle
+from fusiond.navigation.strapdown import LAT, LON
 from fusiond.navigator.alignment.heading_at_rest import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
@@ -108,20 +106,23 @@ class StartCheck:
             doubt = min(self.unshown.sd_rad, sd_m / max(way_m, 1e-9))
             self.unshown = Unshown(doubt, c.lat_rad, c.lon_rad, max(c.sd[:2]))
 
+    @property
+    def over(self) -> bool:
+        """True if nothing is left to be checked."""
+        return not self._claim and not self._backward
+
     def refuted(
-        self, e: Estimator, diagnosis: Diagnosis, measured: RestEvidence
+        self,
+        e: Estimator,
+        axes: tuple[float, ...],
+        ahead_m_s: float,
+        diagnosis: Diagnosis,
+        measured: RestEvidence,
     ) -> tuple[str, str] | None:
-        """Code and text of the event, if the solution refutes the start."""
-        t_ns, nav, covariance = e.t_ns, e.nav, e.covariance
-        axes = dcm_elements(nav[Q0:])
-        v_n, v_e, v_d = nav[VN : VN + 3].tolist()
-        backward = -(axes[0] * v_n + axes[3] * v_e + axes[6] * v_d)
-        if backward > self._options.max_reverse_m_s:
-            ahead = np.array(axes[::3])
-            sd = math.sqrt(max(float(ahead @ covariance[3:6, 3:6] @ ahead), 0.0))
-            if backward - 3.0 * sd > self._options.max_reverse_m_s:
-                return "imu_backwards", reason("imu_backwards", speed=backward)
-        if self._backward and -backward > self._options.course_speed_m_s:
+        """Code and text of the event, if the solution refutes the start: attitude C_nb, row by row
+        (9,), and speed along its first axis."""
+        t_ns = e.t_ns
+        if self._backward and ahead_m_s > self._options.course_speed_m_s:
             self._backward = False
             self._say()
         if not self._claim:
@@ -130,7 +131,7 @@ class StartCheck:
         doubted = any(f.kind.of == SENSOR for f in diagnosis.findings)
         left_out = bool(diagnosis.excluded)
         velocity, yaw = measured.velocity(t_ns - COURSE_NS, t_ns), math.atan2(axes[3], axes[0])
-        sd_yaw = math.sqrt(covariance[2, 2])
+        sd_yaw = math.sqrt(e.covariance[2, 2])
         if (
             self._unproven
             and sd_yaw < DETERMINED * self._sd_yaw
@@ -190,7 +191,9 @@ class StartTrial:
 
     def __init__(self, options: AlignmentOptions, on_event: Callable[[str, str], None]) -> None:
         self._options, self._event = options, on_event
+        self.max_reverse_m_s = options.max_reverse_m_s
         self.check: StartCheck | None = None
+        """Check of the present start; None once it is over."""
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
 
@@ -208,6 +211,12 @@ class StartTrial:
     def begin(self, start: Start) -> None:
         """A filter has been started so."""
         self.check = StartCheck(self._options, start)
+        self.look()
+
+    def look(self) -> None:
+        """Drop a check that is over."""
+        if self.check is not None and self.check.over:
+            self.check = None
 
     @property
     def on_trial(self) -> bool:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.fix_errors import LASTS_S, Fix, FixErrors, Shares
+from fusiond.aiding.fix_errors import LASTS_S, Fix, FixErrors
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import SUFFIX, VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
@@ -24,8 +24,13 @@ from fusiond.models.vehicle_parameter_blocks import (
     fix_markov_block,
     time_offset_block,
 )
-from fusiond.navigator.intake.kind import Instants, Kind, Sections, shown_as
-from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
+from fusiond.navigator.intake.kind import (
+    LEAST_SPEED_SD_M_S,
+    Instants,
+    Kind,
+    Sections,
+    shown_as,
+)
 
 # Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
 ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
@@ -130,11 +135,21 @@ def measurements_of(
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
     markov, markov_m = "" if by_phase else receiver.markov, 0.0
     level_m = math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2))
-    shares = _shares(m, when, motion, by_phase, o, sections, level_m) if receiver.markov else None
-    if shares is not None:
-        markov_m = math.sqrt(shares.wanders) * level_m
-        if receiver.holds and not receiver.shares_stated:
-            share = _lasting(sd, shares, receiver.shared_m)
+    if receiver.markov:
+        known = sections.fix_errors.get((source, by_phase))
+        errors = _errors(source, by_phase, o, sections) if known is None else known
+        if motion is not None:  # without velocities nothing tells how the variance divides
+            (v_n, v_e, *_), (sd_n, sd_e, *_) = motion
+            sd_speed = math.sqrt(0.5 * (sd_n**2 + sd_e**2))
+            place = m.lat_rad, m.lon_rad, level_m**2
+            errors.waiting.append(Fix(when.t_ns, *place, (v_n, v_e), sd_speed))
+            shares = errors.shares(when.t_ns)
+            markov_m = math.sqrt(shares.wanders) * level_m
+            if receiver.holds and not receiver.shares_stated:
+                # What is seen of the horizontal is taken to be so of the height. Its own error
+                # counts as stated: how a receiver that smooths its fixes follows a turn is in none.
+                level, vertical = (math.sqrt(shares.lasts) / s for s in receiver.shared_m)
+                share = level * sd[0], level * sd[1], vertical * sd[2]
     height = m.height_m
     if receiver.holds:
         if m.geoid_sd_m:
@@ -239,38 +254,13 @@ def _markov_block(source: str, section: GnssAiding, sections: Sections) -> str:
     return sections.own(FIX_MARKOV, source, section) if section.shared_sd_m else ""
 
 
-def _shares(
-    m: PositionFix,
-    when: Instants,
-    motion: Motion | None,
-    by_phase: bool,
-    o: GnssAiding,
-    sections: Sections,
-    level_m: float,
-) -> Shares | None:
-    """Division of a fix's variance, as shown by this receiver's fixes and velocities, separately
-    for code and phase; None without velocities. `level_m`: one sigma of a horizontal axis."""
-    known = sections.fix_errors.get((m.source, by_phase))
-    if known is None:
-        offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
-        known = sections.fix_errors[m.source, by_phase] = FixErrors(offset_sd_s, not by_phase)
-        if shown := sections.fixes_shown.get(shown_as(m.source, by_phase)):
-            known.take_up(shown)
-    if motion is None:
-        return None
-    (north, east, *_), sds = motion
-    variance, sd_v = level_m**2, math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
-    known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, variance, (north, east), sd_v))
-    return known.shares(when.t_ns)
-
-
-def _lasting(sd: Vector3, shares: Shares, shared_m: tuple[float, float]) -> Vector3:
-    """Share of the common error of fixes in one of that sigma; what is seen of the
-    horizontal is taken to be so of the height. Its own error counts as stated all the same: how a
-    receiver that smooths its fixes follows a turn is in no share."""
-    north, east, down = sd
-    level, vertical = (math.sqrt(shares.lasts) / s for s in shared_m)
-    return level * north, level * east, vertical * down
+def _errors(source: str, by_phase: bool, o: GnssAiding, sections: Sections) -> FixErrors:
+    """Errors of a receiver's fixes by code or by phase, at the first of them."""
+    offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
+    errors = sections.fix_errors[source, by_phase] = FixErrors(offset_sd_s, not by_phase)
+    if shown := sections.fixes_shown.get(shown_as(source, by_phase)):
+        errors.take_up(shown)
+    return errors
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 
 S = TypeVar("S", bound=Aiding)
+LEAST_SPEED_SD_M_S = 1e-3
+"""Least credible sigma: a hundredth of a good receiver's or wheel sensor's."""
 
 
 class Instants(NamedTuple):
