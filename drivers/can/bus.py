@@ -7,7 +7,7 @@ when its owner calls `poll`: an IMU sends its frames one by one, and a daemon th
 spends five times their cost on waking. A bus without one (`virtual`) is read by a thread into a
 ring of `RING_FRAMES`.
 
-Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
+How a frame lies in what a socket gives: `drivers.can.frame_decoding`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,13 @@ from can.typechecking import CanFilter
 
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.can.errors import ControllerState, controller_state, error_names
+from drivers.can.frame_decoding import (
+    CANFD_BYTES,
+    DATAGRAM_BYTES,
+    Decode,
+    datagram_decoder,
+    of_can_frame,
+)
 from drivers.can.python_can_import import can
 
 FRAMES_PER_WAKEUP = 64
@@ -42,10 +49,7 @@ LONGEST_WAIT_S = 1.0
 
 Interface = Literal["socketcan", "virtual", "udp_multicast"]
 
-EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 0x8000_0000, 0x4000_0000, 0x2000_0000
-_FRAME = struct.Struct("=IB3x")
 _TIMESPEC = struct.Struct("@ll")
-_CANFD_MTU = 72
 _SO_TIMESTAMPNS, _SO_MEMINFO, _SK_MEMINFO_DROPS = 35, 55, 8
 
 
@@ -71,6 +75,8 @@ class _BusFaultError(Exception):
 
 
 Read = Callable[[], CanFrame | None]
+_NO_FRAME = CanFrame(0, False, b"", 0)
+"""What a datagram without a frame is read as."""
 
 
 class CanBus:
@@ -211,7 +217,12 @@ class CanBus:
         except NotImplementedError:
             return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
-        read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
+        own: socket.socket | None = None
+        if sock is not None:
+            read = partial(self.read_socket, sock, CANFD_BYTES, of_can_frame)
+        else:
+            own = socket.socket(fileno=fd)
+            read = partial(self.read_socket, own, DATAGRAM_BYTES, datagram_decoder())
         self._drain = partial(self._readable, read, gone)
         self._read_ns = self._now_ns()
         if not self.polled:
@@ -225,6 +236,8 @@ class CanBus:
         finally:
             self._drain = None
             loop.remove_reader(fd)
+            if own is not None:
+                own.detach()  # it is the bus that closes it
 
     def _readable(self, read: Read, gone: asyncio.Future[str]) -> None:
         """Read what has come, the rest in the next turn of the loop."""
@@ -239,7 +252,8 @@ class CanBus:
                 frame = read()
                 if frame is None:
                     return False
-                self.deliver(frame)
+                if frame is not _NO_FRAME:
+                    self.deliver(frame)
         except _BusFaultError as fault:
             gone.set_result(str(fault))
         except Exception as defect:
@@ -255,50 +269,38 @@ class CanBus:
         # A stamp from before the system clock was set, or by another clock, lies outside.
         return arrived_ns if self._read_ns <= arrived_ns <= now_ns else now_ns
 
-    def _read_socket(self, sock: socket.socket) -> CanFrame | None:
-        """Read one frame of a raw CAN socket with its kernel stamp; None without one.
+    def read_socket(self, sock: socket.socket, size: int, decode: Decode) -> CanFrame | None:
+        """Read one frame of a socket with its kernel stamp; None without one.
 
-        A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds.
+        A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds. A datagram on
+        `udp_multicast` that is no CAN frame is counted and passed over.
         """
         try:
-            raw, control, _, _ = sock.recvmsg(_CANFD_MTU, 64, socket.MSG_DONTWAIT)
+            raw, control, _, _ = sock.recvmsg(size, 64, socket.MSG_DONTWAIT)
         except (BlockingIOError, InterruptedError):
             self._read_ns = self._now_ns()
             return None
-        except OSError as error:
-            raise _BusFaultError(self._explain(error)) from error
+        except OSError as failure:
+            raise _BusFaultError(self._explain(failure)) from failure
         realtime_ns = None
         for level, kind, value in control:
             if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(value)
                 realtime_ns = seconds * 1_000_000_000 + nanoseconds
-        can_id, length = _FRAME.unpack_from(raw)
-        extended = bool(can_id & EXTENDED_FLAG)
-        return CanFrame(
-            can_id & (0x1FFF_FFFF if extended or can_id & ERROR_FLAG else 0x7FF),
-            extended,
-            raw[_FRAME.size : _FRAME.size + length],
-            self._arrived_ns(realtime_ns),
-            realtime_ns,
-            bool(can_id & REMOTE_FLAG),
-            bool(can_id & ERROR_FLAG),
-        )
+        try:
+            can_id, extended, data, remote, error = decode(raw)
+        except Exception:  # whatever python-can raises for what others send to its group
+            self.counters["bad_datagrams"] += 1
+            return _NO_FRAME
+        arrived_ns = self._arrived_ns(realtime_ns)
+        return CanFrame(can_id, extended, data, arrived_ns, realtime_ns, remote, error)
 
     def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
-        """Read one frame through python-can; None without one.
-
-        A datagram on `udp_multicast` that is no CAN frame is counted and passed over.
-        """
+        """Read one frame of a bus without a descriptor through python-can; None without one."""
         try:
             message = bus.recv(timeout_s)
-        except OSError as error:
+        except (OSError, can.CanError) as error:
             raise _BusFaultError(self._explain(error)) from error
-        except can.CanError as error:
-            cause = error.__cause__
-            if self.interface != "udp_multicast" or cause is None or isinstance(cause, OSError):
-                raise _BusFaultError(self._explain(error)) from error
-            self.counters["bad_datagrams"] += 1
-            return None
         if message is None:
             self._read_ns = self._now_ns()
             return None

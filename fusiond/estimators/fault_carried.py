@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.covariance_propagation import transition_for
 from fusiond.estimators.fault_bank import PHI, SENSITIVITIES, WAITS, WIDTH
-from fusiond.estimators.fault_update import add_rows, walk_path
+from fusiond.estimators.fault_update import walk_path
 from fusiond.estimators.multi_sample_covariance import DENSITIES, STEPS
+from fusiond.estimators.sensitivity_sums import add_rows
 from fusiond.estimators.tilt_axes_propagation import rest_rows
 from fusiond.navigation.compiled import compiled
 

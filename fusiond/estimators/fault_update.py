@@ -65,6 +65,11 @@ from fusiond.estimators.fault_bank import (
     column_of,
     group_at,
 )
+from fusiond.estimators.sensitivity_sums import (
+    add_rows,
+    fold_in_sensitivities,
+    take_off_before,
+)
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DV
 from fusiond.navigation.strapdown import VN
@@ -215,31 +220,6 @@ def rows_of_fault(
         out[a] = (offset + slope * age_s) * b[0 if size == 1 else a]
 
 
-@compiled("void(f4[::1], i8, i8, i8[::1], i8, f8[::1], f4[::1])")
-def add_rows(
-    v: Single, columns: int, first: int, of: Indices, count: int, c: Array, out: Single
-) -> None:
-    """Add to `out` c (n,) times V, from column `first` on: of its rows `count`, `of` which c is not
-    zero, four in one pass."""
-    at = 0
-    while at < count:
-        more = at + 4 <= count
-        i_0 = of[at]
-        v_0, c_0 = v[i_0 * columns + first :], np.float32(c[i_0])
-        if more:
-            i_1, i_2, i_3 = of[at + 1], of[at + 2], of[at + 3]
-            v_1, c_1 = v[i_1 * columns + first :], np.float32(c[i_1])
-            v_2, c_2 = v[i_2 * columns + first :], np.float32(c[i_2])
-            v_3, c_3 = v[i_3 * columns + first :], np.float32(c[i_3])
-            for j in range(out.shape[0]):
-                out[j] += c_0 * v_0[j] + c_1 * v_1[j] + c_2 * v_2[j] + c_3 * v_3[j]
-            at += 4
-        else:
-            for j in range(out.shape[0]):
-                out[j] += c_0 * v_0[j]
-            at += 1
-
-
 @compiled(
     "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
     "f8[:, ::1], f4[::1])",
@@ -301,44 +281,10 @@ def sensitivity_rows(
             along += h[a, i] * g[a, i]
         # Of S = (h g) root + r, which is root^2.
         over = np.float32(1.0 / (0.5 * (along + math.sqrt(along * along + 4.0 * r[a]))))
-        for b in range(a):
-            common, before = 0.0, work[b * columns : (b + 1) * columns]
-            for i in range(n):
-                common += h[a, i] * g[b, i]
-            less = np.float32(common)
-            for j in range(s.shape[0]):
-                s[j] -= less * before[j]
+        take_off_before(h, g, a, columns, work)
         for j in range(s.shape[0]):
             s[j] *= over
     return columns
-
-
-@compiled("void(f4[::1], i8, f8[:, ::1], i8, f4[::1])")
-def _fold_in(v: Single, n: int, g: Array, columns: int, work: Single) -> None:
-    """Update V <- V - g^T s, three rows in one pass, or one."""
-    at, m = 0, g.shape[0]
-    while at < m:
-        s_0 = work[at * columns : (at + 1) * columns]
-        if at + 3 <= m:
-            s_1 = work[(at + 1) * columns : (at + 2) * columns]
-            s_2 = work[(at + 2) * columns : (at + 3) * columns]
-            for i in range(n):
-                c_0, c_1 = np.float32(g[at, i]), np.float32(g[at + 1, i])
-                c_2 = np.float32(g[at + 2, i])
-                if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
-                    continue
-                row = v[i * columns : (i + 1) * columns]
-                for j in range(row.shape[0]):
-                    row[j] -= c_0 * s_0[j] + c_1 * s_1[j] + c_2 * s_2[j]
-            at += 3
-        else:
-            for i in range(n):
-                c_0 = np.float32(g[at, i])
-                if c_0 != 0.0:
-                    row = v[i * columns : (i + 1) * columns]
-                    for j in range(row.shape[0]):
-                        row[j] -= c_0 * s_0[j]
-            at += 1
 
 
 @compiled("void(f8[::1], i8, i8, f8[::1], f8[:, ::1], b1, f4[::1])")
@@ -392,4 +338,4 @@ def account(
                     bank[j + unsigned(E1)] += s_1 * y_a
                     bank[j + unsigned(E2)] += s_2 * y_a
     if fused:
-        _fold_in(v, n, g, columns, work)
+        fold_in_sensitivities(v, n, g, columns, work)

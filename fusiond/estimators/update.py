@@ -44,14 +44,33 @@ def whiten(cov: Array, z: Array, h: Array, r: Array, y: Array, g: Array) -> floa
                 for j in range(width):
                     g[a, j] += c * cov[i, j]
         innovation, s = z[a], r[a]
-        for b in range(a):
-            common = 0.0
-            for i in range(n):
-                if h[a, i] != 0.0:
-                    common += h[a, i] * g[b, i]
-            innovation -= common * y[b]
-            for j in range(width):
-                g[a, j] -= common * g[b, j]
+        b = 0
+        while b < a:
+            g_0, c_0 = g[b], 0.0
+            if b + 4 <= a:  # four rows in one pass, one after the other
+                g_1, g_2, g_3 = g[b + 1], g[b + 2], g[b + 3]
+                c_1 = c_2 = c_3 = 0.0
+                for i in range(n):
+                    c = h[a, i]
+                    if c != 0.0:
+                        c_0 += c * g_0[i]
+                        c_1 += c * g_1[i]
+                        c_2 += c * g_2[i]
+                        c_3 += c * g_3[i]
+                innovation = innovation - c_0 * y[b] - c_1 * y[b + 1]
+                innovation = innovation - c_2 * y[b + 2] - c_3 * y[b + 3]
+                row = g[a]
+                for j in range(width):
+                    row[j] = row[j] - c_0 * g_0[j] - c_1 * g_1[j] - c_2 * g_2[j] - c_3 * g_3[j]
+                b += 4
+            else:
+                for i in range(n):
+                    if h[a, i] != 0.0:
+                        c_0 += h[a, i] * g_0[i]
+                innovation -= c_0 * y[b]
+                for j in range(width):
+                    g[a, j] -= c_0 * g_0[j]
+                b += 1
         for i in range(n):
             if h[a, i] != 0.0:
                 s += h[a, i] * g[a, i]

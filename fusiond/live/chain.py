@@ -24,6 +24,10 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.timeline import Entry
 
+LONGEST_WAIT_NS = 50_000_000
+"""Longest time that samples wait for a tick that does something: a solution's mode is as old as
+that at most, and of an IMU of 1 kHz 50 samples cost that tick 0.1 ms."""
+
 
 class Chain:
     """Chain of one vehicle from inputs to the solution. `saved`: state for the alignment;
@@ -57,6 +61,7 @@ class Chain:
         self.changed = False
         """True if the last tick brought another mode."""
         self._second = Every(SECOND_NS)
+        self._ticked_ns = 0
 
     def _report(self, source: str, code: str, text: str) -> None:
         """An event of a device or of the navigator."""
@@ -69,8 +74,31 @@ class Chain:
         if self._on_outcome is not None:
             self._on_outcome(entry)
 
+    def may_wait(self, t_ns: int) -> bool:
+        """True if a tick at `t_ns`, whose solution nobody reads, may leave its samples to the next.
+
+        The filter's state does not depend on how many samples come at once. What is decided in a
+        tick does: so nothing but samples has come, and the vehicle navigates.
+        """
+        sources = self.sources
+        return (
+            self.solution is not None
+            and self.solution.mode is Mode.NAVIGATING
+            and t_ns - self._ticked_ns < LONGEST_WAIT_NS
+            and sources.imu.may_wait
+            and not sources.measured
+            and not self.injection.faults
+            and self._second.waits(t_ns)
+        )
+
+    def wait(self) -> None:
+        """Leave the samples of a tick to the next."""
+        self.sources.behind = True
+        self.changed = False
+
     def tick(self, t_ns: int) -> Solution:
         """Run the filter on all input and read the solution at `t_ns`."""
+        self._ticked_ns, self.sources.measured, self.sources.behind = t_ns, False, False
         self.sources.release(t_ns)
         arrived = self.sources.take_imu(t_ns)
         if arrived is not None:

@@ -222,6 +222,9 @@ class Daemon:
         delay_ns = self.clock.now_ns() - t_ns
         self.sources.poll()
         self.recorder.tick_begins(t_ns)
+        if self._nobody_reads(t_ns) and self._chain.may_wait(t_ns):
+            self._chain.wait()
+            return
         solution = self._chain.tick(t_ns)
         if self.recorder.active:
             digest = state_digest(self.navigator, solution)
@@ -237,6 +240,11 @@ class Daemon:
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
         self._messages.keep(t_ns, self._chain.messaging)
+
+    def _nobody_reads(self, t_ns: int) -> bool:
+        """True if the solution of this tick goes nowhere: a log has each of them."""
+        unread = self._on_solution is None and not self.recorder.active
+        return unread and self._second.waits(t_ns) and self._publishing.waits(t_ns)
 
     def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
         """Log a state from which a part of the log can be replayed, at intervals."""
@@ -259,6 +267,7 @@ class Daemon:
         except RecordingRefusedError as error:
             raise CommandRefusedError(str(error)) from error
         t_ns = self.clock.now_ns()
+        self.sources.catch_up()
         self.recorder.command(t_ns, NAMES[type(command)], command)
         text = self._chain.operator.carry_out(command, t_ns)
         return self._when_kept(text) if isinstance(command, SendMessage) else text

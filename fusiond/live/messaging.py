@@ -71,6 +71,11 @@ class Messaging:
         self._refused: set[str] = set()
         self.revision = 0
 
+    @property
+    def has_waiting(self) -> bool:
+        """True if there is a message to publish."""
+        return bool(self._waiting)
+
     # ------------------------------------------------------------------ out
 
     def send(self, command: SendMessage, t_ns: int) -> str:

@@ -106,6 +106,13 @@ class Publishing:
             self._waiting.extend((self._health_of, self._consistency_of, self._innovations_of))
         self._publish_calibration(t_ns, utc_ns)
 
+    def waits(self, t_ns: int) -> bool:
+        """True if nothing is due at `t_ns`."""
+        if self._waiting or self._messaging.has_waiting:
+            return False
+        every = self._status, self._health, self._calibration, *(each for _, each in self._nav)
+        return all(each.waits(t_ns) for each in every)
+
     def _publish(self, topic: Topic, message: Message) -> None:
         for output in self._outputs.values():
             output.publish(topic, message)

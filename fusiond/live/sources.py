@@ -78,6 +78,10 @@ class Sources:
         """Callback with every measurement and its instant."""
         self.on_mail: Callable[[Mail], None] = lambda mail: None
         """Callback with short messages."""
+        self.measured = False
+        """True if a measurement that is no IMU sample has come since it was last set to False."""
+        self.behind = False
+        """True if a tick has left its samples to a later one."""
         self.all: dict[str, Source] = {}
         self._polls: list[Callable[[], None]] = []
         points = driver_entry_points()
@@ -146,6 +150,8 @@ class Sources:
         if isinstance(item, ImuSample):
             self.imu.take(item, instant.t_valid_ns)
             return
+        self.measured = True
+        self.catch_up()
         self._navigator.add(item, instant.t_valid_ns, instant.sd_s, item.t_seen_ns)
 
     def take_imu(self, t_ns: int) -> tuple[NDArray[np.int64], Array] | None:
@@ -155,6 +161,13 @@ class Sources:
         if self.imu.changes(t_ns, navigator.imu.latest_ns if navigator.imu.end else None):
             navigator.change_imu()
         return self.imu.samples()
+
+    def catch_up(self) -> None:
+        """Hand over the samples that ticks have left: what comes next finds them there."""
+        if self.behind:
+            self.behind = False
+            if (left := self.imu.samples()) is not None:
+                self._navigator.add_imu(*left)
 
     # ------------------------------------------------------------------ state
 

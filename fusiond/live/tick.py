@@ -31,6 +31,10 @@ class Every:
         self._period_ns = period_ns
         self._next_ns = 0
 
+    def waits(self, t_ns: int) -> bool:
+        """True if `due` would be False."""
+        return t_ns < self._next_ns
+
     def due(self, t_ns: int) -> bool:
         """True if a period has passed; those missed altogether are not made up for."""
         behind_ns = t_ns - self._next_ns

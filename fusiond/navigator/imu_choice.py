@@ -67,6 +67,11 @@ class ImuChoice:
             self.counters["imu_queue_overflow"] += 1
         self._waiting.append(row)
 
+    @property
+    def may_wait(self) -> bool:
+        """True if samples wait, which may go on waiting: there is no other unit to take over."""
+        return self._spare is None and bool(self._waiting)
+
     def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:
         """Rotate a sample from the spare's axes to those of the first unit."""
         both = np.reshape(sample, (2, 3)) @ self._turn.T

@@ -13,7 +13,7 @@ import subprocess
 import threading
 import time
 import tomllib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 
 import can
 import pytest
@@ -21,6 +21,7 @@ import pytest
 from drivers.can import bus as can_bus
 from drivers.can.bus import CanBus, CanFrame
 from drivers.can.errors import controller_state
+from drivers.can.frame_decoding import Content
 from drivers.can.imu import CanImuDriver, CanImuOptions
 from drivers.measurements import DeviceEvent, DeviceStamp, ImuSample, KernelStamp, Measurement
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
@@ -273,16 +274,18 @@ async def test_a_bus_that_dies_is_closed_and_opened_again(monkeypatch: pytest.Mo
     readable: the reader must be taken off the loop, not called for ever."""
     dead = threading.Event()
     calls = 0
-    whole = can_bus.CanBus.read_message
+    whole = can_bus.CanBus.read_socket
 
-    def failing(self: CanBus, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
+    def failing(
+        self: CanBus, sock: socket.socket, size: int, decode: Callable[[bytes], Content]
+    ) -> CanFrame | None:
         nonlocal calls
         if dead.is_set():
             calls += 1
             raise can_bus._BusFaultError(self._explain(OSError(errno.ENETDOWN, "down")))
-        return whole(self, bus, timeout_s)
+        return whole(self, sock, size, decode)
 
-    monkeypatch.setattr(can_bus.CanBus, "read_message", failing)
+    monkeypatch.setattr(can_bus.CanBus, "read_socket", failing)
     async with Running(interface="udp_multicast", channel=GROUP).run() as imu:
         with can.Bus(interface="udp_multicast", channel=GROUP, ignore_config=True) as sender:
             for message in sample_frames(1):
