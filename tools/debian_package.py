@@ -36,6 +36,10 @@ MAINTAINER = "{} <{}>".format(
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
 ENVIRONMENT["PYTHONDONTWRITEBYTECODE"] = "1"
 CONFFILES = ("/etc/fusiond/vehicle.toml",)
+BUILDERS = ("setuptools", "setuptools-*.dist-info", "_distutils_hack", "distutils-precedence.pth")
+"""What the lock has for building the wheel, on this machine; on a vehicle nothing imports it."""
+FOR_COMPILERS = {".a", ".c", ".cpp", ".h", ".hpp", ".pxd", ".pyi", ".pyx"}
+"""Sources, headers and stubs: read by compilers of extensions and by type checkers."""
 
 CONTROL = """\
 Package: fusiond
@@ -201,8 +205,9 @@ def environment(tree: Tree, python: str, requirements: Path, work: Path) -> None
 
 
 def lighten(venv: Path) -> None:
-    """Leave out the packages' own tests (37 MB) and the symbols that only a debugger reads (45 MB),
-    and their programs, which nobody calls.
+    """Leave out what builds wheels (setuptools, 8 MB with its bytecode) and extensions (4 MB), the
+    packages' own tests (37 MB) and the symbols that only a debugger reads (45 MB), and their
+    programs, which nobody calls.
 
     Libraries in `*.libs` stay as they are: their loading segments were moved when the wheels were
     made, which strip does not always survive.
@@ -211,9 +216,15 @@ def lighten(venv: Path) -> None:
         if path.name != "fusiond" and not path.name.startswith("python"):
             path.unlink()
     packages = next(venv.glob("lib/python*/site-packages"))
+    for pattern in BUILDERS:
+        for path in packages.glob(pattern):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
     for folder in sorted(packages.rglob("tests")):
         if folder.is_dir():
             shutil.rmtree(folder)
+    for path in packages.rglob("*"):
+        if path.suffix in FOR_COMPILERS and path.is_file():
+            path.unlink()
     libraries = [p for p in packages.rglob("*.so") if not p.parent.name.endswith(".libs")]
     run("strip", "--strip-unneeded", "--preserve-dates", *libraries)
 

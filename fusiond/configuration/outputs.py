@@ -5,10 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fusiond.configuration.aiding import Section
 
+
+def _host(text: str) -> str:
+    """IPv6 addresses have colons, of which the last is no port's."""
+    if not text or "/" in text or text.count(":") == 1 or any(c.isspace() for c in text):
+        raise ValueError("a name or an address alone: no scheme, port or path")
+    return text
+
+
+Host = Annotated[str, AfterValidator(_host)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Rate = Annotated[float, Field(ge=0.1, le=100.0)]
 
@@ -16,7 +25,7 @@ Rate = Annotated[float, Field(ge=0.1, le=100.0)]
 class Served(Section):
     """Common options of TCP servers."""
 
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     """Address to listen at; `0.0.0.0` serves the whole network, without a password."""
     rate_hz: Rate = 1.0
     """Epochs a second, as receivers send them."""
@@ -54,7 +63,7 @@ class NmeaServed(Served):
 class Prometheus(Section):
     """Metrics for Prometheus at `/metrics`."""
 
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     """Address to listen at."""
     port: Port = 9947
 

@@ -34,7 +34,7 @@ from fusiond.configuration.alignment import Alignment
 from fusiond.configuration.constraints import Constraints
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
-from fusiond.configuration.outputs import Outputs
+from fusiond.configuration.outputs import Host, Outputs, Port
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
@@ -176,8 +176,8 @@ class Mqtt(Section):
     here."""
 
     enabled: bool = True
-    host: str = "localhost"
-    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    host: Host = "localhost"
+    port: Port = 1883
     client_id: str | None = None
     username: str | None = None
     password_file: Path | None = None

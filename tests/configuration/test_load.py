@@ -74,6 +74,16 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         ("[mqtt]\nport = 1.5", "mqtt.port = 1.5: expected an integer at least 1 and at most 65535"),
         ("[mqtt]\ntls = 1", "mqtt.tls = 1: expected true or false"),
         ("[mqtt]\nhost = 3", "mqtt.host = 3: expected text in quotes"),
+        (
+            '[mqtt]\nhost = "mqtt://10.0.0.1:1883"',
+            'mqtt.host = "mqtt://10.0.0.1:1883": a name or an address alone:'
+            " no scheme, port or path",
+        ),
+        (
+            '[outputs.gpsd]\nhost = "127.0.0.1:2947"',
+            'outputs.gpsd.host = "127.0.0.1:2947": a name or an address alone:'
+            " no scheme, port or path",
+        ),
         ("state_file = 3", "state_file = 3: expected a path in quotes"),
         ("imu = 3", "imu = 3: expected a section"),
         (

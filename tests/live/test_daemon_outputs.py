@@ -84,6 +84,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["text"] == "position taken: aligning from it"
                 await bench.mode(Mode.ALIGNING)
                 await ask("set_position", here)
+                await bench.mode(PARKED)  # what was put right is no motion
                 await listener.until(lambda li: "gated" in _judged(li))
                 reply = await ask("stop_recording", {})
                 assert reply["ok"], reply

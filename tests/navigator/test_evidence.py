@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise
-from fusiond.navigator.alignment.evidence import AlignmentEvidence, Fix
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Fix, Standstill
 from fusiond.navigator.alignment.options import alignment_options
 
 CONFIG = Config.model_validate({"imu": {"rate_hz": 100.0}})
@@ -62,3 +63,16 @@ def test_velocities_that_run_away_are_suspect_even_when_they_agree_again() -> No
         wrong[: FIXES // 2] = 6.0 * np.array([math.cos(angle), math.sin(angle)])
         known, _ = _looked_at(rng, wrong)
         assert known.contradicted_ns["gnss"] > 1_000_000_000
+
+
+def test_a_position_that_an_operator_corrects_is_no_motion() -> None:
+    """Typed 300 km off and put right a second later: it would never be level. A receiver's two
+    positions that far apart are another matter."""
+    for source, rested in (("operator", True), ("rdss", False)):
+        known = AlignmentEvidence(
+            alignment_options(CONFIG), imu_noise(CONFIG.imu), None, lambda code, text: None
+        )
+        for t_ns, lat in ((1, 0.55), (10**9, 0.5)):
+            where, sd, lever = (lat, 2.0, 40.0), (5.0,) * 3, (0.0,) * 3
+            known.receive([PositionMeasurement(source, t_ns, 0.999, *where, sd, lever)])
+        assert known.rested(Standstill(0, 5 * 10**9, 5.0)) is rested

@@ -44,6 +44,8 @@ ANY_TIME_NS = 1 << 62
 MOST_FIXES, FIXES_NS = 400, 20_000_000_000
 # Positions that may contradict a standstill: a minute's, of a receiver of 1 Hz.
 MOST_POSITIONS = 60
+OPERATOR = "operator"
+"""Source of positions that somebody types."""
 # A vehicle that drives for long drives faster (m/s).
 SLOWEST_M_S = 3.0
 # Sigmas at which position and velocity of a receiver do not confirm each other: of two axes, one
@@ -213,7 +215,11 @@ class AlignmentEvidence:
                 case HeadingCandidate():
                     self.heading = candidate
         if position is not None:
-            self._by_source[measurements[0].source] = position
+            source = measurements[0].source
+            if source == OPERATOR:  # one who corrects what he typed has not moved
+                before = self._by_source.get(source)
+                self._positions = [p for p in self._positions if p is not before]
+            self._by_source[source] = position
             insort(self._positions, position, key=lambda p: p.t_ns)
             del self._positions[:-MOST_POSITIONS]
         if velocity is not None:

@@ -24,6 +24,7 @@ from fusiond.models.vehicle_parameter_blocks import (
     fix_markov_block,
     time_offset_block,
 )
+from fusiond.navigator.alignment.evidence import OPERATOR
 from fusiond.navigator.intake.kind import (
     LEAST_SPEED_SD_M_S,
     Instants,
@@ -292,9 +293,7 @@ def operator_position(
     t_ns: int, where: tuple[float, float, float], sd_m: float
 ) -> PositionMeasurement:
     """Position (rad, rad, m) by an operator, one sigma (m) of each axis."""
-    return PositionMeasurement(
-        "operator", t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0)
-    )
+    return PositionMeasurement(OPERATOR, t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0))
 
 
 KIND = Kind(PositionFix, measurements_of, {GnssAiding: blocks})
