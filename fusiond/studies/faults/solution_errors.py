@@ -1,9 +1,8 @@
 """Published solution of a run at 10 Hz, beside the truth: errors and stated sigmas of every
 instant.
 
-Nothing is read but solutions, as outputs have them: whatever says inside the navigator how sure it
-is, this is what it is worth. Modes that publish are all in which there is a solution, `coasting`
-and `invalid`, too.
+Only solutions are read, as outputs publish them, and no state inside the navigator. Modes that
+publish are all with a solution, `coasting` and `invalid` included.
 """
 
 from __future__ import annotations
