@@ -20,7 +20,7 @@ JUMP_SD_M = 0.6
 
 def estimator(receiver: Receiver, north_m: float = 0.0) -> Estimator:
     """A filter that knows its position to a metre, and takes fixes for so far to the north."""
-    found = Navigator(Vehicle("data sheet", receiver, configured="noise").config()).estimator
+    found = Navigator(Vehicle("data sheet", receiver, told="noise").config()).estimator
     nav, xi = np.zeros(NAV_SIZE), np.zeros(found.model.size)
     xi[[slot for name in BLOCKS[:1] for slot in found.model.slots_of(name)][:1]] = north_m
     nav[0] = 0.8

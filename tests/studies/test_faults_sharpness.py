@@ -43,7 +43,7 @@ def drawn(scale: float) -> Published:
 
 
 def test_cells_are_all_that_the_page_promises() -> None:
-    told = [cell for cell in CELLS if cell.configured == "all"]
+    told = [cell for cell in CELLS if cell.told == "all"]
     assert len(told) == 56
     assert len(set(CELLS)) == len(CELLS) == 68
     assert len(set(jobs(3))) == 204

@@ -168,7 +168,7 @@ def _steady(
     receiver: Receiver, number: int, share: Share, duration_s: float
 ) -> tuple[Scene, Published]:
     """Drive, and its published solution without a fault."""
-    vehicle = Vehicle("data sheet", receiver, configured="noise")
+    vehicle = Vehicle("data sheet", receiver, told="noise")
     on = scene(vehicle, share, number, duration_s)
     return on, published_errors(on.config, on.recording, on.truth)
 

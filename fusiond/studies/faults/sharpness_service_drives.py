@@ -12,7 +12,7 @@ What follows says of what: 0 path, 1 IMU, 2 receiver, 3 what nobody has measured
 
 A receiver's error is white, or shared: a Gauss-Markov process of `SHARED_S` beside white noise. The
 car neither slides nor is its unit askew, and stamps are exact. What of this the configuration says
-is `Configured`:
+is `Told`:
 
     all       noise of the IMU and of the receiver, of which `[aiding.gnss]` says what is shared and
               each fix what is white; stamps that are exact. The filter has no constraint of a
@@ -42,7 +42,7 @@ from fusiond.studies.faults.sensor_data import Received, Recording, gnss_fixes
 
 Share = Literal["looked", "scored"]
 SHARES: tuple[Share, ...] = ("looked", "scored")
-Configured = Literal["all", "noise", "class"]
+Told = Literal["all", "noise", "class"]
 ENTROPY = 38
 RATE_HZ = 50.0
 SHARED_S = 60.0
@@ -104,15 +104,15 @@ class Vehicle:
     sensor: SensorClass | Literal["data sheet"]
     receiver: Receiver
     lever_given: bool = True
-    configured: Configured = "all"
+    told: Told = "all"
 
     def config(self) -> Config:
         """Input of the navigator."""
         gnss: dict[str, Any] = {"lever_arm_m": ANTENNA_M} if self.lever_given else {}
-        slip = {"enabled": self.configured != "all", "lever_arm_m": AXLE_M}
-        if self.configured != "class":
+        slip = {"enabled": self.told != "all", "lever_arm_m": AXLE_M}
+        if self.told != "class":
             gnss |= self.receiver.section
-        if self.configured == "all":
+        if self.told == "all":
             gnss |= {"time_offset_sd_s": 0.0}
         own: dict[str, Any] = {"sensor_class": self.sensor}
         if self.sensor == "data sheet":
@@ -130,7 +130,7 @@ class Vehicle:
     def unit(self) -> Config:
         """Configuration with the IMU on board."""
         config = self.config()
-        if self.configured != "class" or self.sensor == "data sheet":
+        if self.told != "class" or self.sensor == "data sheet":
             return config
         own = {
             key: value if "_noise_" in key else TYPICAL * value
@@ -178,5 +178,5 @@ def _stating(item: Received, vehicle: Vehicle) -> Received:
     fix, receiver = item.measurement, vehicle.receiver
     assert isinstance(fix, PositionFix)
     level, down = receiver.white_m
-    stated = fix.sd_ned_m if vehicle.configured == "class" else (level, level, down)
+    stated = fix.sd_ned_m if vehicle.told == "class" else (level, level, down)
     return replace(item, measurement=replace(fix, quality=receiver.quality, sd_ned_m=stated))

@@ -66,19 +66,19 @@ def _cells() -> tuple[Vehicle, ...]:
 
     Some whose noise is configured in full, some by their class alone, and a unit with square axes
     by its data sheet."""
-    all_configured = [
+    told = [
         Vehicle(sensor, replace(receiver, rate_hz=rate), given)
         for sensor, receiver, rate, given in product(CLASSES, RECEIVERS, RATES_HZ, (True, False))
     ]
     by_class = [
-        Vehicle(sensor, replace(receiver, rate_hz=rate), configured="class")
+        Vehicle(sensor, replace(receiver, rate_hz=rate), told="class")
         for sensor, receiver, rate in product(CLASSES, (CODE, RTK), RATES_HZ)
     ]
     square = [
         Vehicle("data sheet", replace(receiver, rate_hz=rate))
         for receiver, rate in product(RECEIVERS, RATES_HZ)
     ]
-    return (*all_configured, *by_class, *square)
+    return (*told, *by_class, *square)
 
 
 CELLS = _cells()
@@ -121,7 +121,7 @@ def cell_name(vehicle: Vehicle) -> dict[str, Any]:
         "receiver": vehicle.receiver.name,
         "rate_hz": vehicle.receiver.rate_hz,
         "lever_given": vehicle.lever_given,
-        "told": vehicle.configured,
+        "told": vehicle.told,
     }
 
 
