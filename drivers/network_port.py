@@ -41,7 +41,7 @@ _EXAMPLES = "tcp://HOST:PORT, udp://:PORT or gpsd://HOST:2947"
 
 
 def on_network(port: str) -> bool:
-    """True if a `port` is no serial device but an address."""
+    """True if a `port` is an address and not a serial device."""
     return "://" in port
 
 
@@ -104,7 +104,7 @@ def connect(host: str, number: int) -> socket.socket:
 
 
 class _SocketPort:
-    """Common part of TCP and UDP: no rate, and a name that stands for nothing else."""
+    """Common part of TCP and UDP ports, which have no baud rate."""
 
     def __init__(self, opened: socket.socket) -> None:
         opened.setblocking(False)
@@ -137,7 +137,7 @@ class TcpPort(_SocketPort):
 
 
 class GpsdPort(TcpPort):
-    """The bytes of a device that a gpsd reads. What is written would be taken for commands."""
+    """Bytes of a device read by gpsd. Read-only: gpsd would take written bytes for commands."""
 
     at_end = "gpsd closed the connection"
     writable = False

@@ -44,7 +44,7 @@ def rounded_speed(
 ) -> RoundedSpeed:
     """Expected speed for a rounded value of a device with steps of `step_m_s`.
 
-    A 0 is no standstill: it says that the speed is below one step, whichever way it is rounded,
+    A 0 does not mean standstill: the speed is below one step, whichever way it is rounded,
     for sensors of wheels give no pulses below a least speed.
     """
     if abs(value_m_s) < 0.5 * step_m_s:

@@ -1,4 +1,4 @@
-"""Rates at which a line is read while what arrives makes no sense: no I/O, no clock.
+"""Search for the baud rate of a line whose bytes do not verify: no I/O, no clock.
 
 A receiver that loses its battery, or is set anew, sends at another rate than was configured. Each
 rate is tried for two epochs of a second, in turn, the configured one among them, for as long as
@@ -29,7 +29,7 @@ class RateSearch:
         self._since_ns, self._untried = None, []
 
     def next(self, t_ns: int, bytes_in: int) -> int | None:
-        """The rate to go on with, None to stay at this one; `bytes_in` have come in all."""
+        """The next rate to try, or None to stay at this one, after `bytes_in` bytes in all."""
         if self._since_ns is not None and (
             t_ns - self._since_ns < LISTEN_NS or bytes_in - self._bytes_in < ENOUGH_BYTES
         ):

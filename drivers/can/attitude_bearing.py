@@ -35,7 +35,7 @@ class CanMeasurementOptions(CanOptions):
 class CanAttitudeOptions(CanMeasurementOptions):
     """Signals of roll, pitch and yaw (NED to body, 3-2-1), and one sigma of each.
 
-    "" for an angle that the device does not measure, or whose sigma it does not say.
+    "" for an angle or a sigma that the device does not send.
     """
 
     rpy: tuple[str, str, str]

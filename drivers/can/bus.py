@@ -71,7 +71,7 @@ class CanFrame(NamedTuple):
 
 
 class _BusFaultError(Exception):
-    """The bus cannot be read any more; the text says why."""
+    """Error: the bus has become unreadable; the text is the reason."""
 
 
 Read = Callable[[], CanFrame | None]

@@ -151,7 +151,7 @@ class MessagePlan:
     _values: list[tuple[int, float, float, float, float]] = field(default_factory=list)
 
     def decode(self, data: bytes) -> Part:
-        """Decode one frame's data; what is planned stands from the first on.
+        """Decode one frame's data into the planned slots, from the first on.
 
         RefusedFrameError: `wrong_length` (shorter than the DBC says; padding is accepted),
         `undecodable` (a planned signal is not in it), `not_finite` (NaN or infinite float),
@@ -194,7 +194,7 @@ def find_dbc(name: str) -> Path:
 def load_dbc(name: str) -> Database:
     """Load a DBC file; PermanentDriverError when there is none or it cannot be read.
 
-    A message with a flaw in it is left out, which the log says; whoever asks for it hears why.
+    A flawed message is left out and logged; a mapping that uses it raises the reason.
     """
     path = find_dbc(name)
     try:

@@ -215,8 +215,8 @@ class CanDecoder(ABC, Generic[O]):
     def _measurements(
         self, values: list[float], t_seen_ns: int, stamp: Stamp
     ) -> Sequence[Measurement]:
-        """Measurements of a complete set of values (by slot); none, counted, where it says
-        nothing."""
+        """Measurements of a complete set of values (by slot); an empty set is counted and gives
+        none."""
 
 
 def names_of(signals: str | Signals | None) -> Signals:

@@ -45,7 +45,7 @@ class _Doubt:
 
 
 class DeviceTime:
-    """Unwraps a device's time; `restarts` counts how often it began anew."""
+    """Unwrapped time of a device; `restarts` counts its restarts."""
 
     def __init__(self, modulus: int, tick_ns: Fraction) -> None:
         self.restarts = 0

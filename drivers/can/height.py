@@ -1,4 +1,4 @@
-"""Driver `can_height`: a height, or the pressure that stands for one, out of a CAN bus by any DBC.
+"""Driver `can_height`: a height, or an air pressure, from a CAN bus by any DBC.
 
 A pressure becomes a height of the standard atmosphere (drivers.standard_atmosphere).
 """
@@ -24,7 +24,7 @@ _ACCURACY, _FLAGS = 1, 2
 
 
 class CanHeightOptions(CanOptions):
-    """Signal of a height, or the pressure of the air around. A signal is "Message.Signal"."""
+    """Signal of a height or of the ambient pressure. A signal is "Message.Signal"."""
 
     height: str | None = None
     """Metres or feet. Of a barometer's own, say `barometric`."""

@@ -1,4 +1,4 @@
-"""Frames that belong to one instant of an IMU, put together; what is missing, counted. No I/O.
+"""Assembly of an IMU's frames of one instant, with counts of missing ones. No I/O.
 
 An IMU spreads a sample over several messages. Two frames belong together when
 
@@ -150,7 +150,7 @@ class Pairing:
         return part.ticks if self._by_time else None
 
     def _is_duplicate(self, index: int, arrival_ns: int) -> bool:
-        """True for repeated content: with the same inner stamp, or too early for a new sample."""
+        """True for a repeated frame: the same inner stamp, or too early for a new sample."""
         if self._stamped[index]:
             return True
         interval_ns = self.interval_ns

@@ -1,4 +1,4 @@
-"""Driver `can_wheel`: the vehicle's speed out of its own wheel speeds, by any DBC.
+"""Driver `can_wheel`: the vehicle's speed from its own wheel speeds, by any DBC.
 
     v = mean( v_i of wheels that do not steer,  v_j cos(delta) of wheels that do )
 

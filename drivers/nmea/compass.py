@@ -4,9 +4,9 @@
     HDM   magnetic heading
     HDT   true heading, by the compass's own idea of the declination, or of a gyrocompass
 
-A device may send all three of one reading: of those that have been heard the first in this order is
-used, the others are counted as `other_sentence`. The variation of HDG is not used: the declination
-is computed where the vehicle is. Source: NMEA 0183 4.11, section 6.3.
+A device may send all three of one reading: the first received kind in this order is used, the
+others are counted as `other_sentence`. The variation of HDG is ignored; the declination is computed
+for the vehicle's position. Source: NMEA 0183 4.11, section 6.3.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class CompassDecoder:
         return []
 
     def flush(self) -> list[Heading | MagneticHeading]:
-        """The line has been closed: of what is not whole nothing comes."""
+        """End of the line: drop incomplete data."""
         self._splitter.finish()
         return []
 

@@ -1,8 +1,8 @@
 """Fix, heading or UTC report from an NMEA epoch's sentences, or the name of the refusal. No I/O, no
 clock.
 
-The receivers' own protocols have theirs in `drivers.solution`; these say their quality, their date
-and their height in more ways than one.
+Solutions in receivers' own protocols are validated by `drivers.solution`; NMEA states quality, date
+and height in several ways.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
-N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. What lies
-beyond is none (999.9, of a receiver without a model). 0 to the last digit says that, too: the
-places where that is N are one in a thousand, those whose altitude is one above the ellipsoid cannot
-be told from the others. A receiver that has printed N once is remembered: on the way since it has
-changed by the slope of the geoid.
+N lies between -107 and 85 m everywhere; an unknown N is taken as uniform in +-107 m. A printed N
+beyond that is none (999.9, of a receiver without a model). A printed N of exactly 0 means that the
+receiver has no model of the geoid: N is 0 at one place in a thousand. Such an altitude may be above
+the sea or above the ellipsoid. An N that the receiver printed before is used further, with an error
+that grows by the slope of the geoid along the way since.
 Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
 """
 

@@ -247,7 +247,7 @@ class _WholeSentences:
         self._searched = 0
 
     def inside(self, buffer: bytearray, start: int, end: int) -> bool:
-        """True if one stands in start..end, as far as received."""
+        """True if start..end contains one, as far as received."""
         self._search(buffer)
         found = self._found
         while found and found[0][0] < start:

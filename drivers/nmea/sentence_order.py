@@ -4,8 +4,8 @@ Two epochs in a row of the same sentences in the same order are a *cycle*: from 
 sentence ends an epoch at once. A receiver that mixes output rates, RMC at 50 Hz and GGA at 1 Hz,
 has a cycle of its own at each phase of the second: there two seconds in a row show it.
 
-A silence ends an epoch too, but where the receiver has gone on with the same instant after such a
-silence: there it pauses, and what is to come is waited for.
+A silence ends an epoch too, unless the receiver has continued with the same instant after a silence
+at this place: then the silence is a pause inside the epoch, and its other sentences are awaited.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The client of an NTRIP caster: keeps the corrections coming, and hands on what is whole.
+"""Client of an NTRIP caster: keeps the connection alive and passes whole frames on.
 
-Of what the caster sends only RTCM 3 frames whose checksum is right go on, each as a whole, so that
+Only RTCM 3 frames with a correct checksum pass, each as a whole, so that
 nothing that was torn or means something else to the receiver gets to it.
 """
 

@@ -1,4 +1,4 @@
-"""NTRIP on the wire: the request, and the caster's answer taken apart. No I/O, no clock.
+"""NTRIP on the wire: the request, and a parser of the caster's reply. No I/O, no clock.
 
 NTRIP 1.0 (RTCM 10410.0) answers `ICY 200 OK`, and the corrections follow; NTRIP 2.0 (RTCM 10410.1)
 is HTTP/1.1, as a rule in chunks (RFC 9112, section 7.1). A mountpoint that the caster lacks is
@@ -22,7 +22,7 @@ class CasterRefusedError(Exception):
 
 
 def mountpoint_request(host: str, port: int, mountpoint: str, user: str, password: str) -> bytes:
-    """Request for a mountpoint; a caster that knows 1.0 alone overlooks what it does not know."""
+    """Request for a mountpoint; a caster of version 1.0 ignores the headers of 2.0."""
     lines = [
         f"GET /{mountpoint} HTTP/1.1",
         f"Host: {host}:{port}",

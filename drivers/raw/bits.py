@@ -5,7 +5,7 @@
 
 A table names each number once: where it starts, how long it is, and what its last bit weighs. Bits
 count from 0, in a string from which parity and headers were taken out, so that a number which the
-message splits over two words or pages stands in one piece.
+message splits over two words or pages is in one piece.
 """
 
 from __future__ import annotations

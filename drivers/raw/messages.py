@@ -92,7 +92,7 @@ class Ephemeris:
     `week` with `toe_s` and `toc_s` in the system's own time. `group_delay_s`: GPS (TGD,),
     BeiDou (TGD1, TGD2) of D1 and D2, (T_GD B1C pilot, T_GD B2a pilot, ISC of the data component of
     B1C, or of B2a) of B-CNAV1, or B-CNAV2; Galileo (BGD E5a/E1, BGD E5b/E1). `message`: "lnav",
-    "d1", "d2", "bcnav1", "bcnav2", "inav", "fnav". `healthy` is what the satellite says of itself.
+    "d1", "d2", "bcnav1", "bcnav2", "inav", "fnav". `healthy`: the satellite's own statement.
     `semi_major_rate` (m/s) and `mean_motion_rate` (rad/s^2) are B-CNAV's alone.
     """
 

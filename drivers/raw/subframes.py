@@ -39,7 +39,7 @@ class Subframe:
 
 @dataclass(slots=True)
 class Parts:
-    """Blocks by number that belong together by `key`; another key starts anew."""
+    """Blocks by number that share a `key`; another key starts a new set."""
 
     key: Any = None
     found: dict[int, Any] = field(default_factory=dict)

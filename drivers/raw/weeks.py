@@ -28,7 +28,7 @@ LEAP_SECONDS = (
     (date(2015, 7, 1), 17),
     (date(2017, 1, 1), 18),
 )
-"""GPS time minus UTC from a date on (IERS Bulletin C): taken where a receiver does not say."""
+"""GPS time minus UTC from a date on (IERS Bulletin C), for receivers that do not state it."""
 FIRST_RAWX_WEEK = 1773
 """Start of 2014. No receiver sent RXM-RAWX before; an earlier week is a clock never set."""
 LAST_WEEK = 6260

@@ -245,5 +245,5 @@ def _encode(m: Message) -> bytes:
 
 
 def encode(message: Message) -> bytes:
-    """The frame that says `message`. EncodeError if 4.0 cannot say it or it must not be sent."""
+    """Frame of a message. Raises EncodeError for a message that 4.0 lacks or that is forbidden."""
     return encode_frame(_encode, message)

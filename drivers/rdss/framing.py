@@ -22,7 +22,7 @@ def checksum(data: bytes | bytearray | memoryview) -> int:
 
 
 def encode_frame(say: Callable[[Message], bytes], message: Message) -> bytes:
-    """The frame that says `message`. EncodeError where a value of it does not fit its field."""
+    """Frame of a message. Raises EncodeError for a value that exceeds its field."""
     try:
         return say(message)
     except EncodeError:
@@ -40,7 +40,7 @@ class FrameDecoder(ABC):
     """
 
     BETWEEN: ClassVar[bytes] = b""
-    """Bytes that may stand between frames and are no garbage."""
+    """Bytes allowed between frames, which do not count as garbage."""
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
@@ -106,7 +106,7 @@ class FrameDecoder(ABC):
     def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
         """Length of the frame whose `$` stands at `at`, and the name of its fault or "".
 
-        While the length cannot be told, the greatest that it takes to tell it.
+        While the length is unknown, the greatest number of bytes that determines it.
         """
 
     @abstractmethod

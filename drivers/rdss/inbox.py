@@ -1,4 +1,4 @@
-"""Short messages that came: whose they are, what they say, and the receipts that they ask for."""
+"""Received short messages: their senders, their contents and the receipts that they request."""
 
 from __future__ import annotations
 

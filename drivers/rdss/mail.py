@@ -51,7 +51,7 @@ bytes."""
 class MessageReceived:
     """A short message that the terminal has received.
 
-    `text` is None for bytes that are none. `minute_of_day` is the centre's, in the terminal's zone.
+    `text` is None for other bytes. `minute_of_day` is the centre's, in the terminal's zone.
     `report` is the position report that it holds, `repeated` says that it came before.
     """
 

@@ -78,7 +78,7 @@ class Outgoing:
 
 @dataclass(slots=True)
 class StageChange:
-    """A message has come to another stage, or is queued again: as it was then."""
+    """A message's change of stage, or its return to the queue, as it was then."""
 
     message: Outgoing
     stage: Stage
@@ -308,7 +308,7 @@ class Outbox:
 
 
 class StrideScheduler:
-    """Order of fixes and messageswhere both wait: messages have `share`.
+    """Order of fixes and messages while both wait: messages get `share` of the turns.
 
     Stride scheduling (Waldspurger and Weihl, MIT/LCS/TM-528, 1995): each turn costs its class the
     inverse of its share, and the class that has spent less goes next. Who does not want turns does

@@ -45,7 +45,7 @@ class TransmitPermit:
         return news
 
     def silence(self) -> bool:
-        """The terminal says that radio silence is set; True if that is news."""
+        """Note the terminal's report of radio silence; True if silence is new."""
         news = not self.silent
         self.silent = True
         self._inbound_changed = False

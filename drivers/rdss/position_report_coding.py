@@ -1,4 +1,4 @@
-"""A position report: the solution in as few bits as a short message has room for.
+"""Coding of a position report: the solution in the few bits of a short message.
 
     report (kind 1)                                    short report (kind 2)
      0  4  time, POSIX s                                0  3  latitude, 90 deg / 2^23, signed
@@ -15,8 +15,8 @@ All big-endian. The full one has 4.7 mm of latitude and 9.3 mm of longitude, 4 m
 one, for a card of level 1, 1.2 m, 2.4 m and 1 s, without date, height and velocity.
 
 A sigma is a power: the k-th of the full report 0.01 m 2^(k/12) (to 22 km, by 6 %), of the short one
-1 m 2^k (to 8 km). It is rounded up, so that no report claims more than its solution; the last one
-says that it is not known. All bits of a field set say so of height, speed and course.
+1 m 2^k (to 8 km). It is rounded up, so that no report claims more than its solution; the last
+step means unknown. Height, speed and course are unknown with all bits of their field set.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEAST_HEIGHT_M, HEIGHT_STEP_M = -1000.0, 0.1
 SPEED_STEP_M_S = 0.01
 UNKNOWN_24, UNKNOWN_16 = 0xFFFFFF, 0xFFFF
 FULL_SIGMAS, SHORT_SIGMAS = 255, 14
-"""Steps of sigma that are a number; the next one says that it is not known."""
+"""Steps of sigma with a value; the next step means unknown."""
 
 
 class PositionReport(NamedTuple):
@@ -57,7 +57,7 @@ class PositionReport(NamedTuple):
 
 
 def encode_report(report: PositionReport) -> bytes:
-    """The body of a full report. ValueError for a place that is none."""
+    """Body of a full report. Raises ValueError for an invalid position."""
     _check(report)
     whole = math.floor(report.t_s)
     height, speed, course = report.height_m, report.speed_m_s, report.course_deg
@@ -76,7 +76,7 @@ def encode_report(report: PositionReport) -> bytes:
 
 
 def encode_short(report: PositionReport) -> bytes:
-    """The body of a short report. ValueError for a place that is none."""
+    """Body of a short report. Raises ValueError for an invalid position."""
     _check(report)
     north, east = report.sd_ned_m[:2]
     sd = None if north is None or east is None else max(north, east)

@@ -1,6 +1,6 @@
 """State of the terminal in the request cycle, and its transitions.
 
-`replies` changes it by what the terminal says, `terminal` by what is due.
+`message_effects` changes it by the terminal's messages, `request_state_machine` by deadlines.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from drivers.rdss.state_tables import (
 class RequestCycleState:
     """State with its deadline and data. Instants are monotonic ns.
 
-    `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
-    asked for since; `beams_said` is all that was said of the beams last. `answerable`: the last
-    request may still bring a fix; `height_given`: it gave a height, of `height_sd_m` where that is
-    known. `timeouts`: requests in a row without one. Spacing (`pace`), suppression and silence
+    `levels` and `levels_ns`: beam levels and the instant of their reading; `beam_reads`: queries
+    since then; `beams_said`: the last report of the beams. `answerable`: the last request may
+    still bring a fix; `height_given`: it gave a height, of sigma `height_sd_m` (None: unknown).
+    `timeouts`: requests in a row without a fix. Spacing (`pace`), suppression and silence
     (`permit`) and messages (`outbox`) outlive the line.
     """
 

@@ -57,7 +57,7 @@ class HeightSource:
         return PositionRequest(user, HeightMode.NONE, antenna_height_m=antenna)
 
     def _by_pressure(self, user: int, pressure_pa: float, antenna_m: float) -> PositionRequest:
-        """No sensor says the temperature: that of the standard atmosphere at this pressure."""
+        """No sensor measures the temperature; the standard atmosphere's here is used."""
         temperature_c = T0_K - LAPSE_K_M * pressure_height_m(pressure_pa) - ZERO_CELSIUS_K
         return PositionRequest(
             user,

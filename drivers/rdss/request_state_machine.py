@@ -1,6 +1,6 @@
 """The request cycle of an RDSS terminal: a state machine without I/O and without a clock.
 
-What is known lives in `session`; what the terminal's messages change stands in `replies`.
+The state is in `request_cycle_state`; `message_effects` changes it by the terminal's messages.
 Inputs: `opened`, `closed`, `received`, `tick`, each with the host's monotonic clock in ns. Outputs:
 the actions they return, and `next_deadline_ns`, when to call `tick` next. Only `tick` sends.
 

@@ -39,12 +39,12 @@ class EncodedText(NamedTuple):
 
 
 def card_level_bits(comm_level: int) -> int:
-    """Most bits of one message of a card of this level."""
+    """Greatest length (bits) of a message from a card of this level."""
     return LEVEL_BITS[min(comm_level, len(LEVEL_BITS) - 1)]
 
 
 def encode_shortest(text: str) -> EncodedText:
-    """A text in the encoding that takes least. ValueError for what GB 18030 cannot say."""
+    """Text in the shortest encoding. Raises ValueError for characters outside GB 18030."""
     if text and text.isascii() and text.isdigit():
         return encode_digits(text)
     try:
@@ -57,7 +57,7 @@ def encode_shortest(text: str) -> EncodedText:
 
 
 def encode_bytes(data: bytes) -> EncodedText:
-    """Any bytes."""
+    """Bytes in mixed encoding."""
     return EncodedText(MIXED + data, "mixed")
 
 
@@ -68,7 +68,7 @@ def encode_digits(text: str) -> EncodedText:
 
 
 def printable_text(wording: EncodedText) -> str | None:
-    """Readable text; None for bytes that are no text. Control characters are left out."""
+    """Printable text without control characters; None for other bytes."""
     if wording.encoding == "code":
         text = wording.payload.hex().upper()
         return text[:-1] if wording.odd else text

@@ -68,18 +68,18 @@ class Receipt(NamedTuple):
 
 
 def encode_envelope(kind: int, body: bytes) -> bytes:
-    """The envelope around a body."""
+    """Envelope around a body, as bytes."""
     head = bytes((MARK | kind,)) + body
     return head + _crc(head).to_bytes(2, "big")
 
 
 def envelope_crc(envelope: bytes) -> int:
-    """The check at an envelope's end."""
+    """CRC at the end of an envelope."""
     return int.from_bytes(envelope[-2:], "big")
 
 
 def encode_text_body(number: int, text: bytes) -> bytes:
-    """The body of a text that asks for a receipt. ValueError for one that is too long."""
+    """Body of a text that asks for a receipt. Raises ValueError for too long a text."""
     if len(text) > MOST_TEXT:
         raise ValueError(f"{len(text)} bytes of text, at most {MOST_TEXT}")
     return number.to_bytes(2, "big") + bytes((len(text),)) + text
@@ -93,7 +93,7 @@ def decode_text_body(body: bytes) -> tuple[int, bytes]:
 
 
 def encode_receipt_body(receipted: Receipt) -> bytes:
-    """The body of a receipt."""
+    """Body of a receipt."""
     return receipted.number.to_bytes(2, "big") + receipted.crc.to_bytes(2, "big")
 
 

@@ -95,10 +95,11 @@ class State(NamedTuple):
 
 
 class Renewal(NamedTuple):
-    """Errors that successive measurements share become in part others at an instant: those of the
-    `blocks`, t in units of their initial sigmas, are R t + w from then on, R `kept` and cov(w)
-    `new` (k, k). A clone has a part of the navigation errors, too: `of_navigation` (k, 9) times
-    them, in the states' units, and its `estimate` (k,) is given."""
+    """Partial renewal, at an instant, of errors that successive measurements share.
+
+    The states t of the `blocks`, in units of their initial sigmas, become R t + w, with R `kept`
+    and cov(w) `new` (k, k). A clone adds a part of the navigation errors: `of_navigation` (k, 9)
+    times them, in the states' units, with its `estimate` (k,)."""
 
     blocks: tuple[str, ...]
     kept: Array
@@ -148,7 +149,7 @@ class AidingMeasurement:
     """True if it holds while the vehicle moves the way it faces. Repeated refusals mean a slide, a
     wrong attitude or a wrong IMU mounting."""
     shown: ClassVar[attrgetter[Any] | None] = None
-    """Value that a frozen sensor repeats to the bit; else the first of its `candidates` says it."""
+    """Value that a frozen sensor repeats to the bit; by default of the first of `candidates`."""
     waits: ClassVar[bool] = False
     """True if its `feedback` may be held."""
     placed: ClassVar[bool] = False

@@ -6,10 +6,10 @@ With H of the satellites (fusiond.aiding.carrier_anchor), W = diag(1 / s_i^2) of
 
 v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is a
 satellite's orbit, clock and atmosphere beside what is broadcast: smooth over minutes, so that what
-it does to a place in 200 s is as from a walk, and in a second far less. Were it added to the clone
-at the anchor only, the inertial unit, which knows the place across that instant to millimetres,
-would take the velocity of the carriers for true: with four satellites of a DOP of 40 orbits that
-drift by 0.7 mm/s carry the place along by 30 mm/s.
+it does to a place in 200 s is as from a walk, and in a second far less. If it were added
+to the clone at the anchor only, the inertial unit, which knows the position across that instant to
+millimetres, would accept the carriers' velocity as true: with four satellites of a DOP of 40,
+orbits that drift by 0.7 mm/s move the position by 30 mm/s.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Headings and attitudes over time, for a vehicle without an inertial unit.
 
-Between two attitudes it turns evenly, but for a change of its rate of as much as the rate itself;
-after the last one it stands as then, but for that rate. A heading alone says that it is level, as a
-road is.
+Between two attitudes the vehicle turns evenly, with an uncertainty of its rate as large as the
+rate. After the last one it keeps the attitude, with the same uncertainty. A heading alone implies a
+level vehicle, as on a road.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class HeadingHistory:
         del self._headings[: bisect_left(self._headings, oldest)]
 
     def at(self, t_ns: int) -> KnownHeading | None:
-        """The last heading at `t_ns` or before that still counts; None where there is none."""
+        """The last valid heading at or before `t_ns`; None without one."""
         at = bisect_right(self._headings, KnownHeading(t_ns, math.inf, math.inf))
         if not (self.known and at):
             return None

@@ -64,8 +64,8 @@ class SpeedCandidate(NamedTuple):
 class HeadingCandidate(NamedTuple):
     """True heading (rad) of the body's forward axis; `how` names its origin.
 
-    `own_sd_rad` is the part of sigma that is of this measurement alone, `shared` the rest: blocks
-    of the model, with what each of their states turns the heading by."""
+    `own_sd_rad` is the independent part of sigma; `shared` the rest: blocks of the model with the
+    change of heading by each of their states."""
 
     t_ns: int
     yaw_rad: float

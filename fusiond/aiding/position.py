@@ -140,8 +140,8 @@ def position_rows(
 ) -> None:
     """Write the rows of a position: z (m,), H (m, n) and r (m,).
 
-    Of north, east, down the first m. P (n, n) says what the offset in time and the lever arm leave
-    out; (0, 0) where none is known. Slots in `xi`: `bias` (up to 3,), `time` (0 or 1,), `rest`
+    The first m of north, east, down. P (n, n) gives the part that offset in time and lever arm
+    leave out; (0, 0) if unknown. Slots in `xi`: `bias` (up to 3,), `time` (0 or 1,), `rest`
     (0 or 3,), `markov` (0 or 3,)."""
     m, n = h.shape
     h[:] = 0.0
@@ -221,10 +221,9 @@ def position_rows(
 class PositionMeasurement(AidingMeasurement):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
-    `bias`: the blocks whose states north, east, down are the error that the fixes share, and
-    `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
-    that of what is left of the lever arm; `markov` that of the error that lasts for seconds, of
-    `markov_m`.
+    Blocks of the model: `bias` has the error that fixes share (north, east, down), of which
+    `bias_share` enters each axis; `time` the fixes' offset in time; `rest` the residual of the
+    lever arm; `markov` the error that lasts for seconds, of `markov_m` (m).
     """
 
     locates: ClassVar[bool] = True

@@ -10,7 +10,7 @@ A vehicle that does not slide goes the way it faces, psi, or backwards. With f =
 
 f of a wheel is that of the last heading; without one it is the direction of v^ itself, where v^ is
 beyond `SIGN_SIGMAS` of its sigma (f . v is then the ground speed, and a wheel that turns backwards
-has -f). A wheel that says no more than its noise says that the vehicle stands, whichever way it
+has -f). A wheel speed within its noise means that the vehicle stands, whichever way it
 faces: v_n = v_e = 0. What is left is `direction_unknown`. A heading that is off by d makes a speed
 too small by d^2 / 2. Nothing tells an acceleration, so that a latency is noise, of `BRAKES_M_S2`.
 

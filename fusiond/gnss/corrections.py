@@ -1,4 +1,4 @@
-r"""Corrections of a service to broadcast orbits and clocks: which hold, and what they are worth.
+r"""Corrections of a service to broadcast orbits and clocks: their validity and their sigma.
 
 A satellite is corrected when there are, of one solution and none too old,
 

@@ -25,8 +25,8 @@ L1 C/A and L2C: the inter-signal corrections, in CNAV only, are the differential
 C1C-C1W and C2L-C2W, within 1 ns RMS: 0.3 m. L5 likewise.
 IS-GPS-705J 20.3.3.3.1.2.1 has it within +-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
 
-No standard bounds what an ISC is off by: a third of what is left without it is taken, of L5 a
-tenth.
+No standard bounds the error of an ISC: the sigma is a third of the one without an ISC, a tenth for
+L5.
 
 Source: IS-GPS-200N 20.3.3.3.3.2 and 30.3.3.3.1.1; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0
 5.2.4 (equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none), BDS-SIS-ICD-B1C-1.0 7.6

@@ -151,7 +151,7 @@ def ephemeris(slot: Slot, week: int, tow_s: float, epoch_s: float = EPOCH_S) -> 
     """Ephemeris that the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest
     one.
 
-    At `epoch_s` (GPS time, s) the satellites stand where they do at `EPOCH_S` unless told.
+    At `epoch_s` (GPS time, s; default `EPOCH_S`) the satellites have their nominal positions.
     Unquantised: `fusiond.simulation.gnss.nav_fields.quantised` rounds to what a message can carry.
     """
     system = slot.system

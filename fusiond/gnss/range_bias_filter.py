@@ -10,10 +10,10 @@ the others bound the place. Of each satellite a filter of one state
 
 z_k is what the filter predicts less the range with r taken off, so that nu is what r lacks; w the
 variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
-errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
-stays alone goes on telling what it told among others. L falls where its two carriers learn the
-delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing, and is out of
-the mean.
+errors. r is taken off the range, and V in place of L is left of its variance. So a
+satellite that stays alone keeps the information that it had among others. L falls where its two
+carriers learn the delay, since that changes e_k. An innovation beyond three sigma is not used, and
+is out of the mean.
 
 Source: Groves, 2nd edition, 3.2 and 9.4.4.
 """
@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 LASTS_S = 1800.0
 """Correlation time of orbit errors, as of `bias_correlation_s`."""
 EVERY_S = 0.9
-"""Innovations closer together say the same, as multipath lasts longer: those of each second."""
+"""Interval of the innovations that are used: multipath makes closer ones repeat the same error."""
 FORGOTTEN_S = 300.0
 """Time after which a satellite is treated as new; street corners hide it for less."""
 SIGMAS = 3.0

@@ -165,11 +165,11 @@ class ChosenSignals(NamedTuple):
 
 
 class TrackedSignals(NamedTuple):
-    """Picked signals with the results of their carriers (n, 6).
+    """Chosen signals with the results of their carriers (n, 6).
 
-    Everything that needs no receiver: those results after the epochs before, the factors on the
-    model's sigmas of codes, the carriers without a result, with the reason, and which codes (n,)
-    have gone from their carriers; None: none."""
+    All that is independent of the receiver's position: the carriers' results after earlier epochs,
+    the factors on the model's sigmas of codes, the carriers without a result, with the reason, and
+    the codes (n,) that have diverged from their carriers; None: none."""
 
     picked: ChosenSignals
     carriers: Array

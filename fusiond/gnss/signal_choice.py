@@ -324,8 +324,8 @@ class SignalChooser:
         return _Served(index, second, ephemeris, group, fixed, followed, columns)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
-        """Model and scale to the signal's frequency: the system's own, else whichever came. Of
-        BeiDou's two it is BDGIM, which is of the whole earth."""
+        """Ionosphere model and its scale to the signal's frequency: the system's own, else any
+        received one. Of BeiDou's two models BDGIM, which covers the whole earth."""
         have = self.store.ionosphere
         carrier = CARRIER_HZ[signal.system, signal.signal[0]]
         if self.store.bdgim is not None and (signal.system == "C" or "G" not in have):

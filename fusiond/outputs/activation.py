@@ -11,7 +11,7 @@ _FIRST_FD = 3
 
 
 def activated(name: str, environ: Mapping[str, str] = os.environ) -> socket.socket | None:
-    """A listening socket of the unit's `FileDescriptorName=name`; None if there is none for us.
+    """Listening socket of the unit's `FileDescriptorName=name`; None without one.
 
     Each call gives a duplicate, which a server may close and request again.
     """

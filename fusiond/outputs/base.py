@@ -17,7 +17,7 @@ from fusiond.outputs.topics import Topic
 
 
 class Output(Protocol):
-    """An output. `counters` and `status` stand in `health`, under `name`.
+    """An output. `health` shows `counters` and `status` under `name`.
 
     `nav_rate_hz`: rate at which it takes `nav`. `sets_clocks`: True if clients may set clocks by
     its time of day; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
@@ -35,7 +35,7 @@ class Output(Protocol):
     def status(self) -> DriverStatus: ...
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Keep a message, of which the task may send only the latest. Never waits, never raises."""
+        """Store a message; the task may send only the latest. Never waits, never raises."""
 
     async def run(self) -> None:
         """Send until cancelled."""

@@ -2,7 +2,7 @@
 
     offset = true UTC - CLOCK_REALTIME, at an instant of CLOCK_REALTIME
 
-Of the reports of a second the one that was least late counts: lateness is one-sided. Reports go on
+The report with the least delay of each second counts, since delay is one-sided. Reports go on
 as they came, past the daemon's own estimate of UTC: chrony has a filter, and what it does to the
 clock must show in the next sample. Nothing goes out before UTC is settled.
 
@@ -82,7 +82,7 @@ class ChronySocket:
 
 
 def _ahead_ns(sample: TimeSample) -> int:
-    """Lead of true UTC over the system clock by a sample; a late one says less."""
+    """Lead of true UTC over the system clock by a sample; a delayed sample shows less."""
     return sample.utc_ns - sample.system_ns
 
 

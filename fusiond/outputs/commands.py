@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 MAX_PAYLOAD_BYTES = 4096
-"""The longest command is some 200 bytes; what is larger is refused unread."""
+"""The longest command has some 200 bytes; larger ones are refused unread."""
 
 
 class Command(BaseModel):

@@ -1,4 +1,4 @@
-"""NMEA 0183 over TCP: an epoch of sentences at a time to everyone who connects.
+"""NMEA 0183 over TCP: each epoch of sentences to every client.
 
 RMC, GGA, VTG, GST and THS, with the talker GN. Mode letter A while it navigates, E and quality 6
 while it coasts (dead reckoning), N, quality 0 and RMC's status V otherwise. Sentences have no field
@@ -41,8 +41,8 @@ _QUALITY = {Mode.NAVIGATING: "1", Mode.COASTING: "6"}
 
 
 class NmeaServer:
-    """Sentences at `host:port`. Counters: those of `TcpServer`. What a client sends is not read
-    for anything but its end."""
+    """Server of sentences at `host:port`, with the counters of `TcpServer`. A client's bytes are
+    discarded; only its end matters."""
 
     name = "nmea"
     sets_clocks = True

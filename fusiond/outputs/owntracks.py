@@ -1,7 +1,7 @@
-"""OwnTracks output: the vehicle among friends' phones, through the broker of `[mqtt]`.
+"""OwnTracks output: the vehicle's location for phones, through the broker of `[mqtt]`.
 
-A location for each `tracker`, with the speed, course and height of the last `nav`. It is dated, so
-that none goes out before UTC is settled.
+A location for each `tracker`, with the speed, course and height of the last `nav`. It has a date,
+so none is sent before UTC is settled.
 
 Source: OwnTracks booklet, "JSON", _type=location: acc and vac m, alt m, cog deg, vel km/h, tst and
 created_at POSIX seconds.

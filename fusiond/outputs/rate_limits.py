@@ -1,9 +1,9 @@
-"""Allowance of one guest: bytes, messages and microseconds, each a bucket that fills by itself.
+"""Rate limits of one client: token buckets for bytes, messages and microseconds.
 
     left(t) = min(burst, left(t0) + rate (t - t0))
 
-A piece of work may overdraw a bucket; the client then waits until it is full enough again, or is
-dropped for a flood. Time is `time.perf_counter_ns`.
+A piece of work may overdraw a bucket. The client then waits until the bucket has refilled, or is
+disconnected for a flood. Time is `time.perf_counter_ns`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Bucket:
 
 
 class Allowance:
-    """The three buckets of one guest."""
+    """The three buckets of one client."""
 
     __slots__ = ("bytes", "messages", "microseconds")
 

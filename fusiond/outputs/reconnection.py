@@ -33,7 +33,7 @@ class Reconnecting:
         self._in_a_row = 0
 
     def ended(self, lasted_s: float, by_broker: bool) -> bool:
-        """A connection has ended; whether it tells, as the first to do so, of a rival."""
+        """Note the end of a connection; True if it is the first evidence of a rival client."""
         if lasted_s > PEACE_S:
             self.taken = False
             self._contested.reset()

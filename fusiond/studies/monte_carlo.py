@@ -2,7 +2,7 @@
 
 A run draws from a generator of its own, made of the study's seed and the run's number, so that no
 result depends on who ran what, in which order, and on how many processes. `run_generator` makes it
-by a spawn key, as numpy means it. The papers' studies mix [seed, number] instead, which keeps runs
+by a spawn key, as numpy intends. The papers' studies mix [seed, number] instead, which keeps runs
 as far apart (numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0]
 are one stream. None of them has two such lists, and their printed figures stand.
 """

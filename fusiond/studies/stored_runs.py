@@ -1,14 +1,13 @@
-"""Runs of a study as rows of a file: a row each, none made twice.
+"""Runs of a study as rows of a file: one row a run, each computed once.
 
 A row is named by study, part of it, digest of what its runs are given, version of fusiond, seed and
 number. The digest is of the function that makes a run and of all its arguments: a case that has
 been changed has new rows, as a configuration has in `fusiond batch`. Constants of modules are not
 in it: those belong to the version.
 
-Figures of a run that is a record of numbers are the record. Of any other run, its arrays are told
-by their columns: as they are up to `AS_IT_IS` values, else mean and root mean square of what is
-finite; and what the study's summary needs is kept whole in `result`, so that a study that was
-stopped goes on where it was.
+A run that is a record of numbers is stored as it is. Any other run is stored by the columns of its
+arrays: all values up to `AS_IT_IS`, else mean and root mean square of the finite ones. `result`
+holds all that the study's summary needs, so that a stopped study continues where it was.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ from fusiond.studies.faults.runs import VEHICLE, navigate
 from fusiond.studies.faults.sensor_data import Drive, Recording
 
 TICKS_HZ = 100.0
-LATE_S = measurement_faults.LATE_S
+DELAY_S = measurement_faults.DELAY_S
 TRUTH, ON_TIME = Drive(duration_s=60.0).recorded(VEHICLE, seed=5)
-ALWAYS_LATE = measurement_faults.stamped_late(ON_TIME, 0.0, math.inf)
+ALWAYS_LATE = measurement_faults.stamped_too_new(ON_TIME, 0.0, math.inf)
 
 
 def looked(
@@ -64,7 +64,7 @@ def test_lateness_is_found_when_the_vehicle_drives_off() -> None:
     measurements = navigator._intake.measurements_of(item.measurement, item.t_ns, 0.0, item.seen_ns)
     assert not isinstance(measurements, str)
     shifted_s = (measurements[0].t_ns - late.receive(source, measurements)[0].t_ns) * 1e-9
-    assert shifted_s == pytest.approx(LATE_S, abs=4.0 * SETTLED_SD_S)
+    assert shifted_s == pytest.approx(DELAY_S, abs=4.0 * SETTLED_SD_S)
 
 
 def test_a_receiver_that_cannot_have_become_late_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +80,7 @@ def test_a_receiver_that_cannot_have_become_late_is_not(monkeypatch: pytest.Monk
     told, late, _ = looked(ALWAYS_LATE, (19.0, 20.5, 22.0, 23.5, 25.0))
     assert not told
     assert not late.suspects
-    assert asked == pytest.approx([LATE_S] * len(asked), abs=0.2)
+    assert asked == pytest.approx([DELAY_S] * len(asked), abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_a_receiver_that_was_late_for_a_while_is_not_late_now() -> None:
     )
     _, on_time = Drive(duration_s=120.0).recorded(phone, seed=5)
     end_s = 42.0
-    recording = measurement_faults.stamped_late(on_time, 30.0, end_s - 30.0)
+    recording = measurement_faults.stamped_too_new(on_time, 30.0, end_s - 30.0)
     told, late, _ = looked(recording, tuple(end_s + 1.0 + 1.5 * k for k in range(10)), phone)
     assert not told
     assert not late.suspects

@@ -235,7 +235,7 @@ def test_absent_and_late_are_of_their_kinds() -> None:
     assert len(measurement_faults.intermittent(whole, 10.0, 10.0, WheelSpeed).received) == 81
     late = [
         item
-        for item in measurement_faults.wheels_delayed(whole, 10.0, 5.0, late_s=0.5).received
+        for item in measurement_faults.wheels_delayed(whole, 10.0, 5.0, delay_s=0.5).received
         if item.t_ns % 1_000_000_000
     ]
     assert [item.t_ns for item in late] == [s * 1_000_000_000 + 500_000_000 for s in range(10, 15)]

@@ -11,10 +11,10 @@ import pytest
 from drivers.measurements import MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.faulty_hours import (
-    APART_S,
     JUDGED_S,
     LASTS_S,
     SETTLED_S,
+    SPACING_S,
     TimedFault,
     by_fault,
     faults_of,
@@ -52,10 +52,10 @@ def test_one_is_over_and_settled_before_the_next(name: str) -> None:
     for seed in HOURS:
         found = timed_faults(kind, seed, 3600.0)
         assert found == timed_faults(kind, seed, 3600.0) != timed_faults(kind, seed + 1, 3600.0)
-        assert APART_S[0] <= found[0].begin_s <= APART_S[1]
-        assert 3600.0 - sum(APART_S) < found[-1].begin_s <= 3600.0 - APART_S[0]
+        assert SPACING_S[0] <= found[0].begin_s <= SPACING_S[1]
+        assert 3600.0 - sum(SPACING_S) < found[-1].begin_s <= 3600.0 - SPACING_S[0]
         for one, other in pairwise(found):
-            assert APART_S[0] - 0.1 <= other.begin_s - one.begin_s <= APART_S[1] + 0.1
+            assert SPACING_S[0] - 0.1 <= other.begin_s - one.begin_s <= SPACING_S[1] + 0.1
             assert one.end_s + SETTLED_S < other.begin_s
         for h in found:
             length_s, whole_s = h.end_s - h.begin_s, EVERY[h.fault].length_s

@@ -39,7 +39,7 @@ class Watch:
     pps: bool = False
 
     def ask(self, wanted: dict[str, Any]) -> str | None:
-        """Take a client's object over; what is wrong with it, if something is.
+        """Adopt a client's object; the reason if it is invalid.
 
         One that says no `enable` wants to watch; one that names no format gets no reports, as from
         gpsd 3.22: clients that then connect again and ask for JSON read the answer first.

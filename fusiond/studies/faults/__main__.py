@@ -127,12 +127,12 @@ def _run(
 ) -> list[dict[str, Any]]:
     """Run `one` for each input; a lost row is reported on standard error."""
 
-    def tell(done: int, total: int) -> None:
+    def show_progress(done: int, total: int) -> None:
         if sys.stderr.isatty():
             print(f"\r{done}/{total}", end="", file=sys.stderr, flush=True)
 
     with Pool(workers) as pool, runner_context(pool) as lost:
-        found = map_items(one, wanted, step_counter(tell, len(wanted)))
+        found = map_items(one, wanted, step_counter(show_progress, len(wanted)))
     for run in lost:
         print(f"row {run.number} {run.ended}: {run.reason}", file=sys.stderr)
     return found

@@ -1,8 +1,8 @@
 r"""Bounds: the earliest possible detection of a fault, and the largest error before it.
 
-All that a filter knows of a fault is in its whitened innovations y. A fault adds a signature s_k to
-them: the difference of the innovations of two runs with the same noise, with the fault and without
-it, nothing gated and nobody accused. No test is better than the one that knows it, and that one has
+All of a filter's information on a fault is in its whitened innovations y. A fault adds a signature
+s_k to them: the difference of the innovations of two runs with the same noise, with the fault and
+without it, without gates and exclusions. The best possible test knows the signature, and it has
 
     d^2(t) = sum_k |s_k|^2          e^T L^-1 e ~ noncentral chi-square with d^2
 

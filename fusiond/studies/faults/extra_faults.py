@@ -40,7 +40,7 @@ MORE: dict[str, Fault] = {
     "height_50m": _of_fixes(partial(measurement.too_high, up_m=50.0), 20.0),
     "velocity_off_3_m_s": _of_fixes(partial(measurement.velocity_bias, north_m_s=3.0), 20.0),
     "sigma_1mm": _of_fixes(partial(measurement.tiny_sigma, sd_m=1e-3), 30.0),
-    "fixes_late_2s": _of_fixes(partial(measurement.stamped_late, late_s=2.0), 30.0),
+    "fixes_late_2s": _of_fixes(partial(measurement.stamped_too_new, delay_s=2.0), 30.0),
     # samples of the IMU
     "gyro_bias_0.3_deg_s": _of_imu(partial(imu.bias_step, size=0.3 * DEG)),
     "force_bias_0.5_m_s2": _of_imu(partial(imu.bias_step, size=0.5, axis=FORWARD)),
@@ -66,7 +66,7 @@ MORE: dict[str, Fault] = {
     "wheels_10%_fast": _of_wheels(partial(measurement.wheels_scaled, factor=1.1), 30.0),
     "wheels_locked": _of_wheels(measurement.wheels_locked, 5.0),
     "wheels_slip": _of_wheels(_slip, 3.0),
-    "wheels_late_0.5s": _of_wheels(partial(measurement.wheels_delayed, late_s=0.5)),
+    "wheels_late_0.5s": _of_wheels(partial(measurement.wheels_delayed, delay_s=0.5)),
     "wheels_in_km_h": _of_wheels(partial(measurement.wheels_scaled, factor=KM_H)),
     "wheels_in_km_h_always": _of_wheels(
         partial(measurement.wheels_scaled, factor=KM_H), phases=("aligning",), begin_s=0.0

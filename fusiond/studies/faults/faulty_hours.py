@@ -2,7 +2,7 @@
 
 The vehicles of `hours`, with the same noise for the same seed. Faults are those that alter a
 recording over a window and need no other drive or configuration; the seed draws which, and when:
-each begins `APART_S` after the last one began. Those that last to the end of the matrix's drive
+each begins `SPACING_S` after the last one began. Those that last to the end of the matrix's drive
 have a drawn length (`LASTS_S`). Of two receivers one, the other or both are wrong.
 
 A fault answers for all that follows it until the next begins. It is noticed if an event or another
@@ -49,7 +49,7 @@ from fusiond.studies.faults.power import largest
 from fusiond.studies.faults.runs import navigate
 from fusiond.studies.faults.sensor_data import GNSS, SECOND, Recording, town
 
-APART_S = (180.0, 480.0)
+SPACING_S = (180.0, 480.0)
 """Least and largest interval between the starts of two faults, and before the first."""
 LASTS_S = (20.0, 60.0)
 """Least and largest duration of faults that last to the end of the matrix's drive."""
@@ -96,7 +96,7 @@ def timed_faults(kind: Kind, seed: int, duration_s: float) -> list[TimedFault]:
     rng = np.random.default_rng([seed, 3])
     names, found = faults_of(kind), []
     begin_s = 0.0
-    while (begin_s := round(begin_s + rng.uniform(*APART_S), 1)) <= duration_s - APART_S[0]:
+    while (begin_s := round(begin_s + rng.uniform(*SPACING_S), 1)) <= duration_s - SPACING_S[0]:
         name = names[rng.integers(len(names))]
         fault, drawn_s = EVERY[name], round(rng.uniform(*LASTS_S))
         spares = (None, *RECEIVERS)[rng.integers(3)]
@@ -133,7 +133,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
 
     aligned = course.samples[modes.index(NAVIGATING) if NAVIGATING in modes else len(modes) :]
     samples = [s if calm(s.t_s) else replace(s, mode="", ratios=()) for s in aligned]
-    told = Counter(event_name(e.code, e.text) for e in course.events if alarms(e))
+    reported = Counter(event_name(e.code, e.text) for e in course.events if alarms(e))
     ends = [*(h.begin_s for h in happened[1:]), duration_s]
     return {
         "kind": name,
@@ -145,7 +145,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
             if happening.begin_s < len(modes)
         ],
         "hours": sum(s.mode == NAVIGATING for s in samples) / 3600.0,
-        "told": dict(told),
+        "told": dict(reported),
         "stated_per_h": stated_per_h(config),
         "tests": tests_by_series(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
         "judged": tests_by_series(
@@ -192,14 +192,14 @@ def by_fault(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         rows = [row for row in happened if row["fault"] == name]
         if not rows:
             continue
-        begun = [row for row in rows if row["mode"] == NAVIGATING]
-        noticed = [row["noticed_s"] for row in begun if row["noticed_s"] is not None]
-        recovered = [row["recovered_s"] for row in begun if row["recovered_s"] is not None]
+        started = [row for row in rows if row["mode"] == NAVIGATING]
+        noticed = [row["noticed_s"] for row in started if row["noticed_s"] is not None]
+        recovered = [row["recovered_s"] for row in started if row["recovered_s"] is not None]
         lines.append(
             {
                 "fault": name,
                 "times": len(rows),
-                "begun": len(begun),
+                "begun": len(started),
                 "noticed": len(noticed),
                 "noticed_median_s": statistics.median(noticed) if noticed else None,
                 "noticed_slowest_s": max(noticed, default=None),

@@ -9,7 +9,7 @@ isolated              a fault of a source is identified at odds of a thousand to
                       Three gates of 0.9999 that fail in a row are nothing beside it
 corrected             likewise of the inertial unit and of stamps, and that a source's fault is
                       over, as often as one begins
-verdict               alpha, begun: `BEGUN`, as study `consistency` counts them
+verdict               alpha, begun: `STARTED_RATE`, as study `consistency` counts them
 protection            `false_alarm_per_hour` of `[integrity]`
 
 Wheels have the drift that the filter allows for. RDSS is no matched
@@ -63,7 +63,7 @@ HOUR_S = 3600.0
 RATE_HZ, GNSS_HZ = 50.0, 1.0
 LIMITS_M = (40.0, 40.0)
 """Alert limits, as in study `protection`."""
-BEGUN = 0.015e-3
+STARTED_RATE = 0.015e-3
 """False verdicts an innovation with a window of 100 (docs/consistency.md)."""
 CONFIDENCE = 0.99
 CORRECTED = ("sensor_fault", "fault_over")
@@ -175,7 +175,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     truth, recording = kind.recorded(config, seed, duration_s)
     course = navigate(config, recording, truth)
     since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
-    told = Counter(
+    reported = Counter(
         event_name(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
     )
     after = [s for s in course.samples if s.t_s > since_s]
@@ -184,7 +184,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "kind": name,
         "seed": seed,
         "hours": duration_s / 3600.0,
-        "told": dict(told),
+        "told": dict(reported),
         "stated_per_h": stated_per_h(config),
         "tests": tests_by_series(recording.received),
         "limits": kind.drive.second,
@@ -246,7 +246,7 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         rows = [row for row in found if row["kind"] == name]
         if not (hours := sum(row["hours"] for row in rows)):
             continue
-        told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+        reported: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
         tests: Counter[str] = sum((Counter(row["tests"]) for row in rows), Counter())
         judged: Counter[str] = sum(
             (Counter(row.get("judged", row["tests"])) for row in rows), Counter()
@@ -254,7 +254,7 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         alarms = {
             **{
                 what: (
-                    _starting(told, *codes),
+                    _starting(reported, *codes),
                     sum(row["hours"] * row["stated_per_h"][what] for row in rows),
                     hours,
                 )
@@ -262,8 +262,8 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
             },
             **{
                 f"verdict of {series}": (
-                    sum(k for what, k in told.items() if _verdict_of(what) == series),
-                    BEGUN * count,
+                    sum(k for what, k in reported.items() if _verdict_of(what) == series),
+                    STARTED_RATE * count,
                     hours * count / tests[series],
                 )
                 for series, count in judged.items()
@@ -271,18 +271,18 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         }
         if rows[0]["limits"]:
             limit = Config().integrity.false_alarm_per_hour * hours
-            alarms["protection"] = _starting(told, "protection"), limit, hours
+            alarms["protection"] = _starting(reported, "protection"), limit, hours
         known = ("isolated", "verdict_", "protection", *CORRECTED)
-        other = sum(k for what, k in told.items() if not what.startswith(known))
+        other = sum(k for what, k in reported.items() if not what.startswith(known))
         alarms["anything else"] = other, 0.0, hours
-        for what, (times, stated, heard) in alarms.items():
+        for what, (times, stated, observed_h) in alarms.items():
             low = chi2.ppf(0.5 - CONFIDENCE / 2, 2 * times) / 2 if times else 0.0
             high = chi2.ppf(0.5 + CONFIDENCE / 2, 2 * times + 2) / 2
-            a_day = 24.0 / heard
+            a_day = 24.0 / observed_h
             lines.append(
                 {
                     "kind": name,
-                    "hours": heard,
+                    "hours": observed_h,
                     "what": what,
                     "times": times,
                     "per_24_h": times * a_day,
@@ -293,8 +293,8 @@ def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _starting(told: Counter[str], *words: str) -> int:
-    return sum(k for what, k in told.items() if what.startswith(words))
+def _starting(reported: Counter[str], *words: str) -> int:
+    return sum(k for what, k in reported.items() if what.startswith(words))
 
 
 def _verdict_of(what: str) -> str:

@@ -187,8 +187,8 @@ FAULTS: dict[str, Fault] = {
     # Of a receiver without velocities, which would tell.
     "places_drift_0.5_m_s": _of_places(measurement.drift),
     "places_drift_2_m_s": _of_places(partial(measurement.drift, north_m_s=2.0)),
-    "fixes_late_0.8s": Fault(measurement.stamped_late, phases=UNDER_WAY),
-    "fixes_always_late_0.8s": _from_start(measurement.stamped_late),
+    "fixes_late_0.8s": Fault(measurement.stamped_too_new, phases=UNDER_WAY),
+    "fixes_always_late_0.8s": _from_start(measurement.stamped_too_new),
     "false_burst_1khz": Fault(measurement.false_burst, 0.5),
     "sigma_1e-9": Fault(measurement.tiny_sigma, 20.0),
     "sigma_infinite": Fault(measurement.infinite_sigma, 1.0),

@@ -22,7 +22,7 @@ MULTIPATH_M = 80.0
 MULTIPATH_S, TUNNEL_S = 0.6, 60.0
 TINY_SD_M = 1e-9
 VELOCITY_RAMP_M_S2 = 0.1
-LATE_S = 0.8
+DELAY_S = 0.8
 HUGE = 1e300
 FAST_M_S = 2000.0 * 1852.0 / 3600.0
 """2,000 knots."""
@@ -171,14 +171,14 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _changed(r, begin_s, length_s, PositionFix, grown)
 
 
-def stamped_late(
-    r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S
+def stamped_too_new(
+    r: Recording, begin_s: float, length_s: float, delay_s: float = DELAY_S
 ) -> Recording:
     """Fixes that are older than their stamps.
 
     As of a line that is slow from its first byte on, and a receiver whose time nobody knows."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
-    ns = round(late_s * 1e9)
+    ns = round(delay_s * 1e9)
     return r.with_received(
         [
             replace(item, t_ns=item.t_ns + ns, seen_ns=item.seen_ns + ns) if item in moved else item
@@ -337,9 +337,9 @@ def wheels_locked(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _wheels_times(r, begin_s, length_s, 0.0)
 
 
-def wheels_delayed(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
+def wheels_delayed(r: Recording, begin_s: float, length_s: float, delay_s: float) -> Recording:
     """Speeds that are older than their stamps."""
-    ns = round(late_s * 1e9)
+    ns = round(delay_s * 1e9)
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
     received = []
     for item in r.received:

@@ -64,7 +64,7 @@ SWEEPS: dict[str, Sweep] = {
     "fixes late": Sweep(
         "s",
         (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 2.0, 3.0),
-        lambda size: partial(measurement.stamped_late, late_s=size),
+        lambda size: partial(measurement.stamped_too_new, delay_s=size),
     ),
     "yaw gyro off": Sweep(
         "deg/s",

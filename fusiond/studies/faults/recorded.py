@@ -1,13 +1,14 @@
 """Faults put into a recorded drive: vibration, a road and errors that nobody simulated.
 
-A recorded drive has no truth that knows attitude and velocity. What it is compared with is its own
-smoothed solution, of all measurements and with nothing wrong, and by the sigmas of both together:
+A recorded drive has no true attitude and velocity. Its own fault-free smoothed solution, of all
+measurements, stands for the truth, and errors are compared with the sigmas of both together:
 
     ratio = |x_fault - x_smoothed| / sqrt(sigma_fault^2 + sigma_smoothed^2)
 
-Were both optimal, the variance of the difference would be that of the fault's less that of the
-smoothed, which uses all that the other uses: so that the ratio is too small, by little where the
-smoothed one is much the surer. An error that both share, a receiver's that lasts, is not seen.
+If both were optimal, the variance of the difference would be P_fault - P_smoothed, since the
+smoother uses all that the filter uses. So the ratio is too small, by little where the smoothed
+sigma is much the smaller. An error that both share, such as a receiver's lasting one, remains
+unseen.
 
 Where a fault turns the unit in the vehicle its yaw is compared with that of either.
 

@@ -4,7 +4,7 @@ Each drive goes through the navigator by its class alone: what the owner of the 
 and class, and nothing of noise. Once as it is, and then with outages (`Drive.outages`), set by set.
 A reference is what is not fused at that instant: the fixes that are withheld, or a truth of another
 device. Its sigma counts beside the published one; it is compared at the instants nearest to its
-own, `APART_S` at most. Lever arms of 5 cm are passed over.
+own, `GAP_S` at most. Lever arms of 5 cm are passed over.
 
 told        events after the first `navigating`, but for those that say all is well
 own         published horizontal sigma over that of the filter's own covariance, at each tick
@@ -38,7 +38,7 @@ from fusiond.studies.faults.solution_errors import AXES, STEP_S, Bools, errors_a
 
 Array = NDArray[np.float64]
 
-APART_S = 0.5 * STEP_S
+GAP_S = 0.5 * STEP_S
 ON_FOOT = {"heading": ("gnss_course",), "course_speed_m_s": 0.8, "course_sd_deg": 20.0}
 SLIPLESS = {"non_holonomic": {"enabled": True}}
 PHASE = "steady"
@@ -148,7 +148,7 @@ def real_run(job: RealJob) -> dict[str, Any]:
         held |= (states.t_s >= at_s) & (states.t_s < at_s + length_s)
     since = run.t_s >= run.t_s[int(np.argmax(run.navigating))]
     first_s = float(run.t_s[since][0])
-    told = Counter(
+    reported = Counter(
         event_name(e.code, e.text) for e in run.events if e.t_s > first_s and e.code not in USUAL
     )
     compared = near & run.there & (held if windows else np.full_like(held, drive.truth is not None))
@@ -157,8 +157,8 @@ def real_run(job: RealJob) -> dict[str, Any]:
         "outages": job.outages,
         "seconds": round(float(run.t_s[-1]), 1),
         "not_navigating_s": round(float((since & ~run.navigating & ~held).sum()) * STEP_S, 1),
-        "told": dict(told),
-        "isolated": sum(k for what, k in told.items() if what.startswith("isolated")),
+        "told": dict(reported),
+        "isolated": sum(k for what, k in reported.items() if what.startswith("isolated")),
         "own": own.shares(),
         "compared": int(compared.sum()),
         "phases": {PHASE: moments(run, compared)},
@@ -251,5 +251,5 @@ def _at_ticks(
     states = States(t_s, place, at(table.v), at(np.unwrap(table.rpy, axis=0)))
     sd = np.hstack((at(table.sd_position), at(table.sd_v), at(table.sd_rpy)))
     after = np.clip(np.searchsorted(table.t_s, there_s), 1, len(table.t_s) - 1)
-    apart = np.minimum(abs(table.t_s[after] - there_s), abs(table.t_s[after - 1] - there_s))
-    return states, np.nan_to_num(sd), apart <= APART_S
+    gap_s = np.minimum(abs(table.t_s[after] - there_s), abs(table.t_s[after - 1] - there_s))
+    return states, np.nan_to_num(sd), gap_s <= GAP_S

@@ -274,5 +274,9 @@ def _position_error_m(solution: Solution, true: Array) -> list[float]:
     """North, east, down; from the true latitude, longitude (rad) and height (m)."""
     unit = metres_to_geodetic(true[0:1], true[2:3], np.ones((1, 3)))[0]
     lat, lon, height = true.tolist()
-    apart = solution.lat_rad - lat, _wrapped(solution.lon_rad - lon), solution.height_m - height
-    return [a / u for a, u in zip(apart, unit.tolist(), strict=True)]
+    difference = (
+        solution.lat_rad - lat,
+        _wrapped(solution.lon_rad - lon),
+        solution.height_m - height,
+    )
+    return [a / u for a, u in zip(difference, unit.tolist(), strict=True)]

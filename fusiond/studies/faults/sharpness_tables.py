@@ -30,7 +30,7 @@ REAL = (
     "largest of each, RMS, m",
     "of all",
 )
-TOLD = {"all": "all", "class": "the class alone"}
+CONFIGURED = {"all": "all", "class": "the class alone"}
 _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("all told", lambda r: True),
     ("code", lambda r: r["receiver"] == "code"),
@@ -50,12 +50,12 @@ _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
 
 def sharpness(found: Rows) -> str:
     """Three tables and a line of sums."""
-    told = [row for row in found if row["told"] == "all"]
+    reported = [row for row in found if row["told"] == "all"]
     by_class = [row for row in found if row["told"] != "all"]
     sums = [
         (name, phase, str(len(rows)), *_entries(rows, phase))
         for name, holds in _ALL
-        if (rows := [row for row in told if holds(row)])
+        if (rows := [row for row in reported if holds(row)])
         for phase in PHASES
     ]
     sums += [
@@ -99,8 +99,8 @@ def _entry(nees: float, half: float, ratio: float) -> str:
 def _counts(found: Rows) -> list[tuple[str, ...]]:
     """Counts of right, perhaps and outside cells, by setting, phase and quantity."""
     lines = []
-    for told, name in TOLD.items():
-        cells = [rows for rows in _by_cell(found) if rows[0]["told"] == told]
+    for reported, name in CONFIGURED.items():
+        cells = [rows for rows in _by_cell(found) if rows[0]["told"] == reported]
         for phase in PHASES:
             columns = []
             for quantity in AXES:
@@ -125,7 +125,7 @@ def real(found: Rows) -> str:
 
 
 def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
-    told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+    reported: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
     largest = [value for row in rows for value in row["largest_m"]]
     own = [row["own"]["most_99"] for row in rows if row["own"]["most_99"] is not None]
     return (
@@ -134,7 +134,7 @@ def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
         f"{sum(row['seconds'] for row in rows):.0f}",
         f"{sum(row['not_navigating_s'] for row in rows):g}",
         str(sum(row["isolated"] for row in rows)),
-        ", ".join(f"{what} x{n}" if n > 1 else what for what, n in told.items()) or "-",
+        ", ".join(f"{what} x{n}" if n > 1 else what for what, n in reported.items()) or "-",
         number(max(own, default=None), "-"),
         *_entries(rows, COMPARED),
         number(math.sqrt(sum(x * x for x in largest) / len(largest)) if largest else None, "-"),

@@ -1,9 +1,8 @@
 """Published solution of a run at 10 Hz, beside the truth: errors and stated sigmas of every
 instant.
 
-Nothing is read but solutions, as outputs have them: whatever says inside the navigator how sure it
-is, this is what it is worth. Modes that publish are all in which there is a solution, `coasting`
-and `invalid`, too.
+Only solutions are read, as outputs publish them, and no state inside the navigator. Modes that
+publish are all with a solution, `coasting` and `invalid` included.
 """
 
 from __future__ import annotations
@@ -130,10 +129,10 @@ def errors_against(
 
     course = run_navigator(config, recording, n * STEP_S, look, watch, every_ticks=1)
     unit = metres_to_geodetic(true.position[:, 0], true.position[:, 2], np.ones((n, 3)))
-    apart = rows[:, :3] - true.position
-    apart[:, 1] = _wrapped(apart[:, 1])
+    difference = rows[:, :3] - true.position
+    difference[:, 1] = _wrapped(difference[:, 1])
     turned = _wrapped(rows[:, _TURNS] - true.rpy)
-    errors = np.hstack((apart / unit, rows[:, 3:6] - true.v_ned, turned))
+    errors = np.hstack((difference / unit, rows[:, 3:6] - true.v_ned, turned))
     sigmas = rows[:, 9:] if true_sd is None else np.hypot(rows[:, 9:], true_sd)
     return Published(true.t_s, errors, sigmas, modes, tuple(course.events), course.crash)
 

@@ -80,9 +80,9 @@ def recorded_table(found: Rows) -> str:
 
 
 def _failed(row: Mapping[str, Any]) -> bool:
-    late = row["recovered_s"] is None or row["recovered_s"] > SLOW_S
+    slow = row["recovered_s"] is None or row["recovered_s"] > SLOW_S
     over = row["end_s"] + SLOW_S <= row["duration_s"]
-    return row["verdict"] in {"crashed", "lie"} or (late and over)
+    return row["verdict"] in {"crashed", "lie"} or (slow and over)
 
 
 def matrix_table(found: Rows) -> str:
@@ -144,7 +144,7 @@ def alarm_table(found: Rows) -> str:
     hours = sum(row["hours"] for row in found)
     other_s = sum(row["not_navigating_s"] for row in found)
     return (
-        f"{_told(found)}\n\n{hours:.4g} hours simulated; of them {other_s:g} s in another "
+        f"{_reported(found)}\n\n{hours:.4g} hours simulated; of them {other_s:g} s in another "
         f"mode than `navigating` after the start. {_beyond(found)}\n"
     )
 
@@ -177,12 +177,12 @@ def fault_table(found: Rows) -> str:
     return (
         f"{table(HAPPENED, lines)}\n\n{len(happened)} faults in {hours:.4g} hours simulated; "
         f"{crashes} ended the navigator. Beyond five sigma in any mode: {beyond_s} s.\n"
-        f"\n{_told(found)}\n\n{quiet:.4g} hours quiet, and {other_s:g} s as far from any fault in "
-        f"another mode than `navigating`. {_beyond(found)}\n"
+        f"\n{_reported(found)}\n\n{quiet:.4g} hours quiet, and {other_s:g} s as far from any fault "
+        f"in another mode than `navigating`. {_beyond(found)}\n"
     )
 
 
-def _told(found: Rows) -> str:
+def _reported(found: Rows) -> str:
     lines = [
         (
             row["kind"],

@@ -187,8 +187,8 @@ def _finding(result: dict[str, Any]) -> str:
     unequal = result["honesty"]["unequal"]
     drift = result["faults"]["drift"]["modes"]["fusion_reset"]
     low, high = unequal["nees_interval"]
-    late = drift["detected_after_s"]
-    sees = "never" if late is None else f"after {late:g} s"
+    delay_s = drift["detected_after_s"]
+    sees = "never" if delay_s is None else f"after {delay_s:g} s"
     return (
         f"Three local filters, one faulty: {'; '.join(parts)}; without reset the NEES with unequal "
         f"sources is {unequal['filters']['no_reset']['nees_mean']:.1f} (centralised and fusion "

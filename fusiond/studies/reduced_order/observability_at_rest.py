@@ -1,7 +1,7 @@
 r"""Observability of paper 002's 23 states at rest, the paper's argument for omitting six of them.
 
-F and H are constant: the vehicle stands at the start of the flight under the satellites of that
-instant, the radar sees its first point. Rank is that of the rows over the flight's 4000 s
+F and H are constant: the vehicle rests at the start of the flight under that instant's satellites,
+and the radar sees its first point. Rank is that of the rows over the flight's 4000 s
 (`fusiond.studies.observability`), the same as that of H, H F, ... H F^22.
 """
 

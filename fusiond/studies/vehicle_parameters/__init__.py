@@ -1,1 +1,1 @@
-"""Study: whether what the filter finds of a vehicle is as good as it says."""
+"""Study: honesty of the filter's estimates of a vehicle's parameters."""

@@ -1,4 +1,4 @@
-r"""Study `vehicle`: whether what the filter finds of a vehicle is as good as it says.
+r"""Study `vehicle`: honesty of the filter's estimates of a vehicle's parameters.
 
 Cars are drawn from the filter's own priors (fusiond.studies.vehicle_parameters.car) and driven
 twice: on a drive that shows everything, and straight on at one speed, which shows little. Of each
@@ -6,11 +6,11 @@ block
 
     NEES = e^T P^-1 e / k,   e true minus estimated (k,) at the end, P the filter's
 
-averaged over the runs is 1 where sigma is honest; `interval` is that of a matched filter (99 %, one
-block at a time). `kept` is sigma at the end over that at the start: 1 where nothing was seen.
+averaged over the runs is 1 for an honest sigma; `interval` is that of a matched filter (99 %, one
+block at a time). `kept` is sigma at the end over sigma at the start: 1 without information.
 
-A third set has an IMU whose axes are out of square, with the noise for it and without. The attitude
-is that of the housing, and its P what is published of it, with what the axes are out of square by.
+A third set has an IMU with non-orthogonal axes, with and without noise for it in the filter. Its
+attitude is that of the housing, and P is the published one, which includes the non-orthogonality.
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), section 5.4.2.
 """
