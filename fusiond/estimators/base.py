@@ -14,6 +14,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ class Outcome(NamedTuple):
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
     lasting: tuple[float, ...] = ()
-    first: float = float("nan")
+    first: float = math.nan  # the one that equals itself in a tuple
 
 
 class Ran(NamedTuple):
