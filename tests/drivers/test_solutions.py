@@ -46,7 +46,7 @@ PROTOCOLS = {
         lambda k: ubx.pvt(k) + ubx.dop(k),
         ubx.relposned,
         ubx.pvt(flags=0),
-        "the receiver has no fix",
+        "the receiver does not stand by its fixes",
         ubx.nav(0x35, "I", 0),
         "switch on UBX-NAV-PVT",
     ),
