@@ -83,7 +83,8 @@ class SolutionJudge:
     """Judge of solutions, in their order.
 
     Counts `epochs`, `fixes`, the names of `REFUSALS`, and within a fix `sigma_too_small`,
-    `height_not_measured`, `velocity_not_finite`; of headings `headings`, `heading_implausible`.
+    `height_not_measured`, `velocity_not_finite`, `velocity_unknown`; of headings
+    `headings`, `heading_implausible`.
     """
 
     def __init__(self, source: str, decoding: SolutionDecoding, counters: Counter[str]) -> None:
@@ -165,6 +166,9 @@ class SolutionJudge:
         if sd is not None and min(sd) < SIGMA_M[0]:
             self.counters["sigma_too_small"] += 1
             sd = None
+        if sd_v is not None and any(x is not None and x > SPEED_M_S for x in sd_v):
+            self.counters["velocity_unknown"] += 1
+            v = None  # a sigma above all speeds: a position alone
         if sd_v is not None and not all(x is None or 0.0 < x < math.inf for x in sd_v):
             sd_v = None
         if v is not None and not all(x is None or math.isfinite(x) for x in v):

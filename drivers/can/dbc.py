@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from codecs import BOM_UTF8
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -29,6 +29,9 @@ from drivers.shipped import shipped
 log = logging.getLogger(__name__)
 
 SHIPPED = shipped("dbc")
+
+BOMS = {BOM_UTF8: "utf-8-sig", BOM_UTF16_LE: "utf-16", BOM_UTF16_BE: "utf-16"}
+"""Encodings by the byte order mark that begins a file."""
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """Standard acceleration of gravity: 3rd CGPM (1901), the `g` of every data sheet."""
@@ -208,8 +211,8 @@ def _parsed(path: Path, changed_ns: int) -> Database:
     """Parsed file at that time of change, shared by sources of one bus."""
     content = path.read_bytes()
     # As cantools takes it; a BOM says that it is not so.
-    encoding = "utf-8-sig" if content.startswith(BOM_UTF8) else "cp1252"
-    text = content.decode(encoding, "replace")
+    marked = (encoding for mark, encoding in BOMS.items() if content.startswith(mark))
+    text = content.decode(next(marked, "cp1252"), "replace")
     flaw: Exception | str = "there is no message in it"
     try:
         if (database := read_whole(text)).messages and not unselected(text):
@@ -231,16 +234,24 @@ def _parsed(path: Path, changed_ns: int) -> Database:
 def find_signal(database: Database, name: str, what: str) -> tuple[Message, Signal]:
     """The signal `Message.Signal`; PermanentDriverError lists what there is."""
     message_name, dot, signal_name = name.partition(".")
-    messages = {message.name: message for message in database.messages}
-    if not dot or message_name not in messages:
+    messages = [message for message in database.messages if message.name == message_name]
+    if not dot or not messages:
         _refuse_flawed(database, message_name, what)
         names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
         raise _unknown(what, name, "Message.Signal", names)
-    signals = {signal.name: signal for signal in messages[message_name].signals}
-    if signal_name not in signals:
+    found = [(m, s) for m in messages for s in m.signals if s.name == signal_name]
+    if not found:
         _refuse_flawed(database, name, what)
-        raise _unknown(what, signal_name, f"signal of {message_name}", list(signals))
-    return messages[message_name], signals[signal_name]
+        there = [signal.name for message in messages for signal in message.signals]
+        raise _unknown(what, signal_name, f"signal of {message_name}", there)
+    different = {(m.frame_id, s.start, s.length, s.byte_order, s.scale, s.offset) for m, s in found}
+    if len(different) > 1:
+        identifiers = ", ".join(f"0x{message.frame_id:X}" for message, _ in found)
+        raise PermanentDriverError(
+            f"{what}: {name} stands in the DBC file more than once (in {identifiers}), and not "
+            "alike: rename all but the one that is meant"
+        )
+    return found[0]
 
 
 def _refuse_flawed(database: Database, name: str, what: str) -> None:

@@ -138,7 +138,8 @@ def test_three_protocols_give_one_navigation(logs: dict[str, Path], tmp_path: Pa
     ("kind", "content", "words"),
     [
         ("ubx", b"$GNGGA,nothing*00\r\n", "no UBX navigation message (UBX-NAV-PVT)"),
-        ("ubx", pvt(flags=0), "no fix: the receiver has no fix"),
+        ("ubx", pvt(flags=0), "no fix: the receiver does not stand by its fixes"),
+        ("ubx", pvt(fix=5), "no fix: the receiver repeats a surveyed place"),
         ("ubx", posllh(), "without the receiver's own judgement"),
         ("bestpos", b"", "the file is empty"),
         ("bestpos", bestpos.bestpos(kind="INS_PSRSP"), "own inertial solution"),

@@ -226,9 +226,27 @@ def test_a_multiplexed_signal_without_a_selector_is_no_plain_one(tmp_path: Path)
         find_signal(dbc, "Motor_2.Torque", "wheels")
 
 
-def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:
+@pytest.mark.parametrize("again", [("77", "8|8"), ("1", "8|8"), ("77", "0|8"), ("1", "0|8")])
+def test_a_name_that_stands_twice_is_one_if_it_is_alike(
+    again: tuple[str, str], tmp_path: Path
+) -> None:
+    """Files are glued together: the same message again is it, another of its name is a question."""
+    path = tmp_path / "glued.dbc"
+    body = 'BO_ {}: 8 X\n SG_ s : {}@1+ (1,0) [0|0] "" X\n SG_ {} : 16|8@1+ (1,0) [0|0] "" X\n\n'
+    first = body.format("1 speed", "0|8", "t")
+    path.write_text(first + body.format(f"{again[0]} speed", again[1], "u"))
+    if again == ("1", "0|8"):
+        assert find_signal(load_dbc(str(path)), "speed.s", "wheels")[1].start == 0
+    else:
+        with pytest.raises(PermanentDriverError, match="more than once"):
+            find_signal(load_dbc(str(path)), "speed.s", "wheels")
+    assert find_signal(load_dbc(str(path)), "speed.t", "wheels")[0].frame_id == 1
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_file_with_a_byte_order_mark(encoding: str, tmp_path: Path) -> None:
     path = tmp_path / "bom.dbc"
-    path.write_text(content("racelogic_imu04"), "utf-8-sig")
+    path.write_text(content("racelogic_imu04"), encoding)
     assert told(load_dbc(str(path))) == told(load_dbc("racelogic_imu04"))
 
 

@@ -175,6 +175,13 @@ def test_a_plane_fix_has_no_height() -> None:
     assert fix.sd_v_ned_m_s[2] is None
 
 
+def test_a_velocity_that_is_not_known_costs_no_position() -> None:
+    found, decoder = decoded(pvt(sd_speed=0xFFFFFFFF))
+    (fix,) = fixes(found)
+    assert (fix.v_ned_m_s, fix.sd_v_ned_m_s) == (None, None)
+    assert decoder.counters["velocity_unknown"] == 1
+
+
 @pytest.mark.parametrize(("flags", "quality"), [(1, 1), (3, 2), (3 | 1 << 6, 5), (1 | 2 << 6, 4)])
 def test_quality(flags: int, quality: int) -> None:
     (fix,) = fixes(decoded(pvt(flags=flags))[0])
