@@ -24,7 +24,15 @@ satellites' levels (fusiond.gnss.satellite_biases) do not know of their errors, 
 
 with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
 what levels know they know of what all share, too. Here the clock is known, for it is that of the
-sky before, from which it has gone a metre. A filter that lets K grow and adds nothing solves
+sky before, from which it has gone a metre. That holds as far as levels know. A satellite that comes
+for the first time, or of which two carriers have learned the delay, has errors that nothing has
+told of yet, and its sky is off by others: with C = cov(b_b, b_a) of the gains of K,
+
+    C = G_b E G_a^T + (G_b S_b) (G_a S_a)^T,  E the lesser v_k of both,  b_b = C B_a^-1 b_a + w
+
+in the part of it that is the larger of the fresh satellites' share and of V / v in the mean. As
+long as b_b = b_a alone stood here, a place that four satellites began kept their sigma for half an
+hour, whatever came. A filter that lets K grow and adds nothing solves
 t of how the ranges part when satellites go, and is sure of a place that it does not know.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
@@ -57,8 +65,9 @@ satellites, scaled to the present sky."""
 APART_M = 5.0 * 2.0 * PLACE_M
 """Largest difference of two ranges' errors: five sigma of such a position, between opposite
 satellites."""
-FRESH = 0.5
-"""A satellite's errors are others where two carriers have learned half of their variance."""
+FRESH = 0.7
+"""A satellite tells anew where it is known that its errors have so much less variance: a sixth less
+of sigma."""
 LEAST_M = 1e-3
 """Least K along an axis (m); a sky with less displaces nothing and ends the state."""
 FLOOR_M = 0.2
@@ -201,8 +210,8 @@ class Displacement(NamedTuple):
     """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
     two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
     3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states; `gain` (3, n + 2) as
-    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors, and by satellite the
-    least there has been of them."""
+    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors; by satellite what
+    lasting errors (m^2) and common one (m) its place was told with, and who is `fresh`."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -213,7 +222,8 @@ class Displacement(NamedTuple):
     shape: Array
     gain: Array
     lasting: Array
-    least: dict[str, float]
+    counted: dict[str, tuple[float, float]]
+    fresh: tuple[str, ...]
 
     @classmethod
     def of(
@@ -236,12 +246,17 @@ class Displacement(NamedTuple):
         known = np.sqrt(variance / rows.values[rk.LASTING])
         for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
             effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
-        root, least = out[:3], {} if before is None else before.least.copy()
-        for name, own in zip(rows.satellites, lasting.tolist(), strict=True):
-            least[name] = min(own, least.get(name, math.inf))
+        root, counted = out[:3], {} if before is None else before.counted.copy()
+        fresh: list[str] = []
+        common = rows.values[rk.COMMON].tolist()
+        for name, *told in zip(rows.satellites, lasting.tolist(), common, strict=True):
+            was = counted.get(name)
+            if was is None or told[0] + told[1] ** 2 < FRESH * (was[0] + was[1] ** 2):
+                counted[name] = told[0], told[1]
+                fresh.append(name)
         return cls(
             *(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA),
-            *(gain, lasting, least),
+            *(gain, lasting, counted, tuple(fresh)),
         )
 
     def holds(self, rows: Rows, t_s: float) -> bool:
@@ -267,30 +282,33 @@ class Displacement(NamedTuple):
             new += np.multiply.outer(g, g)
         kept: Array = _times(self.back, before.root)
         new = _times(_times(self.back, new), self.back)
-        if any(
-            own < FRESH * before.least.get(name, math.inf) for name, own in self.least.items()
-        ):
-            kept, new = self._mixed(before, kept, new)
-        return kept, new
-
-    def _mixed(self, before: Displacement, kept: Array, new: Array) -> tuple[Array, Array]:
-        """Transition and noise with what fresh errors tell, as far as levels know nothing."""
-        n, last = len(self.satellites), len(before.satellites)
-        at = {name: k for k, name in enumerate(before.satellites)}
-        both = np.zeros((3, 3))
-        known: list[float] = []
-        for k, name in enumerate(self.satellites):
-            j = at.get(name)
-            if j is not None:
-                same = min(float(self.lasting[k]), float(before.lasting[j]))
+        if not self.fresh:
+            return kept, new
+        # What the sky before is off by, and how it goes with what this one is.
+        own, both = np.zeros((3, 3)), np.zeros((3, 3))
+        shared = before.gain[:, last:].copy()
+        shared[:, 0] = 0.0
+        at = {name: k for k, name in enumerate(self.satellites)}
+        unknown: list[float] = []
+        for j, name in enumerate(before.satellites):
+            lasting, common = before.counted[name]
+            own += lasting * np.multiply.outer(before.gain[:, j], before.gain[:, j])
+            shared[:, 0] += common * before.gain[:, j]
+            if (k := at.get(name)) is not None:
+                same = min(float(self.lasting[k]), lasting)
                 both += same * np.multiply.outer(self.gain[:, k], before.gain[:, j])
-                known.append(float(self.variance[k] / self.lasting[k]))
+                unknown.append(float(self.variance[k] / self.lasting[k]))
         for k in range(2):
-            both += np.multiply.outer(self.gain[:, n + k], before.gain[:, last + k])
-        told = _times(_times(self.back, both), before.back)
-        part = sum(known) / len(known) if known else 1.0
+            own += np.multiply.outer(shared[:, k], shared[:, k])
+            both += np.multiply.outer(self.gain[:, n + k], shared[:, k])
+        out = np.empty((6, 3))
+        roots(own, out)
+        told = _times(_times(self.back, both), out[3:])
         drawn = np.eye(3) - _times(told, told.T)
+        told = _times(_times(told, out[3:]), before.root)
+        part = max(len(self.fresh) / n, sum(unknown) / max(len(unknown), 1))
         return kept + part * (told - kept), new + part * (drawn - new)
+
 
 def _times(a: Array, b: Array) -> Array:
     """A B (3, 3), in one order of operations on all machines."""

@@ -12,7 +12,8 @@ z_k is what the filter predicts less the range with r taken off, so that nu is w
 variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
 errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
 stays alone goes on telling what it told among others. L falls where its two carriers learn the
-delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing, and is out of the mean.
+delay: what they learn changes e_k. An innovation beyond three sigma teaches nothing, and the mean
+is without it, the farthest first.
 
 Source: Groves, 2nd edition, 3.2 and 9.4.4.
 """
