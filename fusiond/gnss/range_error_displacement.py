@@ -62,7 +62,7 @@ it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
-APART_M = 5.0 * 2.0 * PLACE_M
+INCONSISTENT_M = 5.0 * 2.0 * PLACE_M
 """Largest difference of two ranges' errors: five sigma of such a position, between opposite
 satellites."""
 FRESH = 0.7
@@ -83,17 +83,17 @@ FLICKERS_S = 3.0
 def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
     """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
 
-    One does not that is `APART_M` from more than half of them. Its range is gated, and what is left
+    One does not that is `INCONSISTENT_M` from more than half of them. Its range is gated, and what is left
     displaces by itself."""
     n, odd = clock.shape[0], 0
     for k in range(n):
         own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
-        apart = others = 0
+        unlike = others = 0
         for j in range(n):
             if j != k and clock[j] == clock[k]:
                 others += 1
-                apart += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > APART_M
-        marked[k] = others < 2 or 2 * apart <= others
+                unlike += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > INCONSISTENT_M
+        marked[k] = others < 2 or 2 * unlike <= others
         odd += not marked[k]
     return odd
 
@@ -249,10 +249,10 @@ class Displacement(NamedTuple):
         root, counted = out[:3], {} if before is None else before.counted.copy()
         fresh: list[str] = []
         common = rows.values[rk.COMMON].tolist()
-        for name, *told in zip(rows.satellites, lasting.tolist(), common, strict=True):
+        for name, *errors in zip(rows.satellites, lasting.tolist(), common, strict=True):
             was = counted.get(name)
-            if was is None or told[0] + told[1] ** 2 < FRESH * (was[0] + was[1] ** 2):
-                counted[name] = told[0], told[1]
+            if was is None or errors[0] + errors[1] ** 2 < FRESH * (was[0] + was[1] ** 2):
+                counted[name] = errors[0], errors[1]
                 fresh.append(name)
         return cls(
             *(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA),
@@ -294,7 +294,8 @@ class Displacement(NamedTuple):
             lasting, common = before.counted[name]
             own += lasting * np.multiply.outer(before.gain[:, j], before.gain[:, j])
             shared[:, 0] += common * before.gain[:, j]
-            if (k := at.get(name)) is not None:
+            if name in at:
+                k = at[name]
                 same = min(float(self.lasting[k]), lasting)
                 both += same * np.multiply.outer(self.gain[:, k], before.gain[:, j])
                 unknown.append(float(self.variance[k] / self.lasting[k]))
@@ -303,11 +304,11 @@ class Displacement(NamedTuple):
             both += np.multiply.outer(self.gain[:, n + k], shared[:, k])
         out = np.empty((6, 3))
         roots(own, out)
-        told = _times(_times(self.back, both), out[3:])
-        drawn = np.eye(3) - _times(told, told.T)
-        told = _times(_times(told, out[3:]), before.root)
+        correlation = _times(_times(self.back, both), out[3:])
+        drawn = np.eye(3) - _times(correlation, correlation.T)
+        regression = _times(_times(correlation, out[3:]), before.root)
         part = max(len(self.fresh) / n, sum(unknown) / max(len(unknown), 1))
-        return kept + part * (told - kept), new + part * (drawn - new)
+        return kept + part * (regression - kept), new + part * (drawn - new)
 
 
 def _times(a: Array, b: Array) -> Array:

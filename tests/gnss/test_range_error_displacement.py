@@ -11,7 +11,7 @@ import pytest
 
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.range_error_displacement import (
-    APART_M,
+    INCONSISTENT_M,
     CLOCK_M,
     FLOOR_M,
     FREE_M,
@@ -149,11 +149,11 @@ def test_a_range_that_fits_no_other_displaces_nothing() -> None:
     r = rows()
     fits = np.empty(len(r.satellites), bool)
     assert plausible(r.values, r.clock, fits) == 0
-    r.values[rk.CORRECTED, 2] += 2.0 * APART_M
+    r.values[rk.CORRECTED, 2] += 2.0 * INCONSISTENT_M
     assert plausible(r.values, r.clock, fits) == 1
     assert np.flatnonzero(~fits).tolist() == [2]
     alone = rows(2)
-    alone.values[rk.CORRECTED, 1] += 2.0 * APART_M
+    alone.values[rk.CORRECTED, 1] += 2.0 * INCONSISTENT_M
     assert plausible(alone.values, alone.clock, fits[:2]) == 0
 
 
