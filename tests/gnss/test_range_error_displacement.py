@@ -11,10 +11,10 @@ import pytest
 
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.range_error_displacement import (
-    INCONSISTENT_M,
     CLOCK_M,
     FLOOR_M,
     FREE_M,
+    INCONSISTENT_M,
     PLACE_M,
     SHARED,
     Displacement,
