@@ -37,9 +37,10 @@ Array = NDArray[np.float64]
 FLOOR_M = 1e-3
 """One sigma of a clock at least: a covariance of which a part is another's to the last digit is
 none any more after some updates."""
-DRIFT_M_SQRT_S = 0.005
-"""Walk of orbits and clocks over minutes, by 2 mm/s that last for 30 s: 0.16 m in 200 s, and errors
-of 0.5 m that last for half an hour change by 0.24 m."""
+DRIFT_M_SQRT_S = 0.003
+"""Walk of orbits and clocks over minutes: 42 mm in 200 s. Of a station with a known place each
+satellite's carrier goes from its range at 0.12 to 0.22 mm/s, the same rate for minutes (28 to 44 mm
+in 200 s), so that shorter times have less than a walk says, 4 to 7 mm for 16 in 30 s."""
 WALKS_S = 0.9
 """Between two steps of the walk: those of each second."""
 

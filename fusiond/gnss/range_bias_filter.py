@@ -10,10 +10,10 @@ the others bound the place. Of each satellite a filter of one state
 
 z_k is what the filter predicts less the range with r taken off, so that nu is what r lacks; w the
 variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
-errors. r is taken off the range, and V in place of L is left of its variance. So a
-satellite that stays alone keeps the information that it had among others. L falls where its two
-carriers learn the delay, since that changes e_k. An innovation beyond three sigma is not used, and
-is out of the mean.
+errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
+stays alone keeps the information that it had among others. L falls where its two carriers learn the
+delay, since that changes e_k. An innovation beyond three sigma is not used, and the mean is without
+it, the farthest first.
 
 Source: Groves, 2nd edition, 3.2 and 9.4.4.
 """

@@ -24,7 +24,15 @@ satellites' levels (fusiond.gnss.range_bias_filter) do not know of their errors,
 
 with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
 what levels know they know of what all share, too. Here the clock is known, for it is that of the
-sky before, from which it has gone a metre. A filter that lets K grow and adds nothing solves
+sky before, from which it has gone a metre. That holds as far as levels know. A satellite that comes
+for the first time, or of which two carriers have learned the delay, has errors that nothing has
+told of yet, and its sky is off by others: with C = cov(b_b, b_a) of the gains of K,
+
+    C = G_b E G_a^T + (G_b S_b) (G_a S_a)^T,  E the lesser v_k of both,  b_b = C B_a^-1 b_a + w
+
+in the part of it that is the larger of the fresh satellites' share and of V / v in the mean. As
+long as b_b = b_a alone stood here, a place that four satellites began kept their sigma for half an
+hour, whatever came. A filter that lets K grow and adds nothing solves
 t of how the ranges part when satellites go, and is sure of a place that it does not know.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
@@ -54,11 +62,16 @@ it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
+<<<<<<< HEAD
 OUTLYING_M = 5.0 * 2.0 * PLACE_M
+=======
+INCONSISTENT_M = 5.0 * 2.0 * PLACE_M
+>>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
 """Largest difference of two ranges' errors: five sigma of such a position, between opposite
 satellites."""
-FRESH = 0.5
-"""A satellite's errors are others where two carriers have learned half of their variance."""
+FRESH = 0.7
+"""A satellite tells anew where it is known that its errors have so much less variance: a sixth less
+of sigma."""
 LEAST_M = 1e-3
 """Least K along an axis (m); a sky with less displaces nothing and ends the state."""
 FLOOR_M = 0.2
@@ -74,6 +87,7 @@ FLICKERS_S = 3.0
 def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
     """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
 
+<<<<<<< HEAD
     One does not that is `OUTLYING_M` from more than half of them. Its range is gated, and what is
     left displaces by itself."""
     n, odd = clock.shape[0], 0
@@ -85,6 +99,19 @@ def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[n
                 others += 1
                 outlying += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > OUTLYING_M
         marked[k] = others < 2 or 2 * outlying <= others
+=======
+    One does not that is `INCONSISTENT_M` from more than half of them. Its range is gated, and what
+    is left displaces by itself."""
+    n, odd = clock.shape[0], 0
+    for k in range(n):
+        own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
+        unlike = others = 0
+        for j in range(n):
+            if j != k and clock[j] == clock[k]:
+                others += 1
+                unlike += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > INCONSISTENT_M
+        marked[k] = others < 2 or 2 * unlike <= others
+>>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
         odd += not marked[k]
     return odd
 
@@ -201,8 +228,8 @@ class Displacement(NamedTuple):
     """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
     two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
     3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states; `gain` (3, n + 2) as
-    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors, and by satellite the
-    least there has been of them."""
+    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors; by satellite what
+    lasting errors (m^2) and common one (m) its place was told with, and who is `fresh`."""
 
     t_s: float
     satellites: tuple[str, ...]
@@ -213,7 +240,8 @@ class Displacement(NamedTuple):
     shape: Array
     gain: Array
     lasting: Array
-    least: dict[str, float]
+    counted: dict[str, tuple[float, float]]
+    fresh: tuple[str, ...]
 
     @classmethod
     def of(
@@ -236,12 +264,17 @@ class Displacement(NamedTuple):
         known = np.sqrt(variance / rows.values[rk.LASTING])
         for j, row in enumerate((rk.COMMON, rk.TROPOSPHERE_SIGMA)):
             effect[:, n + j] = (effect[:, :n] * (known * rows.values[row])).sum(axis=1)
-        root, least = out[:3], {} if before is None else before.least.copy()
-        for name, own in zip(rows.satellites, lasting.tolist(), strict=True):
-            least[name] = min(own, least.get(name, math.inf))
+        root, counted = out[:3], {} if before is None else before.counted.copy()
+        fresh: list[str] = []
+        common = rows.values[rk.COMMON].tolist()
+        for name, *errors in zip(rows.satellites, lasting.tolist(), common, strict=True):
+            was = counted.get(name)
+            if was is None or errors[0] + errors[1] ** 2 < FRESH * (was[0] + was[1] ** 2):
+                counted[name] = errors[0], errors[1]
+                fresh.append(name)
         return cls(
             *(t_s, rows.satellites, effect, variance, root, out[3:], root * PER_SIGMA),
-            *(gain, lasting, least),
+            *(gain, lasting, counted, tuple(fresh)),
         )
 
     def holds(self, rows: Rows, t_s: float) -> bool:
@@ -267,6 +300,7 @@ class Displacement(NamedTuple):
             new += np.multiply.outer(g, g)
         kept: Array = _times(self.back, before.root)
         new = _times(_times(self.back, new), self.back)
+<<<<<<< HEAD
         if any(own < FRESH * before.least.get(name, math.inf) for name, own in self.least.items()):
             kept, new = self._mixed(before, kept, new)
         return kept, new
@@ -281,14 +315,43 @@ class Displacement(NamedTuple):
             j = at.get(name)
             if j is not None:
                 same = min(float(self.lasting[k]), float(before.lasting[j]))
+=======
+        if not self.fresh:
+            return kept, new
+        # What the sky before is off by, and how it goes with what this one is.
+        own, both = np.zeros((3, 3)), np.zeros((3, 3))
+        shared = before.gain[:, last:].copy()
+        shared[:, 0] = 0.0
+        at = {name: k for k, name in enumerate(self.satellites)}
+        unknown: list[float] = []
+        for j, name in enumerate(before.satellites):
+            lasting, common = before.counted[name]
+            own += lasting * np.multiply.outer(before.gain[:, j], before.gain[:, j])
+            shared[:, 0] += common * before.gain[:, j]
+            if name in at:
+                k = at[name]
+                same = min(float(self.lasting[k]), lasting)
+>>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
                 both += same * np.multiply.outer(self.gain[:, k], before.gain[:, j])
-                known.append(float(self.variance[k] / self.lasting[k]))
+                unknown.append(float(self.variance[k] / self.lasting[k]))
         for k in range(2):
+<<<<<<< HEAD
             both += np.multiply.outer(self.gain[:, n + k], before.gain[:, last + k])
         recalled = _times(_times(self.back, both), before.back)
         part = sum(known) / len(known) if known else 1.0
         drawn = np.eye(3) - _times(recalled, recalled.T)
         return kept + part * (recalled - kept), new + part * (drawn - new)
+=======
+            own += np.multiply.outer(shared[:, k], shared[:, k])
+            both += np.multiply.outer(self.gain[:, n + k], shared[:, k])
+        out = np.empty((6, 3))
+        roots(own, out)
+        correlation = _times(_times(self.back, both), out[3:])
+        drawn = np.eye(3) - _times(correlation, correlation.T)
+        regression = _times(_times(correlation, out[3:]), before.root)
+        part = max(len(self.fresh) / n, sum(unknown) / max(len(unknown), 1))
+        return kept + part * (regression - kept), new + part * (drawn - new)
+>>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
 
 
 def _times(a: Array, b: Array) -> Array:

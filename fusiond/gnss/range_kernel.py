@@ -82,9 +82,10 @@ EARTH_RATE_RAD_S = 7.2921151467e-5
 LOWEST_RADIUS_M = 6.3e6
 """A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
 
-WALK_M_SQRT_S = 0.002
-"""Walk of a carrier at the zenith beside the models: satellites' clocks, 1e-12 to 3e-12 over 10 s,
-are 3 to 9 mm, ionosphere and troposphere 1 mm/s at most."""
+WALK_M_SQRT_S = 0.0012
+"""Walk of a carrier at the zenith beside the models (satellite's clock, atmosphere, orbit): at a
+station with a known place a satellite's goes from its range by 4 to 7 mm in 30 s, phases' noise
+in it."""
 BEIDOU_2_CODE_M, BEIDOU_2_PAIR_M = 1.0, 5.0
 """One sigma of a receiver's delay of BeiDou-2 against BeiDou-3: of B1I (0.5 m for a Septentrio),
 and of a delay by a pair (2.4 m on B3I are 4.7 m there); Jiao et al., Remote Sensing 13 (2021), 15,

@@ -26,7 +26,7 @@ minutes; what is left beside it is the drift's walk."""
 CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
 """Antenna position (ECEF, m) at the epoch from which carriers are counted, and the carriers' clock
 since (m): fusiond.aiding.carrier_anchor."""
-CARRIER_WALK = 0.002**2
+CARRIER_WALK = 0.0012**2
 """Random walk of all carriers beside their models (m^2/s), as in fusiond.gnss.range_kernel for
 each; the displacement error of a sky is about that of one satellite at the zenith."""
 SAR_MISALIGNMENT = "sar_misalignment"

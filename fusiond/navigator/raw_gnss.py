@@ -55,7 +55,7 @@ REMEMBERED_NS = 12_000_000_000
 NOTHING = np.zeros((3, 3))
 NOWHERE = Displacement(
     *(0.0, (), np.zeros((3, 2)), np.zeros(0), NOTHING, NOTHING, NOTHING),
-    *(np.zeros((3, 2)), np.zeros(0), {}),
+    *(np.zeros((3, 2)), np.zeros(0), {}, ()),
 )
 """Rows of an epoch without satellites."""
 

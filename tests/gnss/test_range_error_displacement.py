@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from fusiond.gnss.range_error_displacement import (
     CLOCK_M,
     FLOOR_M,
     FREE_M,
+    INCONSISTENT_M,
     PLACE_M,
     SHARED,
     Displacement,
+    plausible,
     roots,
 )
 from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
@@ -25,16 +28,18 @@ from tests.gnss.test_corrections import sky, solved, store_of
 T_S = 1.4e9
 
 
-def rows(keep: int | None = None) -> Rows:
-    """Of the simulated sky, GPS and BeiDou; of its first `keep` satellites."""
+@lru_cache(maxsize=1)
+def _whole() -> Rows:
     epoch, broadcast = sky()
     store = store_of(*broadcast)
-    found = RangeModel(store, RangeOptions(systems=("G", "C"))).rows(
-        epoch, solved(store, epoch).position
-    )
-    if keep is None:
-        return found
-    return found.only(np.arange(len(found.satellites)) < keep)
+    model = RangeModel(store, RangeOptions(systems=("G", "C")))
+    return model.rows(epoch, solved(store, epoch).position)
+
+
+def rows(keep: int | None = None) -> Rows:
+    """Of the simulated sky, GPS and BeiDou, to be changed; of its first `keep` satellites."""
+    n = len(_whole().satellites)
+    return _whole().only(np.arange(n) < (n if keep is None else keep))
 
 
 def gain(r: Rows, noise: Any, clock_m: float) -> Any:
@@ -110,14 +115,46 @@ def test_what_is_carried_from_sky_to_sky() -> None:
     assert kept == pytest.approx(np.eye(3), abs=1e-9)
     assert new == pytest.approx(np.zeros((3, 3)), abs=1e-12)
     few = rows(3)
-    now = Displacement.of(few, T_S + 60.0, known[:3])
+    now = Displacement.of(few, T_S + 60.0, known[:3], before)
     kept, new = now.carried(before)
     # The displacement itself is what it was, and more comes by what is not known of each range.
     assert now.root @ kept == pytest.approx(before.root, abs=1e-6)
     more = np.sqrt(np.diag(now.root @ new @ now.root))
-    fresh = Displacement.of(few, T_S + 60.0, few.lasting)
-    _, unknown = fresh.carried(Displacement.of(r, T_S, r.lasting))
+    first = Displacement.of(r, T_S, r.lasting)
+    fresh = Displacement.of(few, T_S + 60.0, few.lasting, first)
+    _, unknown = fresh.carried(first)
     assert (more < 0.2 * np.sqrt(np.diag(fresh.root @ unknown @ fresh.root))).all()
+
+
+def test_satellites_that_come_tell_anew() -> None:
+    """Of levels that know nothing: what a sky is off by, and those before it and after, have the
+    covariances of gains on errors that are each satellite's own and shared."""
+    few, whole = rows(6), rows()
+    before = Displacement.of(few, T_S, few.lasting)
+    now = Displacement.of(whole, T_S + 60.0, whole.lasting, before)
+    assert now.fresh == whole.satellites[6:]
+    kept, new = now.carried(before)
+    g, h = gain(few, few.variance, FREE_M), gain(whole, whole.variance, FREE_M)
+    shared = [q.values[[rk.COMMON, rk.TROPOSPHERE_SIGMA]].T for q in (few, whole)]
+    both = (h[:, :6] * few.lasting) @ g.T + (h @ shared[1]) @ (g @ shared[0]).T
+    assert now.root @ kept @ before.root == pytest.approx(both, abs=1e-6)
+    assert kept @ kept.T + new == pytest.approx(np.eye(3), abs=1e-6)
+    # The same sky once more tells nothing more, nor one of which levels know all.
+    again = Displacement.of(whole, T_S + 120.0, whole.lasting, now)
+    assert again.fresh == ()
+    assert again.carried(now)[0] == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_a_range_that_fits_no_other_displaces_nothing() -> None:
+    r = rows()
+    fits = np.empty(len(r.satellites), bool)
+    assert plausible(r.values, r.clock, fits) == 0
+    r.values[rk.CORRECTED, 2] += 2.0 * INCONSISTENT_M
+    assert plausible(r.values, r.clock, fits) == 1
+    assert np.flatnonzero(~fits).tolist() == [2]
+    alone = rows(2)
+    alone.values[rk.CORRECTED, 1] += 2.0 * INCONSISTENT_M
+    assert plausible(alone.values, alone.clock, fits[:2]) == 0
 
 
 def test_how_long_a_displacement_holds() -> None:
@@ -182,6 +219,16 @@ def test_a_satellite_that_is_alone_or_far_off_teaches_nothing() -> None:
     then = subtract_biases(last, rows(1), T_S + 1.0)
     assert then.offset[0] == 0.0
     assert then.variance[0] == pytest.approx(r.lasting[0])
+
+
+def test_one_far_off_keeps_no_other_from_being_told() -> None:
+    """The mean that levels are beside is without it."""
+    errors = np.random.default_rng(1).normal(0.0, 0.5, len(rows().satellites))
+    with_it = errors.copy()
+    with_it[2] = 40.0
+    apart = np.delete(after(with_it, 60).offset - after(errors, 60).offset, 2)
+    assert np.abs(apart).max() < 0.1
+    assert np.abs(after(with_it, 60).offset).max() > 0.1
 
 
 def test_levels_come_by_the_second_and_are_forgotten() -> None:
