@@ -3,6 +3,16 @@ clock.
 
 The receivers' own protocols have theirs in `drivers.solution`; these say their quality, their date
 and their height in more ways than one.
+
+A receiver that does not state the geoid's height has one by what it stated before, or none:
+
+    h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
+
+N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. 0 to the
+last digit says that a receiver has no model of the geoid: the places where that is N are one in a
+thousand, those whose altitude is one above the ellipsoid cannot be told from the others. A receiver
+that has printed N once is remembered: on the way since it has changed by the slope of the geoid.
+Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
 """
 
 from __future__ import annotations
@@ -23,10 +33,9 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.epochs import INTEGRATED, Epoch
-from drivers.nmea.geoid_fallback import Geoid
 from drivers.nmea.reasons import Received, note
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
-from drivers.plausible import SIGMA_M
+from drivers.plausible import HEIGHT_M, SIGMA_M, within
 
 PLAIN_AFTER = 2
 """Consecutive epochs with RMC or GLL but neither GGA nor GNS, after which their position is a fix:
@@ -36,6 +45,40 @@ _QUALITIES = frozenset({1, 2, 3, 4, 5})
 DATUMS = frozenset({"", "W84", "P90"})
 """Datums of DTM: WGS 84, and PZ-90, which agrees with it to some centimetres since 2007 (PZ-90.02);
 others differ by up to hundreds of metres."""
+
+
+BOUND_M = 107.0
+GEOID_SD_M = BOUND_M / math.sqrt(3.0)
+SLOPE_SD = 5e-5
+"""One sigma of the slope of the geoid: deflections of the vertical are 5 to 10 arc seconds outside
+high mountains."""
+EARTH_M = 6_371_000.0
+
+
+class Geoid:
+    """Geoid separation of one receiver."""
+
+    def __init__(self) -> None:
+        self._known: tuple[float, float, float] | None = None
+
+    def height(
+        self, altitude_m: float, separation_m: float | None, lat_deg: float, lon_deg: float
+    ) -> tuple[float, float]:
+        """Height above the ellipsoid (m), and one sigma (m) of the geoid height in it, 0 where
+        printed; the height above the sea where the geoid is unknown."""
+        if separation_m:
+            if abs(separation_m) <= BOUND_M:
+                self._known = separation_m, lat_deg, lon_deg
+            return altitude_m + separation_m, 0.0
+        if self._known is None:
+            return altitude_m, GEOID_SD_M
+        separation_m, lat, lon = self._known
+        north = math.radians(lat_deg - lat)
+        east = math.radians(math.remainder(lon_deg - lon, 360.0)) * math.cos(math.radians(lat))
+        sd_m = SLOPE_SD * EARTH_M * math.hypot(north, east)
+        if sd_m > GEOID_SD_M or not within(altitude_m + separation_m, HEIGHT_M):
+            return altitude_m, GEOID_SD_M
+        return altitude_m + separation_m, sd_m
 
 
 class EpochJudge:

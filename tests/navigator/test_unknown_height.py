@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.measurements import PositionFix
-from drivers.nmea.geoid_fallback import GEOID_SD_M
+from drivers.nmea.judge import GEOID_SD_M
 from fusiond.aiding.initialisation import PositionCandidate
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise

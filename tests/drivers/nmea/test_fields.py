@@ -14,7 +14,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from drivers.nmea.geoid_fallback import GEOID_SD_M
+from drivers.nmea.judge import GEOID_SD_M
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_NO_FIX,
