@@ -62,11 +62,7 @@ it."""
 PER_SIGMA = np.array([1.0 / 0.5, 1.0 / 0.5, 1.0 / 1.0])
 """Displacement for the default sigmas `bias_sd_m` and `bias_down_sd_m`: that of a sky of eight
 satellites, scaled to the present sky."""
-<<<<<<< HEAD
-OUTLYING_M = 5.0 * 2.0 * PLACE_M
-=======
 INCONSISTENT_M = 5.0 * 2.0 * PLACE_M
->>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
 """Largest difference of two ranges' errors: five sigma of such a position, between opposite
 satellites."""
 FRESH = 0.7
@@ -87,19 +83,6 @@ FLICKERS_S = 3.0
 def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
     """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
 
-<<<<<<< HEAD
-    One does not that is `OUTLYING_M` from more than half of them. Its range is gated, and what is
-    left displaces by itself."""
-    n, odd = clock.shape[0], 0
-    for k in range(n):
-        own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
-        outlying = others = 0
-        for j in range(n):
-            if j != k and clock[j] == clock[k]:
-                others += 1
-                outlying += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > OUTLYING_M
-        marked[k] = others < 2 or 2 * outlying <= others
-=======
     One does not that is `INCONSISTENT_M` from more than half of them. Its range is gated, and what
     is left displaces by itself."""
     n, odd = clock.shape[0], 0
@@ -111,7 +94,6 @@ def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[n
                 others += 1
                 unlike += abs(values[rk.CORRECTED, j] - values[rk.RANGE, j] - own) > INCONSISTENT_M
         marked[k] = others < 2 or 2 * unlike <= others
->>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
         odd += not marked[k]
     return odd
 
@@ -300,22 +282,6 @@ class Displacement(NamedTuple):
             new += np.multiply.outer(g, g)
         kept: Array = _times(self.back, before.root)
         new = _times(_times(self.back, new), self.back)
-<<<<<<< HEAD
-        if any(own < FRESH * before.least.get(name, math.inf) for name, own in self.least.items()):
-            kept, new = self._mixed(before, kept, new)
-        return kept, new
-
-    def _mixed(self, before: Displacement, kept: Array, new: Array) -> tuple[Array, Array]:
-        """Transition and noise with what fresh errors tell, as far as levels know nothing."""
-        n, last = len(self.satellites), len(before.satellites)
-        at = {name: k for k, name in enumerate(before.satellites)}
-        both = np.zeros((3, 3))
-        known: list[float] = []
-        for k, name in enumerate(self.satellites):
-            j = at.get(name)
-            if j is not None:
-                same = min(float(self.lasting[k]), float(before.lasting[j]))
-=======
         if not self.fresh:
             return kept, new
         # What the sky before is off by, and how it goes with what this one is.
@@ -331,17 +297,9 @@ class Displacement(NamedTuple):
             if name in at:
                 k = at[name]
                 same = min(float(self.lasting[k]), lasting)
->>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
                 both += same * np.multiply.outer(self.gain[:, k], before.gain[:, j])
                 unknown.append(float(self.variance[k] / self.lasting[k]))
         for k in range(2):
-<<<<<<< HEAD
-            both += np.multiply.outer(self.gain[:, n + k], before.gain[:, last + k])
-        recalled = _times(_times(self.back, both), before.back)
-        part = sum(known) / len(known) if known else 1.0
-        drawn = np.eye(3) - _times(recalled, recalled.T)
-        return kept + part * (recalled - kept), new + part * (drawn - new)
-=======
             own += np.multiply.outer(shared[:, k], shared[:, k])
             both += np.multiply.outer(self.gain[:, n + k], shared[:, k])
         out = np.empty((6, 3))
@@ -351,7 +309,6 @@ class Displacement(NamedTuple):
         regression = _times(_times(correlation, out[3:]), before.root)
         part = max(len(self.fresh) / n, sum(unknown) / max(len(unknown), 1))
         return kept + part * (regression - kept), new + part * (drawn - new)
->>>>>>> b65efe414de9311f310f818fd4a72f6abeed7839
 
 
 def _times(a: Array, b: Array) -> Array:

@@ -349,7 +349,7 @@ class AlignmentEvidence:
 
     def place(self) -> Place | None:
         """Position (rad, rad, m) to start at, its fix, and its sigmas."""
-        return self.place_of(self._positions[-1]) if self._positions else self._told()
+        return self.place_of(self._positions[-1]) if self._positions else self._reported()
 
     def place_of(self, p: PositionCandidate, velocity: VelocityCandidate | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
@@ -377,7 +377,7 @@ class AlignmentEvidence:
                 largest = max(largest, away)
         return largest
 
-    def _told(self) -> Place | None:
+    def _reported(self) -> Place | None:
         """Place by the configuration or the saved state."""
         height: float | None
         if self._options.position is not None:
@@ -395,11 +395,11 @@ class AlignmentEvidence:
         far as roads climb on the way from there; 0 where nothing has told any."""
         if p.height_m is not None:
             return p.height_m, p.sd[2]
-        if (told := self._told()) is not None:
-            lat, lon, height = told.where.tolist()
+        if (reported := self._reported()) is not None:
+            lat, lon, height = reported.where.tolist()
             separation = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
             way_m = math.hypot(*(separation / as_geodetic(np.ones(3), lat)[:2]).tolist())
-            sd = math.hypot(told.sd_height, SLOPE_SD * way_m)
+            sd = math.hypot(reported.sd_height, SLOPE_SD * way_m)
             if sd < UNKNOWN_HEIGHT_SD_M:
                 return height, sd
         return 0.0, UNKNOWN_HEIGHT_SD_M

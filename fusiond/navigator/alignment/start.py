@@ -181,19 +181,8 @@ def build_start(
     `moves`: what the velocity was measured of, `heading`: the yaw. `grades`: of the unit (13,).
     """
     fix, where, sd_position, sd_height = place
-    lat, height = float(where[0]), float(where[2])
-    nav = np.zeros(10)
-    nav[:3] = where
-    nav[3:6] = velocity
-    nav[6:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
-    if fix is not None:
-        nav[:3] -= as_geodetic(dcm @ np.array(fix.lever), lat)
-    if model.hold_height and sd_height >= UNKNOWN_HEIGHT_SD_M:
-        nav[2] = nav[5] = 0.0  # HELD_UNKNOWN_M tells it from a height
-    p = np.diag(model.initial**2)
-    for column in range(RATE_ERROR, COLUMN_END):
-        for slot in model.parameters(column):
-            p[slot, slot] *= grades[column - RATE_ERROR]
+    (lat, _, height), nav = where.tolist(), _first_state(model, place, dcm, velocity)
+    p = _prior(model, grades)
     tilt_sd = MOTION_LEVEL_SD_RAD if levelled is None else levelled.sd
     p[0, 0] = p[1, 1] = tilt_sd**2
     p[2, 2] = sd_yaw**2
@@ -202,10 +191,9 @@ def build_start(
     xi, by = np.zeros(model.size), np.eye(model.size)
     if bias is not None:
         _start_biases(model, p, xi, by, dcm if levelled is None else levelled.dcm, lat, *bias)
-    if unexplained is not None:
-        for axis in range(3):
-            slot = model.parameters(9 + axis)[0]
-            p[slot, slot] += float(unexplained[axis]) ** 2
+    for axis, rate in enumerate([] if unexplained is None else unexplained.tolist()):
+        slot = model.parameters(9 + axis)[0]
+        p[slot, slot] += rate**2
     if fitted is not None:
         time = model.slots_of(moves.candidate.time) if moves is not None else []
         _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2], time)
@@ -222,6 +210,28 @@ def build_start(
     confirmed = not how.endswith(BACKWARD)
     covariance = by @ p @ by.T
     return Start(t_ns, nav, xi, covariance, how, used=used, confirmed=confirmed, grades=grades)
+
+
+def _first_state(model: Model, place: Place, dcm: Array, velocity: Array) -> Array:
+    """Navigation state (10,) at a place, that of its fix without the lever arm."""
+    nav = np.zeros(10)
+    nav[:3] = place.where
+    nav[3:6] = velocity
+    nav[6:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
+    if place.fix is not None:
+        nav[:3] -= as_geodetic(dcm @ np.array(place.fix.lever), float(place.where[0]))
+    if model.hold_height and place.sd_height >= UNKNOWN_HEIGHT_SD_M:
+        nav[2] = nav[5] = 0.0  # HELD_UNKNOWN_M tells it from a height
+    return nav
+
+
+def _prior(model: Model, grades: Array) -> Array:
+    """Covariance (n, n) of a model's start, of a unit of those grades (13,)."""
+    p = np.diag(model.initial**2)
+    for column in range(RATE_ERROR, COLUMN_END):
+        for slot in model.parameters(column):
+            p[slot, slot] *= grades[column - RATE_ERROR]
+    return p
 
 
 def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
