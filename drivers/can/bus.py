@@ -227,11 +227,12 @@ class CanBus:
         if fd < 0:
             return await _ThreadReader(self, bus, gone).wait_until_gone()
         sock: socket.socket | None = getattr(bus, "socket", None)
-        own = socket.socket(fileno=fd) if sock is None else None
-        if own is not None:
-            read = partial(self.read_socket, own, DATAGRAM_BYTES, datagram_decoder())
-        else:
+        own = None
+        if sock is not None:
             read = partial(self.read_socket, sock, CANFD_BYTES, of_can_frame)
+        else:
+            own = socket.socket(fileno=fd)
+            read = partial(self.read_socket, own, DATAGRAM_BYTES, datagram_decoder())
         self._drain = partial(self._readable, fd, read, gone)
         self._read_ns = self._now_ns()
         if not self.polled:
@@ -297,12 +298,12 @@ class CanBus:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(value)
                 realtime_ns = seconds * 1_000_000_000 + nanoseconds
         try:
-            can_id, extended, data, remote, error = decode(raw)
+            can_id, extended, data, remote, of_error = decode(raw)
         except Exception:  # whatever python-can raises for what others send to its group
             self.counters["bad_datagrams"] += 1
             return _NO_FRAME
         arrived_ns = self._arrived_ns(realtime_ns)
-        return CanFrame(can_id, extended, data, arrived_ns, realtime_ns, remote, error)
+        return CanFrame(can_id, extended, data, arrived_ns, realtime_ns, remote, of_error)
 
     def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
         """Read one frame of a bus without a descriptor through python-can; None without one."""
