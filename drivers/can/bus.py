@@ -83,7 +83,7 @@ class _BusFaultError(Exception):
 
 Read = Callable[[], CanFrame | None]
 _NO_FRAME = CanFrame(0, False, b"", 0)
-"""What a datagram without a frame is read as."""
+"""Reading of a datagram that holds no frame."""
 
 
 class CanBus:
