@@ -76,7 +76,7 @@ class _BusFaultError(Exception):
 
 Read = Callable[[], CanFrame | None]
 _NO_FRAME = CanFrame(0, False, b"", 0)
-"""What a datagram without a frame is read as."""
+"""Reading of a datagram that holds no frame."""
 
 
 class CanBus:
@@ -288,12 +288,12 @@ class CanBus:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(value)
                 realtime_ns = seconds * 1_000_000_000 + nanoseconds
         try:
-            can_id, extended, data, remote, error = decode(raw)
+            can_id, extended, data, remote, of_error = decode(raw)
         except Exception:  # whatever python-can raises for what others send to its group
             self.counters["bad_datagrams"] += 1
             return _NO_FRAME
         arrived_ns = self._arrived_ns(realtime_ns)
-        return CanFrame(can_id, extended, data, arrived_ns, realtime_ns, remote, error)
+        return CanFrame(can_id, extended, data, arrived_ns, realtime_ns, remote, of_error)
 
     def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
         """Read one frame of a bus without a descriptor through python-can; None without one."""

@@ -45,6 +45,8 @@ class KalmanEstimator(Estimator):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+        self._spaces: dict[int, tuple[Array, Array, NDArray[np.float32]]] = {}
+        """Work space of the bank's update by so many rows."""
         self._run_by(NO_AXES)
 
     def _run_by(self, axes: Axes) -> None:
@@ -122,14 +124,18 @@ class KalmanEstimator(Estimator):
         self, measurement: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
     ) -> None:
         """Update the bank by rows of a measurement that will be fused, or have failed."""
-        bank, count = self.hypotheses, int(kept.sum())
+        bank, count = self.hypotheses, int(np.count_nonzero(kept))
         assert bank is not None
-        z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
-        y, g = work(count, self.model.width)
+        z, h, r = rows
+        if count < kept.size:
+            z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
+        if (space := self._spaces.get(count)) is None:
+            of_bank = np.empty(count * bank.columns, dtype=np.float32)
+            space = self._spaces[count] = *work(count, self.model.width), of_bank
+        y, g, of_bank = space
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
             of_row = bank.bank, *bank.table[:3], measurement.t_ns, *bank.of(measurement)
-            space = np.empty(count * bank.columns, dtype=np.float32)
-            account_for(self.nav, self.step, h, r, y, g, fused, *of_row, space, bank.found)
+            account_for(self.nav, self.step, h, r, y, g, fused, *of_row, of_bank, bank.found)
 
     def hold(self) -> None:
         """Estimate without feedback from now on; errors propagate beside the state."""

@@ -66,6 +66,7 @@ class Innovations:
             degrees=outcome.degrees,
         )
 
+
 LONGEST_WAIT_NS = 50_000_000
 """Longest time that samples wait for a tick that does something: a solution's mode is as old as
 that at most, and of an IMU of 1 kHz 50 samples cost that tick 0.1 ms."""

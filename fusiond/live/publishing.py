@@ -110,7 +110,9 @@ class Publishing:
         """True if nothing is due at `t_ns`."""
         if self._waiting or self._messaging.has_waiting:
             return False
-        every = self._status, self._health, self._calibration, *(each for _, each in self._nav)
+        if not self._calibration.waits(t_ns) and self._navigator.calibrating.parameters:
+            return False
+        every = self._status, self._health, *(each for _, each in self._nav)
         return all(each.waits(t_ns) for each in every)
 
     def _publish(self, topic: Topic, message: Message) -> None:

@@ -21,6 +21,7 @@ from fusiond.configuration.schema import Mqtt
 from fusiond.outputs import broker_access, oversized_packets, subscriptions
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
+from fusiond.outputs.direct_writes import write_directly
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.events import MOST_KEPT, events_message
 from fusiond.outputs.messages.reply import ReplyMessage
@@ -215,6 +216,7 @@ class MqttPublisher:
             socket_options=oversized_packets.SOCKET_OPTIONS,
         )
         oversized_packets.limit(client, MAX_PAYLOAD_BYTES)
+        write_directly(client)
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> str:
