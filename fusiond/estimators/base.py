@@ -66,6 +66,8 @@ class _Thresholds(dict[tuple[float, int], float]):
 
 
 THRESHOLDS = _Thresholds()
+MANY = 1000.0
+"""Number of innovations whose mean has no noise of its own to speak of: 3 % of one sigma."""
 
 
 def gate_threshold(probability: float, degrees: int) -> float:
@@ -77,7 +79,8 @@ class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
     L^-1 nu with S = L L^T). `rows`: of a screened measurement, what became of each row
     (fusiond.estimators.update_with_exclusion); `whitened` is then 0 where a row was left out.
-    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts.
+    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts;
+    `evidence_limits`: chi-square between that and its end that innovations without noise show.
     `first`: innovation of the first row of one that a Kalman filter has fused at once, else NaN."""
 
     name: str
@@ -86,6 +89,7 @@ class Outcome(NamedTuple):
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
     lasting: tuple[float, ...] = ()
+    evidence_limits: tuple[float, ...] = ()
     first: float = math.nan  # the one that equals itself in a tuple
 
 
@@ -328,7 +332,10 @@ class Estimator:
             return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
         lefts = [z - h @ dx - added[: z.shape[0]] for added in lasting]
         lasts = tuple(normalised_innovation_squared(cov, nu, h, r, y.copy()) for nu in lefts)
-        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts)
+        # The filter's own error is common to all of them, so that only their noise averages out.
+        mean = [(added[: z.shape[0]], r / MANY) for added in lasting]
+        limits = tuple(normalised_innovation_squared(cov, b, h, s, y.copy()) for b, s in mean)
+        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts, limits)
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""

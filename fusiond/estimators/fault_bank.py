@@ -159,12 +159,12 @@ class FaultTable(NamedTuple):
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
     """Table of these kinds, `numbers` (k, 7). ValueError where a kind has neither three numbers nor
-    one, a mean of three, or those of three do not come first."""
+    one, a mean of three or of an unknown size, or those of three do not come first."""
     sizes = ints[:, SIZE]
     if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
         raise ValueError("kinds have three numbers or one, those of three first")
-    if numbers[sizes == 3, BOUNDED].any() or numbers[numbers[:, BOUNDED] == 0.0, MEAN].any():
-        raise ValueError("only a kind of one number is known to be of a size, about a mean")
+    if numbers[(sizes == 3) | (numbers[:, BOUNDED] == 0.0), MEAN].any():
+        raise ValueError("only a kind of one number that is known to be of a size has a mean")
     threes = RESTARTS * int(np.count_nonzero(sizes == 3))
     parts = [threes, RESTARTS * len(sizes) - threes]
     lanes = np.zeros((sum(-(-part // LANES) for part in parts), CONSTANTS))

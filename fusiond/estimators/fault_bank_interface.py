@@ -13,18 +13,28 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
     ALL,
+    BEGINS_AT,
+    COUNTS_BY,
+    E_ROWS,
     EXPLAINED,
+    J_AT,
+    L_ROWS,
     LAST_MEASURED,
     LOG_ODDS,
+    MEAN,
     MOVES,
+    N_AT,
     NOTHING,
     ONSET,
     OTHER,
     PLACES,
+    PRIOR,
+    RESTARTED,
     RESTARTS,
     ROLLS,
     SENSITIVITIES,
     SIZE,
+    SLOTS_OF,
     SUSPECTS,
     TURNED_BY,
     UNEXPLAINED,
@@ -47,6 +57,10 @@ from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import MOUNTING
 
 Array = NDArray[np.float64]
+
+
+UNLIKELY = 1e3
+"""Log odds that no rate and no evidence at an onset make up for."""
 
 
 class Estimated(NamedTuple):
@@ -141,6 +155,25 @@ class Hypotheses:
         begin_again(
             self.bank, self.table.ints, self.n, *self.of(measurement), measurement.t_ns, nav, step
         )
+
+    def begin_lasting(
+        self, t_ns: int, kind: int, onset_s: float, b: Array, sd: Array, log_odds: float
+    ) -> None:
+        """A fault of size `b` with `sd` (p,) may last since `onset_s`, with such odds: of its kind
+        the restart that goes on longest begins with what is known, L = M^-1 - S^-1."""
+        level = len(SLOTS_OF) - 1
+        turn = int(self.bank[RESTARTED + level])
+        at, p = self._at[kind, BEGINS_AT[level] + turn % SLOTS_OF[level]], len(b)
+        numbers = self.table.numbers[kind]
+        prior = numbers[PRIOR : PRIOR + p] ** -2.0
+        known = np.maximum(sd**-2.0 - prior, 0.0)
+        e = known * b + prior * (b - numbers[MEAN] * (p == 1))
+        self.bank[at + L_ROWS[:p, :p]], self.bank[at + E_ROWS[:p]] = np.diag(known), e
+        self.bank[at + J_AT], self.bank[at + N_AT] = (e * e / (known + prior)).sum(), p
+        self.bank[at + ONSET], self.bank[at + COUNTS_BY] = onset_s, -UNLIKELY
+        self.judge(t_ns)
+        self.bank[at + COUNTS_BY] += log_odds - self.bank[at + LOG_ODDS]
+        self.judge(t_ns)
 
     def keep_fed_back(self, dx: Array) -> None:
         """An error (n,) is taken out of the filter's state: out of the path behind it as well."""

@@ -35,6 +35,8 @@ from fusiond.estimators.fault_bank import (
     COUNTS_BY,
     DECIDED,
     DEVICE,
+    E1,
+    E2,
     E_AT,
     E_ROWS,
     EXPLAINED,
@@ -92,6 +94,12 @@ BY_CHANCE = 2.05
 part."""
 MOST_OFF = 3.0
 """Largest deviation of a size from the mean of its kind, in prior sigmas."""
+LEAST_SQUARE, MOST_SQUARE = 0.115, 14.2
+"""Least and largest squared size of three numbers, in prior sigmas.
+
+One of a hundred faults of a kind of known size is smaller, as many are larger as of one number are
+beyond `MOST_OFF`. A receiver that is good to a
+centimetre has many jumps of five, and none of metres."""
 MOST_OF_UNIT = 10.0
 """Largest size of a unit's fault in prior sigmas: 10 deg/s, half a g, more than a right angle. A
 reversed velocity is no force of four g."""
@@ -142,8 +150,9 @@ def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Arra
 
 @compiled("void(f8[::1], f8[::1])")
 def _gains(bank: Array, lanes: Array) -> None:
-    """Write each group's explained and unexplained chi-square, and the determinant of L + S^-1 for
-    its weight; for groups of one number also the gain of log odds by the prior."""
+    """Write each group's explained and unexplained chi-square.
+
+    With the determinant of L + S^-1 for its weight, and the gain of log odds by the prior."""
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
@@ -165,6 +174,12 @@ def _gains(bank: Array, lanes: Array) -> None:
                 b_2 = bank[j + unsigned(L22)] + lanes[c + unsigned(P_AT + 2 * LANES)]
                 b_2 -= m_2 * a_2 + m_3 * m_3 / b_1
                 bank[j + unsigned(WEIGHT)] = b_0 * b_1 * b_2
+                # e^T M e / 2
+                e_0 = bank[j + unsigned(E_AT)]
+                e_1 = bank[j + unsigned(E1)] - m_1 * e_0
+                e_2 = bank[j + unsigned(E2)] - m_2 * e_0 - m_3 / b_1 * e_1
+                gained = e_0 * e_0 / b_0 + e_1 * e_1 / b_1 + e_2 * e_2 / b_2
+                bank[j + unsigned(LOG_ODDS)] = 0.5 * gained
         else:
             for k in range(length):
                 j, c = at + unsigned(k), constants + unsigned(k)
@@ -200,6 +215,16 @@ def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Arra
     return 0.5 * math.log(max(square / size, 1.0))
 
 
+@compiled("b1(f8[::1], f8[::1], i8, f8[::1])", forceinline=True)
+def _of_its_size(bank: Array, numbers: Array, at: int, m: Array) -> bool:
+    """True if a fault of three numbers is neither too small nor too large for its kind."""
+    solve(bank, at, 3, numbers, 1.0, m)
+    square = 0.0
+    for c in range(3):
+        square += (m[9 + c] / numbers[PRIOR + c]) ** 2
+    return bool(LEAST_SQUARE <= square <= MOST_SQUARE)
+
+
 @compiled(
     "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[:, ::1])", forceinline=True
 )
@@ -230,8 +255,12 @@ def _odds(
             gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
-        off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
-        if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
+        if number >= threes:
+            off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
+            other = abs(off) > MOST_OFF * numbers[kind, PRIOR]
+        else:
+            other = rate + gained > _NOTHING and not _of_its_size(bank, numbers[kind], at, m)
+        if other:
             bank[at + UNEXPLAINED] = np.inf  # it is of another size than this kind has
     bank[at + LOG_ODDS] = rate + gained
 
@@ -269,7 +298,8 @@ def judge(
 ) -> None:
     """Write log odds, weight and unexplained chi-square of each group, and `found` (4,), at an
     epoch of a measurement. A single measurement accuses the nearest hypothesis; one is found after
-    it has been likely and has explained all for `LASTS_S`.
+    it has been likely and has explained all for `LASTS_S`. Three numbers of a known size open what
+    is published, and accuse nobody.
 
     It is ahead of another by odds. Between a step of states, which changes what is published, and a
     fault of a source that is likelier than nothing wrong it counts how well each fits, if that is
@@ -311,7 +341,8 @@ def judge(
         if bank[at + LIKELY] < np.inf:
             bank[SUSPECTS] = 1.0
         lasted = epoch_s - bank[at + LIKELY] > LASTS_S - 1e-3
-        if lasted and odds > found[BEST_ODDS]:
+        opens = number < int(bank[THREES]) and numbers[number // RESTARTS, BOUNDED] != 0.0
+        if lasted and not opens and odds > found[BEST_ODDS]:
             found[BEST], found[BEST_ODDS] = number, odds
         found[EXPLAINS] = max(found[EXPLAINS], odds)
     if found[BEST] >= 0.0:

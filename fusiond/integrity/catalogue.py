@@ -66,6 +66,10 @@ TURNS_PER_H = 0.01
 """Rate at which a unit turns in its mount, an hour: seldom in a vehicle's life. A rate of one an
 hour would add 0.2 deg of tilt for good to a unit that knows its tilt to 0.05 deg."""
 POSITION_SD_M = (20.0, 20.0, 20.0)
+METRES_SD_M = (2.0, 2.0, 3.0)
+"""The lower end of the same sizes: a reflection that arrives with the direct signal, or other
+satellites than before. Of code receivers no test tells it before the filter has followed it, so
+that it opens what is published and accuses nobody (`Kind.opens`)."""
 TOGETHER = "all receivers"
 """Device name of a kind that concerns all devices."""
 LAGGED_S = 0.5
@@ -109,6 +113,11 @@ class Kind:
     def corrected(self) -> bool:
         """True if the filter corrects the fault, which is one of its states."""
         return self.signature in (STATES, TURNED, SHIFTED, FOLLOWED)
+
+    @property
+    def opens(self) -> bool:
+        """True if the fault only opens what is published: three numbers of a known size."""
+        return self.bounded and self.size == 3
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
         """True if the fault invalidates a series of such a device."""
@@ -161,6 +170,11 @@ def position_kinds(device: str) -> list[Kind]:
         of(
             *("position", f"{device} position is off", "m", POSITION, PLACE),
             *(POSITION_SD_M, RECEIVER_PER_H),
+        ),
+        of(
+            *("position", f"{device} position is off", "m", POSITION, PLACE),
+            *(METRES_SD_M, RECEIVER_PER_H),
+            bounded=True,
         ),
         of(
             *("position_drift", f"{device} position runs away", "m/s", POSITION_RAMP, PLACE),

@@ -24,7 +24,7 @@ Source: as of fusiond.estimators.fault_odds.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +43,9 @@ from fusiond.integrity.series_exclusion import Finding, Lasting
 from fusiond.integrity.series_states import (
     DISAGREES,
     FORGET_NS,
+    MOST_SURE,
     REPEATS,
+    RETURNS,
     STILL,
     Series,
     ServiceTable,
@@ -166,6 +168,8 @@ class Diagnosis(ServiceTable):
             one.fused(t_ns, () if measurement.constraint else outcome.whitened)
         elif outcome.name == "gated" and (not measurement.constraint or measurement.no_slip):
             one.gated(t_ns, explained)
+            if one.out and one.reason == DISAGREES:
+                self._lasting = {**self._lasting, one.source: Lasting()}
         return correction
 
     def _looked_at(
@@ -177,17 +181,29 @@ class Diagnosis(ServiceTable):
         if outcome.lasting:
             known = self._lasting[one.source].judged(outcome.lasting)
             self._lasting = {**self._lasting, one.source: known}
-        lasts = min(outcome.lasting, default=math.nan)
+        lasts, limit = min(
+            zip(outcome.lasting, outcome.evidence_limits, strict=True),
+            default=(math.nan, math.inf),
+        )
         others = self._over_by_others(one)
-        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others)
+        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis, others, limit)
         if self._goes_its_own_way(one):
             correction = somewhere_else(measurement, estimator)
             one.readmit(t_ns)
         if not one.out:
-            self._is_over(one)
+            known = self._is_over(one)
             if bank is not None:
                 bank.begin_again(measurement, estimator.nav, estimator.step)
+                self._may_last(t_ns, one, known, bank)
         return correction
+
+    def _may_last(self, t_ns: int, one: Series, known: Lasting, bank: Hypotheses) -> None:
+        """Begin hypotheses that the faults of a returning series last, as likely as they are."""
+        for finding, share in zip(known.findings, known.shares, strict=True):
+            kind, per_unit = self._kinds.index(finding.kind), finding.kind.per_unit
+            b, sd = np.array(finding.size) / per_unit, np.array(finding.sd) / per_unit
+            odds = math.log(share) - max(RETURNS, min(one.sure, MOST_SURE))
+            bank.begin_lasting(t_ns, kind, finding.since_s, b, sd, odds)
 
     def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
         """False for a position's fault before the position of that instant has arrived, if it may
@@ -236,7 +252,7 @@ class Diagnosis(ServiceTable):
         found = []
         for row in np.flatnonzero(fits.any(axis=1)).tolist():
             kind = self._kinds[row]
-            if kind.device == finding.kind.device and not kind.corrected:
+            if kind.device == finding.kind.device and not (kind.corrected or kind.opens):
                 restart = int(np.argmax(np.where(fits[row], bank.log_odds[row], -np.inf)))
                 told = bank.estimated(RESTARTS * row + restart)
                 found.append(self._finding(finding.t_ns, told))
@@ -261,16 +277,19 @@ class Diagnosis(ServiceTable):
             s.over for s in others if known & set(self._lasting.get(s.source, Lasting()).findings)
         )
 
-    def _is_over(self, one: Series) -> None:
-        """A series has returned: of the faults for which it was out none lasts, for others too."""
-        over, lasting = self._lasting.get(one.source), {}
-        if over is None:
-            return
+    def _is_over(self, one: Series) -> Lasting:
+        """A series has returned: of the faults for which it was out none lasts, for others too.
+        Returns these."""
+        over = self._lasting.get(one.source, Lasting())
+        lasting = {one.source: over}  # which comes again if it fails on probation
         for name, known in self._lasting.items():
+            if name == one.source:
+                continue
             left = lasting[name] = known.without(over)
             if known.findings and not left.findings and self._series[name].out:
                 self._changed(name).reason = STILL
         self._lasting = lasting
+        return over
 
     def lasting(
         self, measurement: AidingMeasurement, one: Series, estimator: Estimator
@@ -291,10 +310,16 @@ class Diagnosis(ServiceTable):
         return [
             bank.estimated(RESTARTS * row + restart)
             for row, each in enumerate(self._kinds)
-            if each.of == kind.of and each.device == kind.device
+            if each.of == kind.of and each.device == kind.device and not each.opens
             for restart in range(RESTARTS)
             if explains[row, restart] and log_odds[row, restart] > odds - ALIKE
         ]
+
+    def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
+        """Exclude the series that faults affect."""
+        for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
+            self._changed(name).exclude(t_ns, reason)
+            self._lasting = {**self._lasting, name: Lasting()}
 
     def _goes_its_own_way(self, one: Series) -> bool:
         """True if the filter, not the device, is somewhere else.

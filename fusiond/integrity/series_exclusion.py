@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -48,6 +49,12 @@ class Lasting(NamedTuple):
         """Faults of `findings` that fit alike."""
         found = tuple(findings)
         return Lasting(found, (0.0,) * len(found))
+
+    @property
+    def shares(self) -> list[float]:
+        """Probability of each, if one of them lasts."""
+        shares = [math.exp(min(self.worse) - w) for w in self.worse]
+        return [share / sum(shares) for share in shares]
 
     def judged(self, nis: Sequence[float]) -> Lasting:
         """Faults after one more innovation, with chi-square `nis` (k,) under each of them. A fault

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 
@@ -98,6 +98,8 @@ class Series:
     """End of probation (ns), which is as long as the exclusion was."""
     over: float = 0.0
     """Log likelihood ratio that the excluding fault is over rather than lasting."""
+    sure: float = math.inf
+    """Log odds that it is over, at the last comparison."""
     value: object = None
     repeats: int = 0
     """So many values in a row, of a vehicle that moves, were that before them, to the bit."""
@@ -141,6 +143,7 @@ class Series:
         self.out = True
         forget_lately(self.noise)
         self.failed = self.passed = 0
+        self.sure = math.inf
         self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
 
     def gated(self, t_ns: int, explained: bool) -> None:
@@ -166,22 +169,33 @@ class Series:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
     def looked_at(
-        self, t_ns: int, passes: bool, lasting: float = math.nan, others: float = 0.0
+        self,
+        t_ns: int,
+        passes: bool,
+        lasting: float = math.nan,
+        others: float = 0.0,
+        limit: float = math.inf,
     ) -> None:
         """Compare a measurement of an excluded series with the published solution. `lasting`:
         increase of the innovation's chi-square if the excluding fault lasts; NaN if unknown.
-        `others`: log likelihood that the fault is over, by its other series.
+        `others`: log likelihood that the fault is over, by its other series. `limit`: chi-square
+        that innovations without noise show of it.
 
-        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
+        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which. The
+        solution's own error is common to all innovations of a series that is not fused: many of
+        them say no more than `limit`.
         """
         if self.unchanged and self.reason == REPEATS:
             passes = False
         self.passed = self.passed + 1 if passes else 0
         if math.isfinite(lasting):
             self.over += 0.5 * max(-MOST_EVIDENCE, min(lasting, MOST_EVIDENCE))
-            self.over = max(-MOST_EVIDENCE, min(self.over, MOST_SURE))
+            self.over = max(
+                -min(MOST_EVIDENCE, 0.5 * limit), min(self.over, MOST_SURE, 0.5 * limit)
+            )
             prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
-            if self.over + others + prior < RETURNS:
+            self.sure = self.over + others + prior
+            if self.sure < RETURNS:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
                 self.reason = STILL
@@ -274,11 +288,6 @@ class ServiceTable:
         if one.device in self._agreement:
             return None
         return self.own(measurement) if measurement.source in self._shared else one
-
-    def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
-        """Exclude the series that faults affect."""
-        for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
-            self._changed(name).exclude(t_ns, reason)
 
     def _changed(self, name: str) -> Series:
         """A series that may be changed."""

@@ -190,7 +190,7 @@ def test_each_kind_says_what_it_is() -> None:
         "e": "height",
     }
     kinds: list[Kind] = kinds_of(MODEL, everything, slips=True)
-    assert len({(k.name, k.device, k.lag_s) for k in kinds}) == len(kinds)
+    assert len({(k.name, k.device, k.lag_s, k.sd) for k in kinds}) == len(kinds)
     for kind in kinds:
         assert kind.text
         assert kind.unit

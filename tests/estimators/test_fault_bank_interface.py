@@ -48,7 +48,7 @@ def effect(estimator: KalmanEstimator, name: str, onset_ns: int) -> Array:
     """V (n, p) of a kind since an onset."""
     bank = estimator.hypotheses
     assert bank is not None
-    [row] = [k for k, kind in enumerate(kinds(estimator.model)) if kind.name == name]
+    row = next(k for k, kind in enumerate(kinds(estimator.model)) if kind.name == name)
     onsets = bank.each(ONSET)[row].tolist()
     return bank.effect(RESTARTS * row + onsets.index(onset_ns * 1e-9))
 

@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     E_AT,
     E_ROWS,
+    J_AT,
     L_AT,
     L_ROWS,
     N_AT,
@@ -174,3 +176,52 @@ def test_weights_are_a_distribution() -> None:
     opened = bank.opened()
     assert np.allclose(opened, opened.T)
     assert np.linalg.eigvalsh(opened).min() > -1e-12
+
+
+def known(size_m: float, sd_m: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Log odds and fit of both sizes of a position's fault that is known so well."""
+    bank = run().hypotheses
+    assert bank is not None
+    rows = [row for row, kind in enumerate(KINDS) if kind.name == "position"]
+    assert [KINDS[row].sd[0] for row in rows] == [20.0, 2.0]
+    for row in rows:
+        at = group_at(bank.bank, RESTARTS * row + RESTARTS - 1)
+        bank.bank[at + L_ROWS[range(3), range(3)]] = sd_m**-2.0
+        bank.bank[at + E_ROWS] = np.array([size_m, 0.0, 0.0]) * sd_m**-2.0
+        bank.bank[at + J_AT], bank.bank[at + N_AT] = (size_m / sd_m) ** 2, 300.0
+    bank.judge(LAST_NS)
+    return bank.log_odds[rows, -1], bank.explains[rows, -1]
+
+
+def test_a_step_of_metres_is_open_before_it_can_be_told() -> None:
+    """Of 2 m, known to half a metre: chi-square 18, of which nobody is accused."""
+    odds, explains = known(2.0, 2.0 / math.sqrt(18.0))
+    assert explains.all()
+    assert odds[0] < -6.0
+    assert -2.0 < odds[1] < 2.0
+
+
+@pytest.mark.parametrize(("size_m", "sd_m"), [(0.3, 0.02), (20.0, 1.0)])
+def test_a_step_of_another_size_is_none_of_metres(size_m: float, sd_m: float) -> None:
+    """What is far smaller is what no model knows of a sound receiver."""
+    _, explains = known(size_m, sd_m)
+    assert explains.tolist() == [True, False]
+
+
+def test_a_fault_that_may_last_begins_with_what_is_known() -> None:
+    bank = run().hypotheses
+    assert bank is not None
+    for name, b, sd in (
+        ("velocity", [0.2, -0.1, 0.0], [0.02, 0.03, 0.04]),
+        ("position_drift", [2.0, 0.1, 0.0], [0.1, 0.1, 0.2]),
+        ("delay", [0.9], [0.05]),
+    ):
+        row, since_s = row_of(name), LAST_NS * 1e-9 - 7.0
+        bank.begin_lasting(LAST_NS, row, since_s, np.array(b), np.array(sd), math.log(0.1))
+        [restart] = np.flatnonzero(np.abs(bank.log_odds[row] - math.log(0.1)) < 1e-9)
+        assert restart >= RESTARTS - 2
+        assert bank.explains[row, restart]
+        found = bank.estimated(RESTARTS * row + int(restart))
+        assert found.size == pytest.approx(b, abs=1e-6)
+        assert np.sqrt(np.diagonal(found.covariance)) == pytest.approx(sd)
+        assert found.onset_s == since_s

@@ -14,6 +14,7 @@ from fusiond.integrity.series_states import (
     MOST_SURE,
     READMIT_COUNT,
     REFUSED_IN_A_ROW,
+    RETURNS,
     STILL,
     Series,
     Service,
@@ -123,6 +124,19 @@ def test_nothing_says_endlessly_that_a_fault_is_over() -> None:
     for k in range(100):
         one.looked_at((60 + k) * S, passes=False, lasting=12.0)
     assert one.over == MOST_SURE
+
+
+def test_many_innovations_of_one_filter_error_say_no_more_than_it_is_known_to() -> None:
+    """Of a velocity that is off by two sigma of the filter's own, chance says that it is over."""
+    one = series()
+    one.exclude(0, "gnss velocity is off")
+    for k in range(100):
+        one.looked_at(20 * S + k * S // 5, passes=True, lasting=3.0, limit=4.0)
+    assert one.over == 2.0
+    assert one.out
+    one.looked_at(42 * S, passes=True, lasting=3.0, limit=4.0)  # more likely over by its duration
+    assert not one.out
+    assert RETURNS < one.sure < RETURNS + 0.1
 
 
 def test_the_end_of_one_fault_is_no_evidence_of_the_end_of_the_next() -> None:
