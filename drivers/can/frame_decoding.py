@@ -55,19 +55,19 @@ def datagram_decoder() -> Decode:
 
     def of_datagram(datagram: bytes) -> Content:
         try:
-            told = unpack(datagram)
-            can_id, extended, data = told["arbitration_id"], told["is_extended_id"], told["data"]
+            stated = unpack(datagram)
+            can_id, extended, data = stated["arbitration_id"], stated["is_extended_id"], stated["data"]
             ordinary = (
-                told.keys() == _NAMES
+                stated.keys() == _NAMES
                 and type(can_id) is int
                 and type(extended) is bool
                 and type(data) is bytes
                 and 0 <= can_id < (0x2000_0000 if extended else 0x800)
-                and told["dlc"] == len(data) <= _CLASSIC_BYTES
-                and told["is_remote_frame"] is False
-                and told["is_error_frame"] is False
-                and told["bitrate_switch"] is False
-                and told["error_state_indicator"] is False
+                and stated["dlc"] == len(data) <= _CLASSIC_BYTES
+                and stated["is_remote_frame"] is False
+                and stated["is_error_frame"] is False
+                and stated["bitrate_switch"] is False
+                and stated["error_state_indicator"] is False
             )
         except Exception:  # whatever msgpack raises, or a structure of another kind
             ordinary = False
