@@ -55,19 +55,23 @@ def datagram_decoder() -> Decode:
 
     def of_datagram(datagram: bytes) -> Content:
         try:
-            stated = unpack(datagram)
-            can_id, extended, data = stated["arbitration_id"], stated["is_extended_id"], stated["data"]
+            map_ = unpack(datagram)
+            can_id, extended, data = (
+                map_["arbitration_id"],
+                map_["is_extended_id"],
+                map_["data"],
+            )
             ordinary = (
-                stated.keys() == _NAMES
+                map_.keys() == _NAMES
                 and type(can_id) is int
                 and type(extended) is bool
                 and type(data) is bytes
                 and 0 <= can_id < (0x2000_0000 if extended else 0x800)
-                and stated["dlc"] == len(data) <= _CLASSIC_BYTES
-                and stated["is_remote_frame"] is False
-                and stated["is_error_frame"] is False
-                and stated["bitrate_switch"] is False
-                and stated["error_state_indicator"] is False
+                and map_["dlc"] == len(data) <= _CLASSIC_BYTES
+                and map_["is_remote_frame"] is False
+                and map_["is_error_frame"] is False
+                and map_["bitrate_switch"] is False
+                and map_["error_state_indicator"] is False
             )
         except Exception:  # whatever msgpack raises, or a structure of another kind
             ordinary = False
