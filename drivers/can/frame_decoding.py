@@ -55,23 +55,20 @@ def datagram_decoder() -> Decode:
 
     def of_datagram(datagram: bytes) -> Content:
         try:
-            map_ = unpack(datagram)
-            can_id, extended, data = (
-                map_["arbitration_id"],
-                map_["is_extended_id"],
-                map_["data"],
-            )
+            entry = unpack(datagram)
+            can_id, extended = entry["arbitration_id"], entry["is_extended_id"]
+            data = entry["data"]
             ordinary = (
-                map_.keys() == _NAMES
+                entry.keys() == _NAMES
                 and type(can_id) is int
                 and type(extended) is bool
                 and type(data) is bytes
                 and 0 <= can_id < (0x2000_0000 if extended else 0x800)
-                and map_["dlc"] == len(data) <= _CLASSIC_BYTES
-                and map_["is_remote_frame"] is False
-                and map_["is_error_frame"] is False
-                and map_["bitrate_switch"] is False
-                and map_["error_state_indicator"] is False
+                and entry["dlc"] == len(data) <= _CLASSIC_BYTES
+                and entry["is_remote_frame"] is False
+                and entry["is_error_frame"] is False
+                and entry["bitrate_switch"] is False
+                and entry["error_state_indicator"] is False
             )
         except Exception:  # whatever msgpack raises, or a structure of another kind
             ordinary = False
