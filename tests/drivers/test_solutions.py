@@ -213,7 +213,7 @@ def test_one_fix_an_epoch_of_a_line_with_nmea_and_ubx() -> None:
     """The first epoch's NMEA comes before its UBX; then UBX stands for both, until it ends."""
     decoder = GnssDecoder("gnss", NmeaDecoding())
     seen: list[PositionFix] = []
-    for k in range(8):
+    for k in range(12):
         stream = gga(29 + k) + rmc(29 + k)
         if k < 3:
             stream += ubx.pvt(k, nano=0) + ubx.end_of_epoch(k)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from pathlib import Path
 
 from fusiond.clock.stamp_mapping import Clock
@@ -41,7 +40,7 @@ class Kept:
         self.t_ns = self.clock.now_ns()
 
     def at(self, speed_m_s: float, mode: Mode = Mode.NAVIGATING) -> Solution:
-        return replace(NAVIGATING, t_ns=self.t_ns, mode=mode, v_ned_m_s=(speed_m_s, 0.0, 0.0))
+        return NAVIGATING._replace(t_ns=self.t_ns, mode=mode, v_ned_m_s=(speed_m_s, 0.0, 0.0))
 
     async def tick(self, after_s: float, speed_m_s: float, mode: Mode = Mode.NAVIGATING) -> None:
         """A tick some time later, and what it started in the background."""

@@ -218,7 +218,7 @@ class Rig:
         if t_s < 0.0 or (self.samples and t_s < self.samples[-1].t_s + 1.0):
             return
         true = self.vehicle.truth.at(np.array([t_s]))
-        found = error_sample(replace(said, t_ns=round(t_s * 1e9)), true)
+        found = error_sample(said._replace(t_ns=round(t_s * 1e9)), true)
         self.samples.append(replace(found, t_s=float(int(t_s))))
 
     @property

@@ -8,7 +8,6 @@ import logging
 import math
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,7 +45,7 @@ async def test_rest_is_kept_and_serves_the_next_start(kept: Kept) -> None:
 
 
 async def test_a_place_whose_height_is_not_known_is_kept_without(kept: Kept) -> None:
-    unknown = replace(kept.at(0.0), height_m=math.nan, sd_ned_m=(3.0, 4.0, math.nan))
+    unknown = kept.at(0.0)._replace(height_m=math.nan, sd_ned_m=(3.0, 4.0, math.nan))
     await kept.keeper.close(unknown, confirmed=True)
     state = Kept(kept.path).keeper.load()
     assert state is not None
@@ -195,7 +194,7 @@ def never(code: str, text: str) -> None:
 async def test_systemd_names_the_folder(tmp_path: Path) -> None:
     config = Config(vehicle="truck")
     clock = Clock(config.clock)
-    now = replace(NAVIGATING, t_ns=clock.now_ns())
+    now = NAVIGATING._replace(t_ns=clock.now_ns())
     await StateKeeper(config, clock, never, {"STATE_DIRECTORY": f"{tmp_path}:/other"}).close(
         now, confirmed=True
     )

@@ -200,7 +200,8 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
 def stated_per_h(config: Config) -> dict[str, float]:
     """False decisions an hour that odds and rates of the catalogue allow."""
     kinds = kinds_of_config(config, Navigator(config).model)
-    of_sources = sum(kind.per_hour for kind in kinds if not kind.corrected)
+    # What only opens sigma decides nothing.
+    of_sources = sum(kind.per_hour for kind in kinds if not (kind.corrected or kind.opens))
     of_unit = sum(kind.per_hour for kind in kinds if kind.corrected and kind.of != OVER)
     return {"isolated": FALSE * of_sources, "corrected": FALSE * (of_unit + of_sources)}
 
