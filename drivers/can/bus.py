@@ -5,9 +5,7 @@ descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descrip
 `udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn, or
 when its owner calls `poll`: an IMU sends its frames one by one, and a daemon that wakes for each
 spends five times their cost on waking. A bus without one (`virtual`) is read by a thread into a
-ring of `RING_FRAMES`.
-
-How a frame lies in what a socket gives: `drivers.can.frame_decoding`.
+ring of `RING_FRAMES`. How a frame lies in what a socket gives: `drivers.can.frame_decoding`.
 """
 
 from __future__ import annotations

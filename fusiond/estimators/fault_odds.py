@@ -95,11 +95,10 @@ part."""
 MOST_OFF = 3.0
 """Largest deviation of a size from the mean of its kind, in prior sigmas."""
 LEAST_SQUARE, MOST_SQUARE = 0.115, 14.2
-"""Least and largest squared size of three numbers, in prior sigmas.
+"""Least and largest squared size of three numbers, in prior sigmas, of a kind of known size.
 
-One of a hundred faults of a kind of known size is smaller, as many are larger as of one number are
-beyond `MOST_OFF`. A receiver that is good to a
-centimetre has many jumps of five, and none of metres."""
+One in a hundred of chi-square of three is smaller; 0.27 % are larger, as of one number are beyond
+`MOST_OFF`. A receiver that is good to a centimetre has many jumps of five, and none of metres."""
 MOST_OF_UNIT = 10.0
 """Largest size of a unit's fault in prior sigmas: 10 deg/s, half a g, more than a right angle. A
 reversed velocity is no force of four g."""
@@ -150,9 +149,8 @@ def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Arra
 
 @compiled("void(f8[::1], f8[::1])")
 def _gains(bank: Array, lanes: Array) -> None:
-    """Write each group's explained and unexplained chi-square.
-
-    With the determinant of L + S^-1 for its weight, and the gain of log odds by the prior."""
+    """Write each group's explained and unexplained chi-square, the determinant of L + S^-1 for its
+    weight, and the gain of log odds by the prior."""
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES

@@ -97,9 +97,8 @@ class Navigator:
         self._intake = Intake(config.aiding, self._limits, self._event)
         self.raw = self._intake.receivers
         shared_blocks = self._intake.extra_blocks()
-        self.model = model_of(
-            config, *vehicle_blocks(config.constraints.non_holonomic), *shared_blocks
-        )
+        of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
+        self.model = model_of(config, *of_vehicle, *shared_blocks)
         self.imu = imu_buffer_of(config, self.model)
         self._screening = ImuScreening(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)

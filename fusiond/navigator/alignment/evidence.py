@@ -80,11 +80,11 @@ def _instant(fix: Fix) -> int:
     return fix.velocity.t_ns
 
 
-def _moved_m(first: PositionCandidate, last: PositionCandidate) -> Array:
-    """Displacement north and east (2,) in m from one position to another."""
-    east = math.remainder(last.lon_rad - first.lon_rad, 2.0 * math.pi)
-    metres: Array = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
-    return np.array([last.lat_rad - first.lat_rad, east]) * metres
+def _moved_m(lat_rad: float, lon_rad: float, last: PositionCandidate) -> tuple[float, float]:
+    """Displacement north and east (m) from a place to a position."""
+    north, east = last.lat_rad - lat_rad, math.remainder(last.lon_rad - lon_rad, 2.0 * math.pi)
+    metres = 1.0 / as_geodetic(np.ones(3), lat_rad)[:2]
+    return north * metres.item(0), east * metres.item(1)
 
 
 @dataclass(slots=True)
@@ -259,7 +259,7 @@ class AlignmentEvidence:
         trend = NO_TREND
         within = [p for p in self._positions if begin_ns <= p.t_ns <= end_ns]
         for p in within:
-            n, e = _moved_m(within[0], p).tolist()
+            n, e = _moved_m(within[0].lat_rad, within[0].lon_rad, p)
             trend = trend.with_one(Offset(n, e, max(p.sd[:2])), (p.t_ns - begin_ns) * 1e-9)
         return trend.slope
 
@@ -297,7 +297,7 @@ class AlignmentEvidence:
             since_s = (position.t_ns - first.t_ns) * 1e-9
             v = np.add(fix.velocity.v_ned[:2], before.velocity.v_ned[:2])
             way += 0.5 * (position.t_ns - before.position.t_ns) * 1e-9 * v
-            moved = _moved_m(first, position)
+            moved = np.array(_moved_m(first.lat_rad, first.lon_rad, position))
             north_m, east_m = (moved - way).tolist()
             trend = trend.with_one(Offset(north_m, east_m, max(position.sd[:2])), since_s)
             before, count = fix, count + 1
@@ -397,9 +397,7 @@ class AlignmentEvidence:
             return p.height_m, p.sd[2]
         if (reported := self._reported()) is not None:
             lat, lon, height = reported.where.tolist()
-            separation = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
-            way_m = math.hypot(*(separation / as_geodetic(np.ones(3), lat)[:2]).tolist())
-            sd = math.hypot(reported.sd_height, SLOPE_SD * way_m)
+            sd = math.hypot(reported.sd_height, SLOPE_SD * math.hypot(*_moved_m(lat, lon, p)))
             if sd < UNKNOWN_HEIGHT_SD_M:
                 return height, sd
         return 0.0, UNKNOWN_HEIGHT_SD_M
