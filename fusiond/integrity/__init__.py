@@ -1,1 +1,1 @@
-"""Integrity: whether what the filter says about itself can be believed."""
+"""Integrity: tests, fault diagnosis and protection levels of the filter's published solution."""

@@ -10,10 +10,9 @@ mode is a set of events that come together,
 
     p_k = prod(P_e, e in k) prod(1 - P_e, e not in k)
 
-Monitored are the modes of at most r events, r the least for which P(more than r) <= P_thres; what
-is left, and modes without whose satellites there is no solution, is `not_monitored`. Modes that
-leave the same satellites are one. For each axis q, with Q the tail of N(0, 1) and N the number of
-modes:
+Monitored are the modes of at most r events, r the least for which P(more than r) <= P_thres; the
+rest, and modes that leave too few satellites for a solution, are `not_monitored`. Modes that leave
+the same satellites are one. For each axis q, with Q the tail of N(0, 1) and N the number of modes:
 
     sigma_k^2  = [(G^T W(k) G)^-1]_qq            b_k = sum_i |S(k)_qi| b_nom,i
     sigma_ss^2 = [(S(k) - S(0)) C_acc (S(k) - S(0))^T]_qq
@@ -23,20 +22,19 @@ modes:
     2 Q((VPL - b_0) / sigma_0) + sum_k p_k Q((VPL - T_k - b_k) / sigma_k)
         = P_HMI,V (1 - P_not_monitored / (P_HMI,V + P_HMI,H))
 
-Where the exposure holds n independent samples, as an hour does, probabilities of a fault stay those
-of the exposure, and P_HMI - P_not_monitored and P_fa are shared out among the samples.
+If the exposure holds n independent samples, as an hour does, fault probabilities remain those of
+the exposure, and P_HMI - P_not_monitored and P_fa are divided by n.
 
 HPL is the root of the sum of squares of two such levels with half of P_HMI,H each. The effective
 monitor threshold is EMT = max T_k (vertical) over the modes of p_k >= P_EMT.
 
-Exclusion: where a test fails, modes are tried, those of few satellites first, then in the order of
-the residuals that they leave, and the first one whose remaining satellites pass their own tests is
-left out. A wrong exclusion may be hazardous, too, so the risk is shared: half of it to all in view,
-the rest evenly to the modes that could be excluded. Each level bounds the error whatever made the
-choice, so their sum holds.
+Exclusion: if a test fails, modes are tried by number of satellites, then by the residuals that
+remain. The first mode whose remaining satellites pass their own tests is excluded. A wrong
+exclusion may be hazardous, too, so the risk is divided: half of it to all in view, the rest evenly
+to the modes that could be excluded. Each level bounds the error for any choice, so their sum holds.
 
-Left out of the reference: consolidation of rare satellite faults into constellation faults, which
-only saves modes, and the optimisation of the weights.
+Not implemented of the reference: consolidation of rare satellite faults into constellation faults,
+which only saves modes, and optimisation of the weights.
 
 Source: EU-US Cooperation on Satellite Navigation, Working Group C, ARAIM Technical Subgroup,
 Reference Airborne Algorithm Description Document, v3.0 (2017) and v3.1 (2019); Blanch et al.,
@@ -186,8 +184,8 @@ def protection_level(
     """Smallest level, rounded up by at most `tolerance_m`, with sum weight Q((level - offset) /
     sigma) <= risk; weight, offset and sigma (m,).
 
-    By bisection: each term alone needs no less than the lower bound, and at the upper bound no term
-    has more than its equal part. Infinite where risk is not positive or a sigma not finite.
+    By bisection. Lower bound: the level that the largest single term needs. Upper bound: no term
+    exceeds its equal part of the risk. Infinite if risk is not positive or a sigma not finite.
     """
     if not (risk > 0.0 and np.isfinite(sigma).all() and np.isfinite(offset).all()):
         return math.inf
@@ -369,7 +367,7 @@ def exclude(epoch: Epoch, requirement: Requirement, y: Array) -> Exclusion | Non
 
 
 def shared(requirement: Requirement, share: float) -> Requirement:
-    """A part of the integrity risk; false alarms as they were."""
+    """Requirement with a part of the integrity risk and unchanged false alarms."""
     return replace(
         requirement,
         vertical_risk=requirement.vertical_risk * share,

@@ -1,15 +1,15 @@
 """Catalogue of fault hypotheses: one for each kind of fault, with its signature.
 
-Each states its size in the published unit, the prior of that size and its rate, with sources; its
-signature in the motion or the measurements (fusiond.estimators.fault_bank); and the measurements
-that it affects.
+Each hypothesis states its size in the published unit, the prior of that size and its rate, with
+sources; its signature in the motion or the measurements (fusiond.estimators.fault_bank); and the
+measurements that it affects.
 
 Rates are engineering estimates for devices on vehicles in streets, for which no standard has
 counts, and therefore equal for all kinds: one an hour. A device that is late by half a second or
-more from an instant on, a wheel whose scale changes, or ground that turns below a vehicle at rest,
-has one in a thousand hours; spoofing of position and velocity together one in ten thousand. A
-tenfold rate equals a chi-square of 4.6, which moves no decision by an epoch. Sizes are one sigma of
-a normal prior, which bounds an estimate; it distinguishes only kinds of a known size.
+more from an instant on, a wheel whose scale changes, or ground that turns below a vehicle at rest:
+one in a thousand hours. Spoofing of position and velocity together one in ten thousand. A tenfold
+rate equals a chi-square of 4.6, which moves no decision by an epoch. Sizes are one sigma of a
+normal prior, which bounds an estimate; it distinguishes only kinds of a known size.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Kind:
 
     @property
     def opens(self) -> bool:
-        """True if the fault only opens what is published: three numbers of a known size."""
+        """True if the fault only widens the published covariance: three numbers of a known size."""
         return self.bounded and self.size == 3
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
@@ -163,8 +163,8 @@ def sensor_kinds(model: Model) -> list[Kind]:
 
 def position_kinds(device: str) -> list[Kind]:
     """Faults of positions: an offset or a drift. Sizes: a reflection in a street displaces by
-    metres to tens of metres (Groves, 2nd ed., section 9.4.4); a spoofer drags a receiver away at a
-    metre a second."""
+    metres to tens of metres (Groves, 2nd ed., section 9.4.4); a spoofer moves a receiver's solution
+    at a metre a second."""
     of = partial(Kind, device=device, moves=False)
     return [
         of(
@@ -313,8 +313,8 @@ def changed_kind(device: str) -> Kind:
 
 
 def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]:
-    """Hypotheses of a model and the devices of `aiding` (name to kind of section), with those of a
-    vehicle without slip where `slips`."""
+    """Hypotheses of a model and the devices of `aiding` (name to kind of section); with `slips`
+    also those of the no-slip constraint."""
     found = sensor_kinds(model)
     for device, kind in aiding.items():
         if kind == "gnss":

@@ -5,9 +5,9 @@ r"""Consistency tests of the innovations of one source against their covariance,
     rho(l)  = sum_k nu(k)^T nu(k-l) / sqrt(sum_k |nu(k)|^2 sum_k |nu(k-l)|^2),  l = 1..8     (8)
 
 nu (m,) innovation, S (m, m) its covariance, K epochs in the window. Every lag has K pairs, as (8)
-is printed, so the eight innovations before the window are kept too. In (8) nu is whitened,
-L^-1 nu with S = L L^T (any root of S gives the same eps, and the same rho while S stands still);
-the paper's form with nu as it is can be had.
+is printed, so the eight innovations before the window are kept too. In (8) nu is whitened, L^-1 nu
+with S = L L^T (any root of S gives the same eps, and the same rho while S is constant); the paper's
+form with unwhitened nu is an option.
 
 Verdict at an overall level alpha: two tests, each at 1 - sqrt(1 - alpha). rho does not change when
 all innovations are scaled, so it is (but for the window's eight neighbours) independent of their
@@ -20,14 +20,14 @@ total and the levels multiply (Basu).
       var(l) = 1 / (n + 2 (1 - l/K)),    n = K m
 
   (expand E[c^2 / (A B)]: E[c^2] = n, E[c^2 A] = n (n + 2 + 2 (1 - l/K)), E[A^2] = n^2 + 2n,
-  E[A B] = n^2 + 2n (1 - l/K)). E[Q] = 8, but a large rho(1) drags its neighbours along and the tail
-  is heavier than chi-square's: Q nu / (8 (nu - 2)) is taken as F(d, nu), d = 8 + 207/n - 1670/n^2,
-  nu = 13.6 + 0.277 n, fitted to the upper 5 % of 200,000 windows or more for each of 14 pairs of
-  K (20 to 200) and m (1 to 3): true within 10 % at a level of 0.005, within 20 % at 0.001.
+  E[A B] = n^2 + 2n (1 - l/K)). E[Q] = 8, but a large rho(1) raises its neighbours, and the tail is
+  heavier than chi-square's: Q nu / (8 (nu - 2)) is taken as F(d, nu), d = 8 + 207/n - 1670/n^2, nu
+  = 13.6 + 0.277 n, fitted to the upper 5 % of 200,000 windows or more for each of 14 pairs of K (20
+  to 200) and m (1 to 3): true within 10 % at a level of 0.005, within 20 % at 0.001.
 
 (5) to (8): Lin, Meng, He, "double-star/SINS, optimal prediction and consistency"; after Bar-Shalom
 and Fortmann, Tracking and Data Association, 1988. Form of Q: Ljung and Box, Biometrika 65, 1978.
-The paper takes N(0, 1/K) for rho whatever m is. That holds for m = 1; for m components of equal
+The paper uses N(0, 1/K) for rho with any m. That holds for m = 1; for m components of equal
 variance it is 1/(K m), in between for others. Unwhitened, 1/K is kept: never too narrow.
 """
 
@@ -98,7 +98,7 @@ class ConsistencyOptions:
 
 @immutable()
 class Consistency:
-    """Results of the tests. Figures that need more epochs than there are, are NaN."""
+    """Results of the tests. A figure is NaN if there are too few epochs for it."""
 
     verdict: Verdict
     """Verdict of the monitor, with hysteresis; of `judge`, equal to `window_verdict`."""
@@ -228,7 +228,8 @@ def _cut_off(m: float, gate: float) -> tuple[float, float]:
 def _told(
     k: int, dof: int, alpha: float, gate: float, whitened: bool
 ) -> tuple[Interval, Interval, float]:
-    """The average's interval; NIS ratios and a single lag's rho that are noticed with POWER."""
+    """Interval of the average; the NIS ratios and the single lag's rho that are detected with
+    POWER."""
     limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
@@ -253,8 +254,8 @@ def judge(
 ) -> Consistency:
     """Judge given figures: K, K m, the average per degree of freedom and rho(1..8) by (8).
 
-    Raises ValueError when they cannot be figures of a window: not 8 lags, K below 1 or above K m.
-    With fewer than FEWEST epochs the verdict is `too_few` and no figure is given.
+    Raises ValueError for figures that no window can have: not 8 lags, K below 1 or above K m. With
+    fewer than FEWEST epochs the verdict is `too_few` and no figure is given.
     """
     if len(rho) != LAGS or not 1 <= k <= dof:
         raise ValueError(f"K = {k}, {dof} degrees of freedom, {len(rho)} lags; needs {LAGS} lags")
@@ -289,8 +290,8 @@ def judge(
 
 @compiled("i8(f8, f8, f8, f8, f8)")
 def verdict_index(average: float, q: float, low: float, high: float, most_q: float) -> int:
-    """Verdict, one of `WORDS`. The average goes first: a covariance that is too small is worse than
-    colour."""
+    """Index of the verdict in `WORDS`. The average takes precedence: a covariance that is too small
+    is worse than correlation."""
     if average > high:
         return 2
     if average < low:
@@ -299,7 +300,7 @@ def verdict_index(average: float, q: float, low: float, high: float, most_q: flo
 
 
 def verdict_of(average: float, q: float, limits: Limits, shared: bool = False) -> Verdict:
-    """The verdict of a window; with a `shared` error small innovations tell nothing."""
+    """Verdict of a window; with a `shared` error small innovations are no evidence."""
     return word(verdict_index(average, q, *limits.nis_limits, limits.portmanteau), shared)
 
 

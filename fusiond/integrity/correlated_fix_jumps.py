@@ -1,18 +1,18 @@
-r"""Jumps of positions within a receiver's shared error, which are not a fault.
+r"""Jumps of positions within a receiver's shared error, distinguished from faults.
 
 Successive fixes share an error s b, b ~ N(0, S) of a Gauss-Markov process, which the filter
-estimates (fusiond.aiding.position). A drift that is too slow to be told, or other satellites than
-before, brings b^ far from zero; when that is over the fixes jump. A jump of j +- M can be a fault
-of any size, j ~ N(0, S_0), or b has begun anew and is as it may be:
+estimates (fusiond.aiding.position). A drift too slow to be detected, or a change of satellites,
+moves b^ far from zero; when it ends, the fixes jump. A jump of j +- M is either a fault of any
+size, j ~ N(0, S_0), or b has restarted from its prior:
 
     o = s b^ + j ~ N(0, C),   C = s S s + P + M          P of the position
 
     log odds = (log det S_0 - log det C - o^T C^-1 o) / 2
 
-of the second against the first; both begin equally often. A fault of positions may be a drift,
-which explains the fixes better than any jump does while it goes on: by so much less likely is the
-second. If it is the likelier, nobody is left out: b^ is zero, and open by S once more. What it was
-correlated with remains in P, so that the position learns less from the next fixes than it might.
+of the restart against the fault; both start equally often. A fault of positions may be a drift,
+which explains the fixes better than any jump while it lasts; the restart is less likely by that
+ratio. If the restart is likelier, no source is excluded: b^ becomes zero with covariance S. Its
+former correlations remain in P, so that the position learns less from the next fixes than it could.
 
 Source: a Bayes factor of two models of the same jump, as of fusiond.estimators.fault_odds.
 """
@@ -38,8 +38,8 @@ def renewed_slots(
 ) -> list[int]:
     """Slots of a shared error that has been renewed.
 
-    None, unless that is likelier than a fault of positions, which a `step` of them explains by so
-    much `less` (log likelihood) than the best of such faults does."""
+    Empty unless a restart is likelier than a fault of positions. `less`: log likelihood of the best
+    such fault minus that of a `step`."""
     place = next((c for c in measurement.candidates() if isinstance(c, PositionCandidate)), None)
     if place is None:
         return []

@@ -3,20 +3,20 @@ r"""Diagnosis: the identified hypothesis, and its consequences for filter and so
 A hypothesis is identified where
 
     log odds > DECIDED for a second                 the probability that it is false, 1 in 1,000
-    what it leaves unexplained is no more than chance leaves
+    the unexplained rest is no more than chance
     log odds and log likelihood - those of every other class > APART
-                                                    nobody else explains it nearly as well
+                                                    no other class explains it nearly as well
 
 A fault that is a step of states (of the inertial unit, of a clock) is removed from the state, V b
 with the covariance V M V^T, and navigation continues. A source's fault is removed likewise, from
 its onset on, and the affected series leave service (fusiond.integrity.series_states). Hypotheses of
 one class and device with similar odds are combined by the moments of their mixture, kinds as well
-as onsets, weighted by their fit alone: an estimated rate and size must not decide between them.
-Where two classes explain the evidence none is accused, and the published covariance includes both.
+as onsets, weighted by their fit alone: an estimated rate and size must not decide between them. If
+two classes explain the evidence, no source is excluded, and the published covariance includes both.
 
-Where positions and velocities of a device fit each other and both are out, it is the filter that is
-wrong, by more than any hypothesis says: after `FITS_NS` where nothing has explained why they are
-out, after `FITS_AGAINST_NS` against a hypothesis that has.
+If positions and velocities of a device agree with each other and both are excluded, the filter is
+wrong by more than any hypothesis covers: after `FITS_NS` if no hypothesis explains the exclusion,
+else after `FITS_AGAINST_NS`.
 
 Source: as of fusiond.estimators.fault_odds.
 """
@@ -71,7 +71,7 @@ class Memory(NamedTuple):
 
 
 class Diagnosis(ServiceTable):
-    """Diagnosis of each measurement after its innovation; depends only on the measurements in
+    """Diagnosis after each measurement's innovation; a function of the measurements in their
     order."""
 
     def __init__(self, kinds: Sequence[Kind] = ()) -> None:
@@ -83,7 +83,7 @@ class Diagnosis(ServiceTable):
         """Identified faults since the start, the last of each kind and device."""
 
     def snapshot(self) -> Memory:
-        """A copy of everything."""
+        """Copy of the state, for `restore`."""
         self._shared = set(self._series)
         return Memory(self._series.copy(), self.findings, self._agreement, self._lasting)
 
@@ -118,8 +118,8 @@ class Diagnosis(ServiceTable):
     # ------------------------------------------------------------------ judgement
 
     def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:
-        """Series of a measurement, before its update; a repeating series leaves service, with all
-        of its device."""
+        """Series of a measurement, before its update. A series that repeats itself leaves service,
+        with all series of its device."""
         # By its class: one that stands for another has its own offers.
         one, shown = self._series.get(measurement.source), getattr(type(measurement), "shown", None)
         if one is None or measurement.source in self._shared:
@@ -146,7 +146,8 @@ class Diagnosis(ServiceTable):
     def judge(
         self, measurement: AidingMeasurement, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
-        """Take in how a measurement ended; what to take out of the filter's state, if anything."""
+        """Process the outcome of a measurement; return the correction of the filter's state, or
+        None."""
         e, t_ns, correction, explained = estimator, measurement.t_ns, None, False
         bank, used = e.hypotheses, not one.out
         if one.out or one.device in self._agreement:
@@ -198,7 +199,7 @@ class Diagnosis(ServiceTable):
         return correction
 
     def _may_last(self, t_ns: int, one: Series, known: Lasting, bank: Hypotheses) -> None:
-        """Begin hypotheses that the faults of a returning series last, as likely as they are."""
+        """Start a hypothesis that a returning series' fault lasts, with its probability."""
         for finding, share in zip(known.findings, known.shares, strict=True):
             kind, per_unit = self._kinds.index(finding.kind), finding.kind.per_unit
             b, sd = np.array(finding.size) / per_unit, np.array(finding.sd) / per_unit
@@ -245,8 +246,8 @@ class Diagnosis(ServiceTable):
 
     def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float) -> None:
         """Exclude the series that a fault affects, and those of similarly likely faults of its
-        device: none of them is trusted before the faults are distinguished. A fix of 60 m behind on
-        a straight may have an offset, or a delay that affects the velocity as well."""
+        device: none of them is trusted before the faults are distinguished. A fix that is 60 m
+        behind on a straight may have an offset, or a delay that affects the velocity, too."""
         fits = bank.explains & (bank.log_odds > max(0.0, finding.log_odds - DECIDED))
         fits &= bank.log_likelihood >= fit - APART
         found = []
@@ -278,8 +279,8 @@ class Diagnosis(ServiceTable):
         )
 
     def _is_over(self, one: Series) -> Lasting:
-        """A series has returned: of the faults for which it was out none lasts, for others too.
-        Returns these."""
+        """End all faults that had excluded a series which has returned, for other series, too;
+        return these series."""
         over = self._lasting.get(one.source, Lasting())
         lasting = {one.source: over}  # which comes again if it fails on probation
         for name, known in self._lasting.items():
@@ -294,8 +295,8 @@ class Diagnosis(ServiceTable):
     def lasting(
         self, measurement: AidingMeasurement, one: Series, estimator: Estimator
     ) -> Array | None:
-        """Terms (k, 3) of each lasting fault in an innovation of a series that may be excluded;
-        None if unknown."""
+        """Terms (k, 3) of each lasting fault in the innovation of an excluded series; None if
+        unknown."""
         bank, added = estimator.hypotheses, []
         if bank is None:
             return None
@@ -322,10 +323,10 @@ class Diagnosis(ServiceTable):
             self._lasting = {**self._lasting, name: Lasting()}
 
     def _goes_its_own_way(self, one: Series) -> bool:
-        """True if the filter, not the device, is somewhere else.
+        """True if the position of the filter, not of the device, is wrong.
 
-        A position whose fault is over has followed its device's velocity, which is in service, for
-        a minute."""
+        The device's positions, whose fault is over, have agreed for a minute with its velocity,
+        which is in service."""
         if not (one.out and one.locates and one.reason == STILL):
             return False
         moves = [s for s in self._series.values() if s.device == one.device and s.moves]

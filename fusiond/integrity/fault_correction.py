@@ -1,13 +1,13 @@
-r"""Corrections of a filter's state: what identified faults have done to it.
+r"""Corrections of a filter's state for the effect of identified faults.
 
-Hypotheses f that nobody can tell apart are taken together, by the moments of their mixture with
-weights w_f,
+Hypotheses f that cannot be distinguished are combined by the moments of their mixture with weights
+w_f,
 
     mean = sum w_f V_f b_f,   spread = sum w_f (V_f M_f V_f^T + (V_f b_f - mean)(...)^T)
 
-and what a straight line leaves out is open, to second order: an attitude that is wrong by phi has
-turned the velocity, and the way, by phi / 2 in the mean. Of a gyro that was off for twenty seconds
-in an outage that is a metre a second.
+plus a second-order term for the nonlinear part: an attitude error phi has turned the velocity, and
+the path, by phi / 2 on average. For a gyro fault of twenty seconds in an outage that is a metre a
+second.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Correction(NamedTuple):
 
 
 def mixed(taken: Sequence[Estimated]) -> Correction:
-    """The correction of hypotheses that are weighed by how well they fit."""
+    """Correction of hypotheses weighted by their fit."""
     fits = np.array([each.log_likelihood for each in taken])
     weights = np.exp(fits - fits.max())
     weights /= weights.sum()
@@ -54,7 +54,7 @@ def mixed(taken: Sequence[Estimated]) -> Correction:
 
 
 def _bent(mean: Array) -> Array:
-    """Covariance (n, n) of the part of a correction that V b, a straight line, leaves out."""
+    """Covariance (n, n) of the nonlinear part of a correction, which V b lacks."""
     half, left = 0.5 * float(np.linalg.norm(mean[:3])), np.zeros(len(mean))
     for first in (PLACE_ROW - 3, PLACE_ROW):
         left[first : first + 3] = half * np.linalg.norm(mean[first : first + 3])
@@ -62,7 +62,7 @@ def _bent(mean: Array) -> Array:
 
 
 def somewhere_else(measurement: AidingMeasurement, estimator: Estimator) -> Correction:
-    """The filter's position is open by how far a position is from it."""
+    """Covariance of the filter's position widened by its distance from a measured position."""
     spread = np.zeros((estimator.model.size, estimator.model.size))
     nav = estimator.nav
     lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)

@@ -117,12 +117,12 @@ def _slide_over(
     held: NDArray[np.int64],
     turned: NDArray[np.int64],
 ) -> int:
-    """Insert successive epochs `new` (n, m) from `now` on. The number of changed verdicts, and in
-    `turned` (n, 2) the epoch and new verdict (index of `WORDS`) of each.
+    """Insert successive epochs `new` (n, m) from `now` on; return the number of changed verdicts.
+    `turned` (n, 2) receives the epoch and the new verdict (index of `WORDS`) of each change.
 
-    `nis` and `energy` (n,) are theirs. `held` (3,): the verdict, the window's, and for how many
-    epochs the second has contradicted the first; after `patience` it takes its place. 0: the window
-    is too short for any.
+    `nis` and `energy` (n,) belong to the epochs. `held` (3,): the published verdict, the window's
+    verdict (0: too few epochs), and the number of epochs in which they differed; after `patience`
+    epochs the window's verdict is published.
     """
     turns = 0
     for i in range(new.shape[0]):
@@ -145,11 +145,11 @@ _TOO_FEW = WORDS.index("too_few")
 class ConsistencyMonitor:
     """Sliding window over the innovations of one kind of measurement of one source.
 
-    Give it what the filter fused, in order. A changed dimension m starts over. `verdict` changes
-    once the window's has differed from it for half a window of epochs in a row: neighbouring
-    windows share their innovations, so a chance excess lasts, but seldom that long. Memory and
-    work are bounded: K + 8 rows; O(m) an epoch, and once in K + 8 epochs the sums are formed anew,
-    so that rounding cannot pile up.
+    Input: innovations of fused measurements, in order. A changed dimension m restarts the window.
+    `verdict` changes once the window's verdict has differed from it for half a window of epochs in
+    a row: neighbouring windows share innovations, so a chance excess lasts, but seldom that long.
+    Memory and work are bounded: K + 8 rows; O(m) an epoch, and once in K + 8 epochs the sums are
+    recomputed, so that rounding errors do not accumulate.
     """
 
     def __init__(self, options: ConsistencyOptions | None = None) -> None:
@@ -186,7 +186,7 @@ class ConsistencyMonitor:
         return word(int(self._held[1]), self.options.shared)
 
     def add(self, nu: Array, s: Array | None = None) -> None:
-        """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
+        """Add an innovation (m,): whitened, or unwhitened with its covariance `s` (m, m).
 
         Raises ValueError when the paper's form is asked for and `s` is missing.
         """
@@ -206,7 +206,8 @@ class ConsistencyMonitor:
         self, rows: Array, nis: Array, energy: Array | None = None
     ) -> list[tuple[int, Verdict]]:
         """Add innovations (n, m) of successive epochs with known NIS and energy (n,), which are
-        equal if whitened: `add` without its checks. Epochs and new verdicts of each change."""
+        equal if whitened: `add` without its checks. Returns the epoch and the new verdict of each
+        change."""
         energy = nis if energy is None else energy
         finite = np.isfinite(nis + energy)
         if not finite.all():
@@ -248,7 +249,7 @@ class ConsistencyMonitor:
         return found
 
     def report(self) -> Consistency:
-        """The figures of the window and the verdict; changes nothing."""
+        """Figures of the window and the verdict."""
         o, k = self.options, self.k
         if k < FEWEST:
             return replace(TOO_FEW, k=k, dof=k * self._m, alpha=o.alpha)

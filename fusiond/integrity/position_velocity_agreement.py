@@ -2,8 +2,8 @@ r"""Agreement of an excluded device's positions with its velocities.
 
     |p_k - p_(k-1) - (v_k + v_(k-1)) h / 2| <= 4 sqrt(2 s_p^2 + s_v^2 h^2 / 2)        north and east
 
-Four sigma, each time: what fits for five fixes in a row is one story. What a turn within the
-interval adds is h^2 a_t / 12, centimetres at a fix a second.
+The limit is four sigma for each fix; five fixes in a row within it agree. A turn within the
+interval adds h^2 a_t / 12, centimetres at a fix a second.
 """
 
 from __future__ import annotations

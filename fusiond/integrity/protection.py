@@ -1,27 +1,27 @@
-r"""Protection levels of a filter by solution separation: how far off it may be, at a stated risk.
+r"""Protection levels of a filter by solution separation, at a stated risk.
 
-Modes: no fault (k = 0), and a fault of device k, of any size, shape and duration, against which
-stands the solution without that device (fusiond.estimators.separation). For each axis q
+Modes: no fault (k = 0), and a fault of device k, of any size, shape and duration. The solution x_k
+without that device is free of it (fusiond.estimators.separation). For each axis q
 
     T_k = K_fa sqrt([P_k - P_0]_qq),   K_fa = Q^-1(P_fa / (2 A N n)),   T_0 = 0
 
-with A axes, N modes and n independent samples an hour. Whatever the device did,
+with A axes, N modes and n independent samples an hour. For any fault of the device,
 
     |error of x_0| <= |x_k - x_0| + |error of x_k|
 
-so with the separation below T_k the level PL* of the first equation holds, and the last one always:
+so PL* of the first equation bounds the error if the separation is below T_k, and PL of the second
+always:
 
     sum_k 2 p_k Q((PL* - T_k) / sigma_k) = (R - P_not_monitored) share_q / n,    p_0 = 1
     PL = max over k of  max(T_k, |x_k - x_0|_q) + PL* - T_k
 
 R is the integrity risk of an hour, half of it for the vertical, a quarter for north and east each;
 HPL^2 = PL_n^2 + PL_e^2. p_k is the probability that device k is at fault at some time of the hour.
-As what is taken from the data is the separation alone, and no choice of what to believe, the bound
-holds when the fault is not noticed, when it is, and after its exclusion. Two devices at fault in
-the same hour are not monitored: p_j p_k of each pair comes off R, and nothing is left where that
-is more than R.
+The bound uses only the separation and does not depend on any decision, so it holds before the fault
+is detected, when it is, and after its exclusion. Two devices at fault in the same hour are not
+monitored: p_j p_k of each pair is subtracted from R; if that exceeds R there is no bound.
 
-The terms are two-sided, where the Working Group C algorithm (fusiond.integrity.araim) has Q for
+The terms are two-sided, while the Working Group C algorithm (fusiond.integrity.araim) has Q for
 faults: a fault leaves x_k's error symmetric, and 2 Q needs no argument about the fault's sign.
 
 Source: Brenner, NAVIGATION 43 (1996), 111; Blanch et al., IEEE Trans. AES 51 (2015), 713, eq. 20
@@ -62,7 +62,7 @@ class IntegrityRisk:
 
     @property
     def monitored(self) -> float:
-        """The risk that is left when simultaneous faults have had theirs; may be negative."""
+        """Integrity risk minus the probability of simultaneous faults; may be negative."""
         return self.risk - sum(math.prod(pair) for pair in combinations(self.priors, 2))
 
 
@@ -74,8 +74,8 @@ class Level(NamedTuple):
 
 
 def axis_level(variance: Array, separation: Array, share: float, limits: IntegrityRisk) -> Level:
-    """The level of an axis: `variance` (1 + k,) m^2 of all measurements and of the subsets,
-    `separation` (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
+    """Protection level of an axis: `variance` (1 + k,) m^2 of all measurements and of the subsets,
+    `separation` (k,) m of the subsets, `share` of the risk. Infinite if there is no bound."""
     sigma = np.sqrt(variance)
     k_fa = -gaussian_quantile(
         limits.false_alarm
@@ -91,8 +91,8 @@ def axis_level(variance: Array, separation: Array, share: float, limits: Integri
 
 
 class FilterProtection(NamedTuple):
-    """Horizontal and vertical protection level (m; vertical None where the model holds the height;
-    infinite where there is no bound), and the devices (k,) whose solution is apart."""
+    """Horizontal and vertical protection level (m; vertical None if the model holds the height;
+    infinite without a bound), and the devices (k,) whose separation is beyond the threshold."""
 
     hpl_m: float
     vpl_m: float | None

@@ -1,4 +1,4 @@
-"""Findings, and those of them that may still exclude a series."""
+"""Findings, and the faults that still exclude a series."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from fusiond.integrity.series_states import MOST_EVIDENCE
 
 
 class Finding(NamedTuple):
-    """An identified hypothesis: its kind, when (ns) it was, and since when (s); its size and one
-    sigma of each number in the kind's unit; log odds."""
+    """Identified hypothesis: kind, instant of identification (ns), time since onset (s), size and
+    one sigma of each number in the kind's unit, log odds."""
 
     kind: Kind
     t_ns: int
@@ -38,27 +38,27 @@ class Finding(NamedTuple):
 
 
 class Lasting(NamedTuple):
-    """Faults that may still exclude a series, and the log likelihood by which each has been worse
-    than the best since."""
+    """Faults that may still exclude a series, each with its log likelihood below that of the
+    best."""
 
     findings: tuple[Finding, ...] = ()
     worse: tuple[float, ...] = ()
 
     @staticmethod
     def of(findings: Iterable[Finding]) -> Lasting:
-        """Faults of `findings` that fit alike."""
+        """Faults of `findings` with similar likelihoods."""
         found = tuple(findings)
         return Lasting(found, (0.0,) * len(found))
 
     @property
     def shares(self) -> list[float]:
-        """Probability of each, if one of them lasts."""
+        """Probability of each fault, given that one of them lasts."""
         shares = [math.exp(min(self.worse) - w) for w in self.worse]
         return [share / sum(shares) for share in shares]
 
     def judged(self, nis: Sequence[float]) -> Lasting:
-        """Faults after one more innovation, with chi-square `nis` (k,) under each of them. A fault
-        a thousand times less likely than another one is dropped."""
+        """Faults after one more innovation with chi-square `nis` (k,) under each. A fault that is a
+        thousand times less likely than another is dropped."""
         best = min(nis)
         worse = [
             w + 0.5 * min(one - best, MOST_EVIDENCE) for w, one in zip(self.worse, nis, strict=True)
@@ -67,6 +67,6 @@ class Lasting(NamedTuple):
         return Lasting(tuple(self.findings[k] for k in kept), tuple(worse[k] for k in kept))
 
     def without(self, over: Lasting) -> Lasting:
-        """Remaining faults without those that are over."""
+        """Faults without the ended ones."""
         kept = [k for k, finding in enumerate(self.findings) if finding not in over.findings]
         return Lasting(tuple(self.findings[k] for k in kept), tuple(self.worse[k] for k in kept))

@@ -1,28 +1,28 @@
 r"""Service of measurement series: one table of states, with named transitions.
 
-A series is what one source says of one thing (`gnss`, `gnss_velocity`).
+A series is all measurements of one kind from one source (`gnss`, `gnss_velocity`).
 
     nominal      its measurements are fused
     suspected    the last one failed its gate
-    out          they are looked at, not fused
-    probation    fused again, after they were out
+    out          they are compared with the published solution, not fused
+    probation    fused again after an exclusion
 
     from                  to           when
     nominal               suspected    `gate`: a measurement fails
     suspected             nominal      one passes
     suspected             out          the third in a row fails, and no fault of the inertial unit
                                        explains it
-    probation             out          a measurement fails: what was wrong comes again
-    any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
-                                       itself to the bit while the vehicle moves
-    out                   probation    `READMIT_COUNT` in a row pass against what is published, and
-                                       the fault for which it is out is likelier over than not; one
-                                       that repeated itself says something new each time. Whether
-                                       a fault is over is asked of all that it has spoiled
+    probation             out          a measurement fails: the fault is back
+    any in service        out          a hypothesis that spoils it is `identified`; or it `repeats`
+                                       itself bit for bit while the vehicle moves
+    out                   probation    `READMIT_COUNT` in a row pass against the published solution,
+                                       and the excluding fault is likelier over than not, by the
+                                       innovations of all series that it has spoiled; a series that
+                                       repeated itself has a new value each time
     probation             nominal      it has been in service for as long as it was out
 
-Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
-four sigma lasts are one case in a thousand. Time alone re-admits nothing.
+Three failures of a gate of 0.9999 in a row have a probability of 1e-12; five passes while a fault
+of four sigma lasts, one in a thousand. Time alone re-admits no series.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class Series:
         return other
 
     def received(self, t_ns: int) -> None:
-        """Note an arrival."""
+        """Record an arrival."""
         if t_ns - self.received_ns > FORGET_NS:
             self.failed = self.passed = self.repeats = 0
             if self.state is Service.SUSPECTED:
@@ -147,7 +147,7 @@ class Series:
         self.over = 0.0  # what was shown of an earlier fault's end says nothing of this one's
 
     def gated(self, t_ns: int, explained: bool) -> None:
-        """Note a gate failure of a series in service; `explained`: by a fault of the inertial
+        """Record a gate failure of a series in service; `explained`: by a fault of the inertial
         unit."""
         self.failed += 1
         again = self.state is Service.PROBATION
@@ -159,7 +159,7 @@ class Series:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
 
     def fused(self, t_ns: int, whitened: tuple[float, ...]) -> None:
-        """Note a pass of the gate, with the whitened innovation."""
+        """Record a pass of the gate with the whitened innovation."""
         rows = len(whitened)
         if 0 < rows <= 3:
             y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
@@ -178,12 +178,12 @@ class Series:
     ) -> None:
         """Compare a measurement of an excluded series with the published solution. `lasting`:
         increase of the innovation's chi-square if the excluding fault lasts; NaN if unknown.
-        `others`: log likelihood that the fault is over, by its other series. `limit`: chi-square
-        that innovations without noise show of it.
+        `others`: log likelihood that the fault is over, by its other series. `limit`: chi-square of
+        the fault in innovations without noise.
 
-        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which. The
-        solution's own error is common to all innovations of a series that is not fused: many of
-        them say no more than `limit`.
+        A fault is over with prior probability 1 - exp(-t / `LASTS_S`), which the innovations
+        update. The solution's own error is common to all innovations of a series that is not fused:
+        many of them are no more evidence than `limit`.
         """
         if self.unchanged and self.reason == REPEATS:
             passes = False
@@ -210,11 +210,11 @@ class Series:
 
     @property
     def stale(self) -> bool:
-        """True if the last position was the one before it once more."""
+        """True if the last position equals the one before."""
         return self.locates and self.repeats > 0
 
     def went_on(self, t_ns: int, value: object, moved: int) -> None:
-        """Note several arrivals of a nominal series, the last at `t_ns`, without repeated values;
+        """Record several arrivals of a nominal series, the last at `t_ns`, without repeated values;
         `value` is None for a constraint. The vehicle moved at `moved` of them."""
         self.received_ns = t_ns
         if value is None:
@@ -224,8 +224,8 @@ class Series:
             self.repeating += -self.repeating / REPEATS_KEPT
 
     def repeats_itself(self, value: object, moving: bool) -> bool:
-        """True if values repeat to the bit too often for a measurement of a `moving` vehicle. At
-        rest values may repeat."""
+        """True if values repeat bit for bit too often for a `moving` vehicle. At rest values may
+        repeat."""
         self.unchanged = value == self.value
         same = moving and self.unchanged
         self.value, self.repeats = value, self.repeats + 1 if same else 0
@@ -243,7 +243,8 @@ _EACH = attrgetter(*(each.name for each in fields(Series)))
 
 
 class ServiceTable:
-    """Series of all sources by name, and how those of a device agree that is or was excluded."""
+    """Series of all sources by name, and the agreement of positions and velocities of each device
+    that is or was excluded."""
 
     def __init__(self) -> None:
         self._series: dict[str, Series] = {}
@@ -259,7 +260,7 @@ class ServiceTable:
 
     @property
     def excluded(self) -> dict[str, str]:
-        """Series that are out, and why."""
+        """Excluded series with the reason."""
         return {name: s.reason for name, s in self._series.items() if s.out}
 
     @property

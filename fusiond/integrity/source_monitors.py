@@ -34,15 +34,15 @@ class _Series:
 
 
 class Verdicts:
-    """Feeds the innovations that were fused to their sources' monitors.
+    """Monitors of all sources, fed with the innovations of fused measurements.
 
     A measurement may hold several series (`AidingMeasurement.series`), each with a monitor of its
     own: a receiver's raw epochs have one for each satellite system, `<source>_<system>`.
 
-    Innovations are stored on arrival and judged together by `report`, since a run of minutes
-    through files has hundreds of them at once. `on_change(source, verdict)` then receives changed
-    verdicts. Constraints are not judged. Errors that a source's measurements share through states
-    of `model` show in no innovation (`AidingMeasurement.shares`).
+    Innovations are stored on arrival and judged together by `report`: a run through files brings
+    hundreds of them at once. `on_change(source, verdict)` then receives changed verdicts.
+    Constraints are not judged. Errors that a source's measurements share through states of `model`
+    are not visible in innovations (`AidingMeasurement.shares`).
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class Verdicts:
         """Changed verdicts not yet reported, with the number of the innovation."""
 
     def judge(self, measurement: AidingMeasurement, outcome: Outcome) -> None:
-        """A measurement has been fused; to be called once for each, though a rewind brings it
-        again."""
+        """Store a fused measurement's innovation; to be called once for each, even if a rewind
+        fuses it again."""
         if measurement.constraint or not outcome.whitened:
             return
         if not measurement.screened:
@@ -108,7 +108,7 @@ class Verdicts:
                     self._turned.append((numbers[row], source, verdict))
 
     def reset(self) -> None:
-        """Restart with the filter: earlier innovations are no evidence on it."""
+        """Restart with the filter; earlier innovations say nothing about the new start."""
         self.waiting.clear()
         self._turned.clear()
         for series in self._series.values():

@@ -1,7 +1,7 @@
 """Assembly of a navigator from a configuration: model, estimator, IMU buffer.
 
-A new estimator is one module in `fusiond.estimators` and one case here; nothing else knows which
-one runs. Each is imported where it is asked for: loading its kernels takes a start's time.
+A new estimator is one module in `fusiond.estimators` and one case here; no other module knows which
+one runs. Each is imported on demand, as loading its kernels takes long.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 def model_of(config: Config, *extra: Block) -> Model:
     """Error-state model of a configuration, with the blocks that its measurements need.
 
-    Optional blocks are left out where there is no room for them.
+    Optional blocks are dropped if there is no room for them.
 
-    Raises `ConfigError` where those are more states than the kernels hold.
+    Raises `ConfigError` for more states than the kernels hold.
     """
     name, noise = config.estimator.model, imu_noise(config.imu)
     return fitting(config, extra, lambda blocks: make_model(name, noise, *blocks))
@@ -46,7 +46,7 @@ def model_of(config: Config, *extra: Block) -> Model:
 def fitting(
     config: Config, extra: Sequence[Block], make: Callable[[Sequence[Block]], Model]
 ) -> Model:
-    """Model that `make` gives of the blocks for which there is room, as `model_of`."""
+    """Model by `make` of the blocks for which there is room, as in `model_of`."""
     try:
         return make(extra)
     except TooManyStatesError as error:
@@ -72,7 +72,7 @@ def _wanders(_: Config, block: Block) -> bool:
 
 
 def _carriers(_: Config, block: Block) -> bool:
-    """True if a block is of the carriers' anchor: without it Dopplers serve."""
+    """True for the block of the carriers' anchor; without it Dopplers are used."""
     return block.name in (CARRIER_ANCHOR, CARRIER_CLOCK)
 
 
@@ -115,8 +115,8 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
 def imu_buffer_of(config: Config, model: Model) -> ImuBuffer:
     """Buffer of IMU samples, with their observed noise.
 
-    That is of vibration, of axes out of square, and of scale factors that the model has no states
-    for."""
+    The noise includes vibration, axes out of square, and scale factors without states in the
+    model."""
     imu, noise = config.imu, imu_noise(config.imu)
     period_s, misalignment = 1.0 / imu.rate_hz, imu.misalignment_deg * DEG
     left_out = (0.0, 0.0) if model.scale_factors else (noise.rate_scale, noise.force_scale)
@@ -142,8 +142,8 @@ def verdicts_of(config: Config, model: Model, on_event: Callable[[str, str], Non
 
 
 def estimator_without_imu(config: Config, model: Model, gap_s: float) -> Estimator:
-    """The estimator of a vehicle without an inertial unit: `federated` with a local filter for each
-    receiver where the configuration says so, else the Kalman filter."""
+    """Estimator of a vehicle without an inertial unit: `federated`, with a local filter for each
+    receiver, if configured; else the Kalman filter."""
     if config.estimator.filter == "federated":
         names = config.estimator.federated.sources or tuple(config.aiding)
         received = tuple(name for name in names if name in config.positioning)

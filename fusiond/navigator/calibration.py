@@ -1,22 +1,21 @@
 """Calibration parameters: mounting, lever arms, offsets in time, scales, as the filter knows them
 now.
 
-A parameter is told in the units that the configuration takes (deg, m, s, a ratio), as what lies
-beyond the value configured there, with one sigma and one of three states:
+A parameter is published in the units of the configuration (deg, m, s, a ratio), as the difference
+from its configured value, with one sigma and one of three states:
 
-    not observed   the sigma is still that of the configuration: the vehicle has not shown it
+    not observed   sigma is still that of the configuration: the motion has not shown it
     observed       better known than configured, and still moving or still wide
     settled        a fifth of the configured sigma or less, and the value has stayed for a minute
 
 An estimate of sigma s from a prior of sigma p holds the share (s / p)^2 of the prior's mean: at a
-fifth 4 %, so a settled value is the drive's and not the owner's. Where s is above 0.9 p, the drive
-has said less than a quarter of what the prior had said already.
+fifth 4 %, so a settled value is the drive's and not the owner's. If s is above 0.9 p, the drive has
+given less than a quarter of the prior's information.
 
-The estimates of a constant are a martingale: from one instant to a later one they move by an amount
-of variance P_1 - P_2, what has been learned meanwhile, and not more. An angle of the mounting that
-has moved by `TURNED_SIGMAS` of that is none: the unit has turned in the vehicle, and P of attitude
-and mounting knows nothing of it. Only the yaw is judged so. A turn about the other axes takes
-gravity along, which is felt at once.
+The estimates of a constant are a martingale: between two instants they move by an amount of
+variance P_1 - P_2, the information gained. A mounting angle that moves by `TURNED_SIGMAS` of that
+is no constant: the unit has turned in the vehicle, which P of attitude and mounting does not
+include. Only the yaw is tested so; a turn about another axis shows at once by gravity.
 """
 
 from __future__ import annotations
@@ -156,7 +155,7 @@ def calibration_slots(model: Model) -> list[Slot]:
 
 
 def _published(block: Block, state: str) -> str:
-    """A state's name outside: `mounting_pitch_deg`, `wheel_scale`."""
+    """Published name of a state: `mounting_pitch_deg`, `wheel_scale`."""
     name = f"{block.name}_{state}" if len(block.states) > 1 else block.name
     return name + UNIT_SUFFIX[block.unit]
 
@@ -165,8 +164,8 @@ class CalibrationWatch:
     """Watch of the calibration in a filter of `model`; `on_event(code, text)` receives `calibrated`
     for each settled parameter, and for the last.
 
-    `misalignment_rad` is one sigma of what the IMU's axes are out of square by: to no more than
-    that can anybody say how it is mounted.
+    `misalignment_rad` is one sigma of the IMU axes' deviation from square, the least sigma of any
+    mounting angle.
     """
 
     def __init__(
@@ -199,14 +198,14 @@ class CalibrationWatch:
         """Parameters at the last look; empty before the filter has run."""
 
     def corrected(self) -> None:
-        """Note a correction of the state for a fault: earlier mounting angles no longer show a
-        turn."""
+        """Record a correction of the state for a fault: earlier mounting angles are no longer
+        comparable."""
         self._known[:] = False
         self.turned = None
 
     @property
     def settled(self) -> bool:
-        """True if all that is estimated has settled."""
+        """True if all estimated parameters have settled."""
         return bool(self.parameters) and all(
             p.state is CalibrationState.SETTLED for p in self.parameters
         )

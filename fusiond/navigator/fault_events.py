@@ -1,4 +1,4 @@
-"""Events of faults and of service: told once each, as timeline and estimator find them."""
+"""Events of faults and of service, reported once each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ServiceEvents:
 
         Events: `sensor_fault` for each step that was corrected, `fault_over` for a source's fault
         that the solution had followed, `isolated` and `readmitted` for each series that has left
-        service or is back."""
+        service or returned."""
         diagnosis, found = self._timeline.diagnosis, False
         for finding in diagnosis.findings:
             key = finding.kind.name, finding.kind.device

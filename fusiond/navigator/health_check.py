@@ -1,7 +1,7 @@
 """Unexpected failures: a measurement that raises, a filter with values that are not finite.
 
-An exception costs the measurement that raised it, never the tick. A filter that has lost its
-numbers never gets them back: it is started anew.
+An exception costs the measurement that raised it, never the tick. A filter with values that are not
+finite is restarted, as it cannot recover.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
 def broken(estimator: Estimator) -> str:
     """Name of the first part of the filter's state that is not finite.
 
-    An update carries a covariance that is none to its diagonal.
+    An update spreads an invalid covariance to its diagonal, which is checked.
     """
     what = first_not_finite(estimator.nav, estimator.xi, estimator.covariance)
     return f"{_STATE[what]} not finite"
@@ -33,7 +33,7 @@ class FailedMeasurements:
         self._known: set[str] = set()
 
     def report(self, source: str, error: str) -> None:
-        """A measurement of `source` is `failed` for `error`."""
+        """Report a measurement of `source` that `failed` with `error`."""
         if source not in self._known:
             self._known.add(source)
             self._report("measurement_failed", f"{source} could not be used: {error}")

@@ -1,12 +1,12 @@
 """Choice of the inertial unit: the first, or the spare that takes over.
 
-The rule is that of gaps: once `gap_s` long no sample of the unit in use has been taken, whether it
-is silent, or says what cannot be true (stuck, saturated, dead: fusiond.navigator.imu_screening),
-and the spare sends, the spare is used. Its samples of that time have been kept, so that it goes on
-where the other ended. It stays until the daemon starts again: a unit that has failed once is not
-trusted until somebody has looked at it, and two that fail in turn must not take turns.
+The spare is used once it sends and no sample of the unit in use has been accepted for `gap_s`: the
+unit is silent, or its samples are invalid (stuck, saturated, dead:
+fusiond.navigator.imu_screening). The spare's samples of that time are stored, so that navigation
+continues without a gap. The spare stays in use until the daemon restarts: a unit that has failed is
+not trusted before a person has checked it, and two failing units must not alternate.
 
-All of it happens in ticks and depends on arrivals alone: a replay chooses alike.
+The choice is made in ticks and depends on arrivals alone, so a replay repeats it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ImuChoice:
             self._turn = sensor_to_body(imu).T @ sensor_to_body(own)
 
     def take(self, item: ImuSample, t_valid_ns: int) -> None:
-        """A sample has come."""
+        """Receive a sample."""
         row: Row = t_valid_ns, (*item.gyro_rad_s, *item.accel_m_s2)
         if self._spare is not None and item.source == self._spare.source:
             row = t_valid_ns, self._turned(row[1])
@@ -69,7 +69,7 @@ class ImuChoice:
 
     @property
     def may_wait(self) -> bool:
-        """True if samples wait, which may go on waiting: there is no other unit to take over."""
+        """True if samples are waiting and may wait longer: there is no spare unit."""
         return self._spare is None and bool(self._waiting)
 
     def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:
@@ -79,10 +79,10 @@ class ImuChoice:
 
     def changes(self, t_ns: int, taken_ns: int | None) -> bool:
         """True if the spare takes over in the tick at `t_ns`; `taken_ns` is the instant of the
-        newest sample that the navigator has taken, None while it has none.
+        navigator's newest accepted sample, None without one.
 
-        Two ticks in a row must say so: after a stall of the host the first may come before the
-        frames that have gathered.
+        Two ticks in a row are required: after a stall of the host the first tick may precede the
+        waiting frames.
         """
         if taken_ns is not None:
             self._taken_ns = max(self._taken_ns, taken_ns)

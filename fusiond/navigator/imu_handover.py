@@ -15,26 +15,25 @@ from fusiond.navigator.timeline import Timeline
 
 
 def publish_by_axes(estimator: Estimator, imu: Imu, spare: bool = False) -> None:
-    """Axes of publication: those that the first unit has by its data sheet: whoever has mounted
-    something by them has not moved it. The gyros tell their own, which sit askew; those of a spare
-    as well, and it elsewhere."""
+    """Publish in the first unit's nominal axes, by which other equipment is mounted. The gyros of
+    either unit measure in their own, misaligned axes."""
     mounting_deg = imu.spare.mounting_sd_deg if spare and imu.spare is not None else 0.0
     sd_rad = math.hypot(imu.misalignment_deg, mounting_deg) * DEG
     estimator.publish_by(estimator.published._replace(axes_sd_rad=sd_rad))
 
 
 def published_of_spare(estimator: Estimator, imu: Imu) -> bool:
-    """True if sigma is published as of the spare, which its mounting limits."""
+    """True if the published sigma is the spare's, limited by its mounting."""
     return estimator.published.axes_sd_rad > imu.misalignment_deg * DEG
 
 
 def hand_over(estimator: Estimator, timeline: Timeline, imu: Imu) -> None:
-    """Go on with the spare of `imu` where the filter is.
+    """Continue the filter with the spare of `imu`.
 
-    Biases, scale factors and the mounting against the vehicle were the first unit's: they are as at
-    a start, 0 with their priors and without any correlation. The body is now what the new unit says
-    it is: the attitude's variance grows by that of its mounting. The timeline begins here: the two
-    units are no one course of samples, and what a fix says of an instant before comes too late.
+    Biases, scale factors and mounting restart from their priors, 0 and uncorrelated: they belonged
+    to the first unit. The body axes are now the new unit's: the attitude's variance grows by that
+    of its mounting. The timeline restarts here: samples of two units are not one sequence, and a
+    fix of an earlier instant is too old.
     """
     assert imu.spare is not None
     model, p = estimator.model, estimator.covariance.copy()

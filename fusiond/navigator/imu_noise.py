@@ -1,9 +1,10 @@
 """Noise of an inertial unit as observed in navigation.
 
-Which share of what the samples show is noise (fusiond.navigator.imu_noise_share), and how good the
-unit is within its class (fusiond.navigator.unit_grade). Both are asked of the filter as it was
-`SETTLES_NS` ago, on a grid of time, and count for samples `COUNTS_NS` later: neither the order in
-which measurements come nor how many samples at once leaves a trace.
+Two estimates: the share of the samples' variation that is noise
+(fusiond.navigator.imu_noise_share), and the unit's grade within its class
+(fusiond.navigator.unit_grade). Both use the filter's state of `SETTLES_NS` ago, on a time grid, and
+apply to samples `COUNTS_NS` later. So neither the order of measurements nor the number of samples
+at once matters.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ STEP_NS = 1_000_000_000
 
 
 class ImuNoise:
-    """Estimate of the IMU's noise from the filter of a configuration, with the vehicle's `drifts`
-    at the same instants."""
+    """Estimator of the IMU's noise from the filter's state; evaluates the vehicle's `drifts` at the
+    same instants."""
 
     def __init__(self, model: Model, imu: Imu, drifts: DriftLevels) -> None:
         self._drifts = drifts
@@ -66,7 +67,7 @@ class ImuNoise:
         self._grade = self._unit
 
     def started(self, start: Start, estimator: Estimator, imu: ImuBuffer) -> None:
-        """The filter has been started: its unit counts as good as it was at rest."""
+        """Start with the filter: the unit has the grade that it showed at rest."""
         if self._grade is None:
             return
         self._grade.begin(start.grades)
@@ -75,19 +76,19 @@ class ImuNoise:
         self._count(estimator, imu, start.t_ns, min(axes, 1.0))
 
     def change(self) -> None:
-        """The samples from now on are a spare's: nothing tells how good the one or the other is."""
+        """Change to the spare: nothing is known of either unit's grade."""
         self._unit = None
         self.restart()
 
     def corrected(self, estimator: Estimator) -> None:
-        """A fault was taken out of the state: what is left of it is no error of a good unit's axes,
-        which are those of its class until it aligns anew."""
+        """Record the removal of a fault: the unit's axes have the class's errors until the next
+        alignment."""
         if self._grade is not None and isinstance(estimator, KalmanEstimator):
             estimator.axes_known(math.sqrt(self._square_rad2))
         self._grade = None
 
     def look(self, timeline: Timeline, imu: ImuBuffer) -> None:
-        """The filter has been run up to `due_ns` or later."""
+        """Evaluate the filter, which has reached `due_ns` or later."""
         settled_ns, vibration = timeline.estimator.t_ns - SETTLES_NS, imu.vibration
         cell = settled_ns // STEP_NS
         self.due_ns = (cell + 1) * STEP_NS + SETTLES_NS
@@ -114,7 +115,7 @@ class ImuNoise:
             self._count(timeline.estimator, imu, at_ns, grade)
 
     def _count(self, estimator: Estimator, imu: ImuBuffer, at_ns: int, grade: float) -> None:
-        """Axes are of that grade within the class, as found at `at_ns`."""
+        """Apply the grade estimated at `at_ns`."""
         square = grade * self._square_rad2
         if imu.crosstalk is not None:
             imu.crosstalk.squares.add(at_ns + COUNTS_NS, np.array([square / self._sheet_rad2]))

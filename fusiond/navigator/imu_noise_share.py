@@ -1,23 +1,21 @@
 r"""Share of the IMU noise that integrates into attitude and velocity, estimated from predictions.
 
-What engine and road shake into the samples bounds the noise of a sensor (fusiond.navigation.
-vibration). A part of it is motion that the sensors measure, and vibration that averages out later
-than the longest of those means; neither the samples nor the innovations of one fix after another
-say how much, for a filter that follows its fixes hides it. So another filter carries the state on
-for `EVERY_NS` without any measurement. With A its covariance then if the samples had no noise at
-all, A + B with the noise as it counts, and P of the filter, which has had the measurements,
+Vibration in the samples bounds the noise of a sensor (fusiond.navigation.vibration). Part of it is
+real motion, and part averages out over longer times than the bound uses. Neither the samples nor
+single innovations show how much, as a filter that follows its fixes hides it. So a second filter
+propagates the state for `EVERY_NS` without measurements. Its covariance is A without sample noise,
+A + B with the assumed noise; P is that of the filter, which uses the measurements:
 
     d = v_predicted - v,   var(d) = A + (g / g_0) B - P,        P' - P of estimates that are optimal
 
-g the share of the noise that counts and g_0 the one that has, forward, to the right and down each:
-a pitch gyro's shows forward, and road and springs pitch a vehicle otherwise than they roll it. The
-likelihood is summed up over predictions, none of which overlaps another, on a grid of g, each as
-likely at first as the next (nobody knows the size of it); E[g] is what counts. Noise of the data
-sheet counts in any case.
+g is the share to be estimated and g_0 the one in use, each forward, to the right and down: the
+noise of the pitch gyro acts forward, and road and springs pitch a vehicle differently than they
+roll it. Log likelihoods of predictions that do not overlap are summed on a grid of g with a uniform
+prior; E[g] is used. Noise of the data sheet always counts.
 
-A prediction tells nothing where the filter itself had no measurements: P is no less than `KNOWN` of
-A + B then. It is made of what was valid `SETTLES_NS` ago, when nothing comes any more that is
-earlier, so that the order of arrival leaves no trace.
+A prediction is no evidence if the filter itself had no measurements, P above `KNOWN` of A + B. It
+uses data older than `SETTLES_NS`, before which nothing arrives any more, so the order of arrival
+does not matter.
 
 Source: Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15
 (1970), for predictions over several steps; Magill, Optimal adaptive estimation of sampled
@@ -71,7 +69,7 @@ it and keeps its full value."""
 
 
 class _Predictor(KalmanEstimator):
-    """Two covariances along one state: without noise, and with the noise that counts."""
+    """Two covariances along one state: without noise, and with the assumed noise."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s, (_NOTHING, 1.0))
@@ -127,13 +125,13 @@ class NoiseShares:
             self._predictor.begin(e)
 
     def carry(self, imu: ImuBuffer, t_ns: int) -> None:
-        """The prediction on to an instant."""
+        """Propagate the prediction to an instant."""
         if self._begins_ns >= 0:
             self._predictor.propagate(imu, t_ns)
 
     def end(self, e: Estimator) -> Array | None:
-        """Judge the prediction by the filter's state at its end; the shares (6,) valid after
-        `COUNTS_NS`, None without a result."""
+        """Compare the prediction with the filter's state at its end; return the shares (6,) to use
+        after `COUNTS_NS`, None without a result."""
         p, since_ns = self._predictor, self._begins_ns
         self._begins_ns = -1
         if since_ns < 0 or e.t_ns - since_ns != EVERY_NS or p.t_ns != e.t_ns:

@@ -1,8 +1,7 @@
-"""The door of the IMU's samples: refuses what cannot be a measurement, and says when it is over.
+"""Screening of IMU samples: rejects invalid ones, and reports start and end.
 
-What is refused leaves a gap, which the filter bridges with noise for what the vehicle may have
-done. A gap that leaves more than a linear filter can bear, and an axis that is dead, end what was
-known: alignment begins anew.
+Rejected samples leave a gap, which the filter bridges with noise for the possible motion. After a
+gap too long for a linear filter, or with a dead axis, alignment restarts.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ TEXTS = {
 
 
 class Run(NamedTuple):
-    """Samples (m,) ns, (m, 6) in order; `ends` says why nothing before them counts any more."""
+    """Samples (m,) ns, (m, 6) in order; `ends`: why navigation must restart with them."""
 
     times: Stamps
     samples: Array
@@ -63,7 +62,7 @@ class Run(NamedTuple):
 
 @dataclass(slots=True)
 class _Trouble:
-    """Refusals of one name: the first and last stamp (ns), and how many."""
+    """Rejections of one name: first and last stamp (ns), and number."""
 
     first_ns: int
     last_ns: int
@@ -71,7 +70,8 @@ class _Trouble:
 
 
 class ImuScreening:
-    """Admits samples; `on_event(code, text)` receives each trouble once, and of its end."""
+    """Screening of samples; `on_event(code, text)` receives the start and the end of each
+    trouble."""
 
     def __init__(self, config: Imu, keep_s: float, on_event: Callable[[str, str], None]) -> None:
         self._config, self._event = config, on_event
@@ -86,7 +86,7 @@ class ImuScreening:
         self._troubles: dict[str, _Trouble] = {}
 
     def silence(self, silent_s: float | None) -> str:
-        """Text on a silent IMU; None: nothing that counts."""
+        """Text on a silent IMU; None if it is not silent."""
         last = max(self._troubles.items(), key=lambda t: t[1].last_ns, default=None)
         why = "" if last is None else f": {TEXTS[last[0]]}"
         if silent_s is None:
@@ -94,7 +94,7 @@ class ImuScreening:
         return reason("imu_silent", seconds=silent_s) + why
 
     def restarts(self, imu: ImuBuffer) -> bool:
-        """True if stamps went back for good; the next stamp may then be any."""
+        """True if stamps went back for good; any next stamp is then accepted."""
         stuck_s = imu.backward_in_a_row / self._config.rate_hz
         if stuck_s <= self._config.gap_s:
             return False
@@ -106,8 +106,8 @@ class ImuScreening:
         return True
 
     def arrived(self, seen_ns: int, imu: ImuBuffer) -> bool:
-        """Something else has arrived at `seen_ns`; True if stamps lie ahead of that for long: no
-        sample can be of an instant that has not come."""
+        """Compare the stamps with another arrival at `seen_ns`; True if they have been ahead of
+        arrivals for long, which no valid sample can be."""
         self._arrived_ns = seen_ns
         if not imu.end or imu.latest_ns <= seen_ns + AHEAD_NS:
             self._ahead_ns = 0 if imu.end else self._ahead_ns
@@ -125,15 +125,15 @@ class ImuScreening:
         return True
 
     def look_behind(self, imu: ImuBuffer) -> bool:
-        """Compare the newest sample with what has arrived, once all that has come is in `imu`; True
-        if it is too old to navigate by, and so to start by: its stamps have gone back."""
+        """Compare the newest sample with other arrivals, once all samples are in `imu`; True if it
+        is too old to navigate: its stamps have gone back."""
         if self._arrived_ns and imu.end:
             self._lags = self._arrived_ns - imu.latest_ns > self._config.gap_s * 1e9
             self._arrived_ns = 0
         return self._lags
 
     def change(self) -> None:
-        """Reset for another unit: what was seen of the first says nothing of it."""
+        """Reset for another unit."""
         self._check.restart()
         self._troubles.clear()
 
@@ -142,8 +142,8 @@ class ImuScreening:
     ) -> Iterator[Run]:
         """Select the samples for `imu`, in runs between gaps too long for navigation.
 
-        Refusals are counted in `imu.counters`. Before navigation nothing is known of what the
-        vehicle did in a gap: any beyond `gap_s` ends what the alignment has collected.
+        Rejections are counted in `imu.counters`. Before navigation the motion in a gap is unknown:
+        one beyond `gap_s` discards the evidence of the alignment.
         """
         if len(times):
             self._newest = times[-1:]
@@ -204,7 +204,7 @@ class ImuScreening:
         return ends
 
     def _trouble(self, name: str, times: Stamps, count: int, text: str = "") -> bool:
-        """Refusals of a name, at `times`; whether that is news."""
+        """Record rejections of a name at `times`; True if they are new."""
         known = self._troubles.get(name)
         news = known is None
         if known is None:

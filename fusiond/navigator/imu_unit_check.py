@@ -1,17 +1,17 @@
 r"""Check of the IMU's units, in a file as in a running vehicle.
 
-Specific force. Its magnitude is that of gravity in the median, whatever the vehicle does; another
-unit shows as its factor. Rates are held against the course of the fixes: between two fixes of a
-vehicle that moves, the yaw rate's integral is the change of course,
+Specific force: its median magnitude is gravity under any motion; another unit shows as a factor.
+Rates are compared with the course of the fixes: between two fixes of a moving vehicle the yaw
+rate's integral is the change of course,
 
     k = sum(dpsi_gyro dpsi_course) / sum(dpsi_course^2),
 
 1 for rad/s and 180 / pi for deg/s.
 
-Where there are positions alone, the way between them is asked (fusiond.navigator.rate_unit_check).
+With positions alone, the path between them is used (fusiond.navigator.rate_unit_check).
 
-Until the way has turned nobody can tell. What can be seen of rates in deg/s is their bias, which is
-57 times what it is, too: while it is none that the data sheet allows, nothing is vouched for.
+Before the path has turned, the unit is unknown. Rates in deg/s then show only by their bias, which
+is 57 times too large: while it exceeds the data sheet, the solution counts as unproven.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def force_unit(magnitude: float) -> str | None:
 
 
 def other_unit(magnitude: float) -> tuple[str, float] | None:
-    """Unit in which forces of this magnitude are gravity, and its size in m/s^2."""
+    """Unit in which a force of this magnitude is gravity, and its size in m/s^2."""
     for name, factor in FORCE_UNITS.items():
         if FORCE_RANGE[0] <= magnitude * factor / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
             return name, factor
@@ -79,7 +79,7 @@ def rms_unit(rms_rad_s: float) -> str | None:
 
 
 class CourseTurns:
-    """Turns by the gyro against those by a receiver's course: k of the module's docstring."""
+    """Ratio k of the gyro's turns to those of a receiver's course."""
 
     def __init__(self) -> None:
         self._last: tuple[int, float] | None = None
@@ -123,7 +123,7 @@ class CourseTurns:
         return abs(self._product / self._square)
 
     def said(self) -> str | None:
-        """Text on the rates; None where they fit, or nobody can tell."""
+        """Text on wrong rates; None if they fit or are undecided."""
         if not self.decided or not DEGREES_RANGE[0] <= (factor := self._factor) <= DEGREES_RANGE[1]:
             return None
         return reason("rate_turns", factor=factor)
@@ -134,8 +134,8 @@ class CourseTurns:
 
 
 class RateUnits:
-    """Check of a running vehicle's rates. `wrong` is the sentence while they are in another unit,
-    by the last turns of 30 deg, the last chord or the last ten seconds with evidence.
+    """Check of a running vehicle's rates. `wrong`: text on rates in another unit, by the last turns
+    of 30 deg, the last chord or the last ten seconds with evidence.
 
     `bias_sd` (rad/s) is one sigma of the data sheet's. `on_event(code, text)` receives `imu_units`
     and `imu_units_well`.
@@ -149,7 +149,7 @@ class RateUnits:
         self.change()
 
     def change(self) -> None:
-        """The samples from now on are another sensor's."""
+        """Reset for another sensor."""
         self.wrong: str | None = None
         self.fits = False
         """True if the rates are known to be in rad/s."""
@@ -182,7 +182,7 @@ class RateUnits:
         return (None, 1.0) if found is None else (found, worst)
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
-        """Take the samples from row `new` on."""
+        """Process the samples from row `new` on."""
         count = imu.end - new
         if not count:
             return
@@ -220,7 +220,7 @@ class RateUnits:
             turns.restart()
 
     def _weigh(self, way: WayTurns) -> None:
-        """A way has gone on: what it tells of the unit."""
+        """Judge the unit by the continued path."""
         evidence = way.log_odds()
         if abs(evidence) <= PROOF:
             return
@@ -238,8 +238,7 @@ class RateUnits:
 
 
 def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:
-    """Yaw (rad) by the gyro between two instants; NaN where samples are not there any more, or not
-    yet."""
+    """Yaw (rad) by the gyro between two instants; NaN if samples are missing."""
     if not imu.end or begin_ns < imu.oldest_ns or end_ns > imu.latest_ns:
         return math.nan
     rows = slice(imu.index_after(begin_ns), imu.index_after(end_ns))

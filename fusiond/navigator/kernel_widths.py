@@ -6,6 +6,5 @@ from fusiond.navigator.navigator import Navigator
 
 
 def kernel_widths(navigator: Navigator) -> set[int]:
-    """Row widths of its filter's covariance, and of the one that navigates without an inertial
-    unit."""
+    """Row widths of the covariances, with and without an inertial unit."""
     return {navigator.model.width, navigator.without_imu.model.width}

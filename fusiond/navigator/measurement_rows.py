@@ -35,9 +35,9 @@ _PADDING = [bytes(max(0, 8 * (SIZE - BODY) - count)) for count in range(8 * (SIZ
 
 @dataclass(slots=True, eq=False)
 class Span:
-    """A series' part of a batch: its number, what its rows are and its device to the bank, and what
-    is asked of them; of which batch it is, instant and value of the last, and at how many the
-    vehicle moved."""
+    """Constants of a series for a batch: its number, and the bank's codes of its rows, its device
+    and its measurement; of the present batch the instant and value of the last measurement, and the
+    number in motion."""
 
     constants: tuple[int, int, int, int]
     batch: int = 0
@@ -48,7 +48,7 @@ class Span:
 
 
 class MeasurementRows:
-    """Rows for one estimator; none for one that takes measurements one by one."""
+    """Rows for one estimator; none for an estimator without batches."""
 
     def __init__(self, estimator: Estimator) -> None:
         self._bank = estimator.hypotheses if estimator.runs else None
@@ -62,7 +62,7 @@ class MeasurementRows:
 
     def packed(self, measurement: AidingMeasurement) -> tuple[bytes, object, Span | None]:
         """Row of a measurement, the value that a frozen sensor would repeat, and the span of its
-        source; empty for a measurement without a row."""
+        source; empty without a row."""
         bank = None if measurement.robust else self._bank
         packed = None if bank is None else measurement.packed(self._model)
         if bank is None or packed is None:

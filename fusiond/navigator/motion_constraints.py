@@ -1,4 +1,4 @@
-"""Measurements from the IMU alone: the vehicle stands, or at least does not slide."""
+"""Measurements from the IMU alone: standstill and no slip."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NO_SLIDING = "non_holonomic"
 
 
 class Sensed(NamedTuple):
-    """The windows that have ended, and the measurements that hold."""
+    """Ended windows, and the measurements that hold."""
 
     windows: list[Window]
     measurements: list[AidingMeasurement]
@@ -52,8 +52,8 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
 class ConstraintMaker:
     """Maker of the constraints of `[constraints]` from samples in chunks of any size.
 
-    `noise` is the IMU's; `rest_evidence` hears of what is measured; `drifts` say how much of the
-    typed side drift and its white noise counts.
+    `noise` is the IMU's; `rest_evidence` receives the measurements; `drifts` scale the configured
+    side drift and its white noise.
     """
 
     def __init__(self, options: Constraints, noise: ImuNoise, drifts: DriftLevels) -> None:
@@ -63,7 +63,7 @@ class ConstraintMaker:
         self._last_cell = -1
 
     def feed(self, imu: ImuBuffer, new: int) -> Sensed:
-        """The samples from row `new` on have come."""
+        """Process the samples from row `new` on."""
         windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
         if windows:
             self.rest_evidence.catch_up()

@@ -1,7 +1,7 @@
 """The navigator: samples and measurements in, solution out. A function of its arrivals alone.
 
-It holds no clock and does no I/O. `add_imu` and `add` take what has arrived, `advance` runs the
-filter as far as the IMU reaches, `solution` reads the state at an instant.
+It has no clock and no I/O. `add_imu` and `add` receive arrivals, `advance` runs the filter up to
+the last IMU sample, `solution` reads the state at an instant.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Navigator:
         return SavedNoise(utc_s, self._intake.fixes_shown, *of_samples, *of_vehicle)
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
-        """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
+        """Set `gate_probability` by section of `aiding`; verdicts restart, as they depend on it."""
         self._intake.set_gates(gates)
         self.verdicts = verdicts_of(self.config, self.model, self._event)
         self.outcome_watch.verdicts = self.verdicts
@@ -169,8 +169,8 @@ class Navigator:
         """Add IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; returns the
         number used.
 
-        What cannot be true is refused by name; what leaves too much unknown ends the navigation:
-        alignment begins anew (fusiond.navigator.imu_screening).
+        Invalid samples are rejected by name; after too long a gap alignment restarts
+        (fusiond.navigator.imu_screening).
         """
         taken = 0
         for run in self._screening.admit(times, samples, self.imu, self.started is not None):
@@ -184,7 +184,7 @@ class Navigator:
         return taken
 
     def change_imu(self) -> None:
-        """The samples from now on are the spare's (fusiond.navigator.imu_handover)."""
+        """Change to the spare inertial unit (fusiond.navigator.imu_handover)."""
         self._screening.change()
         self._units.change()
         self._imu_noise.change()
@@ -201,7 +201,7 @@ class Navigator:
         self.reset(why, saved)
 
     def _sense(self, taken: int) -> None:
-        """The newest samples have come: what they say by themselves."""
+        """Derive constraints and standstill from the newest samples."""
         new = max(0, self.imu.end - taken)
         sensed = self._constraints.feed(self.imu, new)
         self._units.samples(self.imu, new)
@@ -218,7 +218,7 @@ class Navigator:
     def add(
         self, m: Measurement | RawGnssEpoch, t_ns: int, sd_time_s: float = 0.0, seen_ns: int = 0
     ) -> str:
-        """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
+        """Add a measurement valid at `t_ns`; returns `accepted` or the name of its rejection."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self.outcome_watch.refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
@@ -318,7 +318,7 @@ class Navigator:
             self._calibrate()
 
     def _begin(self) -> bool:
-        """Start the filter if the alignment is ready; False while it is not."""
+        """Start the filter if the alignment is ready; False otherwise."""
         if self._screening.look_behind(self.imu):
             return False
         start = self.trial.first(self.imu) or self._aligner.attempt(self.imu)
@@ -341,7 +341,7 @@ class Navigator:
         return True
 
     def _calibrate(self) -> None:
-        """Look at the calibration; one that was taken up and proves wrong is given up."""
+        """Update the calibration; drop a restored one that proves wrong."""
         e, watch = self.estimator, self.calibrating
         if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
@@ -351,8 +351,8 @@ class Navigator:
             self.reset(reason("calibration_wrong", what=wrong))
 
     def _start_is_too_old(self) -> bool:
-        """True if a receiver is found to be late; alignment then begins anew, by its last fixes at
-        the instants at which they were true."""
+        """True if a receiver is found to be delayed; alignment then restarts with its last fixes at
+        their corrected instants."""
         found = self._latency.look(self.imu)
         if found is None:
             return False
@@ -362,12 +362,12 @@ class Navigator:
         return True
 
     def solution(self, t_ns: int) -> Solution:
-        """The solution at `t_ns`, of all that has been run by `advance`.
+        """Solution at `t_ns`, after the last `advance`.
 
-        Later than the newest sample it is carried ahead by holding that sample's rates, at most for
-        `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state of
-        that very instant, by the measurements valid until then; before what is kept of it
-        (`buffer_s`, and the start) nothing is known. The mode is always that of now.
+        After the newest sample the state is extrapolated with that sample's rates, for `gap_s` at
+        most; beyond, the mode reports a silent IMU. Before it the result is the filter's state of
+        that instant, by the measurements valid until then; before the stored history (`buffer_s`,
+        or the start) there is none. The mode is always the present one.
         """
         if self.without_imu.estimator is not None:
             return self.without_imu.solution(t_ns, self.mode(t_ns)[1], self._protection.unknown())

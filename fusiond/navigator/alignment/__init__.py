@@ -1,1 +1,1 @@
-"""Initial alignment: from what has come in to the filter's first state."""
+"""Initial alignment: from received data to the filter's first state."""

@@ -2,7 +2,7 @@
 
 Level comes from a standstill (or from motion known by two velocity fixes), heading from the first
 of the allowed sources that can give it, position from a fix, the configuration or the saved state.
-No heading, no navigation: `reason` says what is missing.
+Navigation does not start without a heading: `reason` names what is missing.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ speed."""
 
 
 class Aligner:
-    """Tries a start whenever asked; `known` takes in what may lead to one."""
+    """Alignment of one vehicle: collects evidence and starts the filter."""
 
     def __init__(
         self,
@@ -79,22 +79,22 @@ class Aligner:
         self._news = True
 
     def sensed(self, windows: Sequence[Window], measurements: Sequence[AidingMeasurement]) -> None:
-        """Windows of the standstill detector have ended; constraints that hold."""
+        """Receive ended windows of the standstill detector and the constraints that hold."""
         for window in windows:
             self.known.window(window)
             self._news = True
         self._track.receive(measurements)
 
     def waits(self, start: Start, latency: LatencySearch) -> bool:
-        """True if a start that was found must wait: while it is looked whether the fixes that it is
-        made of are late, and longer where one is suspected, until others come."""
+        """True if a start must wait for the search for delayed fixes; with a suspected delay it
+        waits for further fixes."""
         self._found = start if latency.looking else None
         if latency.suspects:
             self.reason = latency.suspects
         return self._found is not None or bool(latency.suspects)
 
     def attempt(self, imu: ImuBuffer) -> Start | None:
-        """A start, if all is known by now; else None, and `reason` says what is missing."""
+        """Start of the filter, if all is known; else None, and `reason` names what is missing."""
         if not imu.end:
             self.reason = reason("no_imu")
             return None

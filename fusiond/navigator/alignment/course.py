@@ -5,13 +5,13 @@ l and the point that does not slide at s, a vehicle of forward speed V (negative
 
     C^T v_antenna = V x + w x (l - s),   yaw = course of the antenna - atan2 of that
 
-Moving off from rest the IMU has felt the velocity itself, and its direction in the body:
+Moving off from rest, the IMU senses the velocity and its direction in the body:
 
     C^T v_antenna = int f dt + w x l
 
-which needs no assumption about slip, but that it was at rest: felt and measured speed must agree in
-size. Where they do not, quiet was not rest, and the start is one on the move, where the changes of
-velocity tell forward from backward (fusiond.navigator.alignment.motion_fit).
+This needs no assumption about slip, but a rest before: sensed and measured speed must agree in
+size. If they do not, the quiet window was no rest, and the start is one on the move, in which
+changes of velocity distinguish forward from backward (fusiond.navigator.alignment.motion_fit).
 """
 
 from __future__ import annotations
@@ -186,8 +186,8 @@ def _moved_off(
 
 
 def _level_sd(by: Basis, seconds: float, turned: float, lat: float) -> float:
-    """Sigma (rad) of a level that the gyros have carried on since a rest: white noise, the error of
-    the rate bias at rest, and on the earlier axes the Earth's level rate and misaligned axes."""
+    """Sigma (rad) of a level propagated by the gyros since a rest: white noise, error of the rate
+    bias at rest, and, about the axes of the rest, the Earth's level rate and misaligned axes."""
     n = by.noise
     aside = 2.0 * abs(math.sin(0.5 * turned))
     return math.sqrt(
@@ -228,11 +228,11 @@ def _along(
 
 
 def _reversing(by: Basis, velocity: VelocityCandidate) -> str:
-    """Reason why a start backward must wait; empty if it need not.
+    """Reason why a backward start must wait; empty without one.
 
-    An IMU mounted backwards feels a vehicle that drives off forward just as one that reverses; the
-    speed tells, once it has settled or is one that nobody reverses at. From then on no start is
-    one backward.
+    An IMU mounted backwards senses a vehicle that drives off forward like one that reverses. The
+    speed distinguishes them once it has settled or exceeds that of reversing; from then on no start
+    is backward.
     """
     speed = math.hypot(*velocity.v_ned[:2])
     if speed > by.options.max_reverse_m_s or "imu_backwards" in by.known.reported:
@@ -260,7 +260,7 @@ class Ways:
     _sd_delay_s: float
 
     def fit(self, backward: bool) -> motion_fit.Fit:
-        """The best fit of a vehicle that drives forward, or backward."""
+        """Best fit of a forward or backward direction of travel."""
         velocity = self._latest
         course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
         along = _along(self._options, velocity, self.sensed.rates[-1], backward)
@@ -362,7 +362,7 @@ def _build(
     rested: tuple[tuple[Array, float], Levelled, Array] | None = None,
     fitted: Fitted | None = None,
 ) -> Start:
-    """Start by the antenna's velocity in the body; `rested`: bias, level and grades of a
+    """Start with the antenna's velocity in the body; `rested`: bias, level and grades of a
     standstill."""
     bias, levelled, grades = rested or (None, None, by.known.unit.unrested_grades)
     velocity, sd = velocity_of(candidate)

@@ -69,7 +69,7 @@ CONFIRMED_S = 15.0
 
 
 class Fix(NamedTuple):
-    """A measurement that offered both, and its source."""
+    """Position and velocity of one measurement, and its source."""
 
     velocity: VelocityCandidate
     position: PositionCandidate
@@ -107,7 +107,7 @@ class Standstill:
 
 
 class AlignmentEvidence:
-    """Windows and offers since the alignment began."""
+    """Standstill windows and initialisation candidates since the start of the alignment."""
 
     def __init__(
         self,
@@ -157,11 +157,11 @@ class AlignmentEvidence:
         """The last position of each source."""
 
     def window(self, latest: Window) -> None:
-        """A window of the standstill detector has ended.
+        """Receive an ended window of the standstill detector.
 
-        It counts as rest only once the next one is quiet too: the last before the start may hold
-        the first of the acceleration. One with too few samples (the first after a start or a gap)
-        tells neither rest nor motion.
+        A window counts as rest only once the next one is quiet, too: the last one before the
+        vehicle moves may include the start of the acceleration. A window with too few samples (the
+        first after a start or a gap) shows neither rest nor motion.
         """
         if latest.samples < FEWEST_SAMPLES:
             self._at_rest = False
@@ -233,15 +233,15 @@ class AlignmentEvidence:
         return self._at_rest
 
     def levelled(self) -> Standstill | None:
-        """Present standstill, once long enough for levelling."""
+        """Present standstill, if long enough for levelling."""
         s = self.standstill
         if s is None or not self._at_rest or s.seconds < self._options.levelling_s:
             return None
         return s if self.rested(s, ANY_TIME_NS) else None
 
     def rested(self, s: Standstill, until_ns: int = 0) -> bool:
-        """True if no measured speed contradicts a standstill up to its end or later, nor a
-        displacement of positions where no speed was measured."""
+        """True if no measured speed until the end of a standstill contradicts it, nor, without
+        speeds, a displacement of positions."""
         end_ns = max(s.end_ns, until_ns)
         seen = self.rest_evidence.measured(s.start_ns, end_ns)
         if math.isfinite(seen.sd):
@@ -269,20 +269,20 @@ class AlignmentEvidence:
         return math.isfinite(seen.sd) and not seen.contradicts
 
     def doubted(self, why: str) -> str:
-        """Set the reason why there is no start yet; returns it."""
+        """Set and return the reason why there is no start yet."""
         self.why = why
         return why
 
     def report(self, code: str, text: str) -> str:
-        """Set the reason, and report an event the first time."""
+        """Set the reason; report an event the first time."""
         if code not in self.reported:
             self.reported.add(code)
             self._event(code, text)
         return self.doubted(text)
 
     def position_confirms(self, latest: Fix) -> bool:
-        """True if the positions confirm the direction of the velocities, over a distance that would
-        expose the opposite, without divergence."""
+        """True if the positions confirm the direction of the velocities over a distance that would
+        expose the opposite one."""
         source = latest.source
         fixes = [fix for fix in self.fixes if fix.source == source]
         if fixes[0] is latest:
@@ -378,7 +378,7 @@ class AlignmentEvidence:
         return largest
 
     def _reported(self) -> Place | None:
-        """Place by the configuration or the saved state."""
+        """Position by the configuration or the saved state."""
         height: float | None
         if self._options.position is not None:
             (lat, lon, height), sd = self._options.position, self._options.position_sd_m
@@ -391,8 +391,8 @@ class AlignmentEvidence:
         return Place(None, np.array([lat, lon, height]), sd, sd)
 
     def _height_at(self, p: PositionCandidate) -> tuple[float, float]:
-        """Height (m) of a fix and one sigma; where it has none, that of the place that was told, as
-        far as roads climb on the way from there; 0 where nothing has told any."""
+        """Height (m) of a fix and one sigma. Without one: height of the known place, with sigma for
+        a road's climb from there; 0 without a known place."""
         if p.height_m is not None:
             return p.height_m, p.sd[2]
         if (reported := self._reported()) is not None:

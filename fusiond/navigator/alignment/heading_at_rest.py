@@ -1,6 +1,6 @@
 """Headings of a vehicle that stands: saved, configured, of two antennas, of the Earth's rate.
 
-And that of positions, whose bank is elsewhere (fusiond.navigator.alignment.heading_from_positions).
+Also the heading from positions (fusiond.navigator.alignment.heading_from_positions).
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def _at_standstill(
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Start by the saved heading of a parked vehicle, unless it has moved since: by itself, or on a
-    ferry, as the first fix shows."""
+    """Start by the saved heading of a parked vehicle, unless motion or the first fix shows that it
+    has moved since."""
     if by.saved is None or by.known.ever_moved:
         return None
     fix, where, sd, _ = place
@@ -98,7 +98,7 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """The configured heading, while the vehicle has not moved."""
+    """Start by the configured heading, before the vehicle has moved."""
     o = by.options
     if o.heading_rad is None or by.known.ever_moved:
         return None
@@ -158,7 +158,7 @@ def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_positions(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Heading of positions alone; a velocity, where there is one, tells it sooner and better."""
+    """Start by the heading from positions alone, if no velocity is received."""
     fixes = by.known.fixes
     if (
         fixes

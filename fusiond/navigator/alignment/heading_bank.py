@@ -2,15 +2,15 @@ r"""A bank of headings: filters that start with the heading in cells around the 
 
     p(x) = sum_i w_i N(x; x_i, P_i),   w_i <- w_i N(nu_i; 0, S_i) / sum
 
-Each is a filter of the vehicle's own model (`InvariantFilter`), which is Gaussian where the heading
-alone is not; the weights say which cell the measurements fit. The mixture's mean and covariance,
-taken in the error xi that all cells share, are the start once they are one hump and narrow:
+Each cell is a filter of the vehicle's own model (`InvariantFilter`), nearly Gaussian although the
+heading alone is not; its weight w_i is its probability. Once the mixture has one narrow mode, the
+start is its mean and covariance in the error xi common to all cells:
 
     m = sum w_i xi_i,   C = sum w_i (P_i + (xi_i - m)(xi_i - m)^T)
 
 Source: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE
 TAC 17 (1972), eq. 14 to 20; Bar-Shalom, Li, Kirubarajan (2001), eq. 1.4.16-7 and -8 for the
-moments. PX4's estimator of yaw (EKFGSF_yaw) is such a bank of five, on GNSS velocity.
+moments. PX4's yaw estimator (EKFGSF_yaw) is such a bank of five filters on GNSS velocity.
 """
 
 from __future__ import annotations

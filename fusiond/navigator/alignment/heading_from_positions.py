@@ -1,16 +1,14 @@
-r"""Heading from positions alone: a vehicle that drives, and fixes without velocity, late ones too.
+r"""Heading from positions alone: fixes without velocity, possibly delayed, of a moving vehicle.
 
-A bank of headings (fusiond.navigator.alignment.heading_bank) starts where the vehicle is last known
-to have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving
-all the time, at its first fix, with a road's slope and a road's speed. All that is measured from
-then on is weighed at its own instant: the bank runs `DELAYED_NS` behind the samples, so that what
-comes late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
-heading:
+A bank of headings (fusiond.navigator.alignment.heading_bank) starts at the end of the last rest,
+with level and gyro bias; for a vehicle that has never stood, at its first fix, with priors of a
+road's slope and speed. Every later measurement is applied at its own instant: the bank runs
+`DELAYED_NS` behind the samples, so that delayed measurements arrive in time. The heading is the
+rotation that fits the path of the IMU to the fixes:
 
     sd_yaw ~ sqrt(2) sd_fix / way,   6 deg after 280 m with fixes of 20 m
 
-That the vehicle drives the way it faces, to within a mounting angle, is measured too: at constant
-speed nothing else tells the heading.
+The no-slip constraint is a measurement, too: at constant speed nothing else shows the heading.
 """
 
 from __future__ import annotations
@@ -86,7 +84,7 @@ def bank_model(model: Model, options: AlignmentOptions) -> Model:
 
 
 class Track:
-    """Measurements of a vehicle without heading, and the bank of filters started from them."""
+    """Measurements before the heading is known, and the bank of filters started from them."""
 
     def __init__(self, options: AlignmentOptions, model: Model) -> None:
         self._options = options
@@ -100,7 +98,7 @@ class Track:
         self._started_ns = 0
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
-        """Measurements and constraints have come."""
+        """Receive measurements and constraints."""
         if "positions" not in self._options.heading:
             return
         for measurement in measurements:
@@ -109,19 +107,19 @@ class Track:
         del self._measurements[:-MOST_WAITING]
 
     def give_up(self) -> None:
-        """Forget all: something else tells the heading."""
+        """Discard everything: another source gives the heading."""
         self._measurements.clear()
         self._bank = self._left = None
 
     @property
     def running(self) -> bool:
-        """True if a bank seeks the heading."""
+        """True if a bank is running."""
         return self._bank is not None
 
     def start(
         self, known: AlignmentEvidence, noise: ImuNoise, imu: ImuBuffer, place: Place
     ) -> Start | None:
-        """A start, once the heading is known."""
+        """Start of the filter, once the heading is known; else None."""
         until_ns = imu.latest_ns - DELAYED_NS
         if self._bank is None:
             self._bank = self._begin(known, noise, imu, place, until_ns)
@@ -210,7 +208,7 @@ class Track:
         left: Standstill,
         there: Sequence[AidingMeasurement],
     ) -> list[Cell]:
-        """Cells of a vehicle that has stood until `left` ended; fixes `there` tell the place."""
+        """Cells of a vehicle at rest until the end of `left`; its fixes `there` give the place."""
         place = place._replace(fix=None, sd=ANYWHERE_M)
         roll, pitch = level(left.mean_force)
         there = [replace(measurement, t_ns=left.end_ns) for measurement in there]
@@ -259,7 +257,7 @@ class Track:
         return cells
 
     def _cell(self, imu: ImuBuffer, start: Start, weight: float) -> Cell:
-        """A filter that has started."""
+        """Started filter."""
         found = InvariantFilter(self._model, self._options.gap_s, settles=False)
         first = imu.index_after(start.t_ns) + imu.start
         found.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)

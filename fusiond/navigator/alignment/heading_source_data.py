@@ -23,5 +23,5 @@ class Basis(NamedTuple):
 
     @property
     def noise(self) -> ImuNoise:
-        """Of the inertial unit, as far as it has been seen."""
+        """Noise of the inertial unit, as observed so far."""
         return self.known.unit.noise

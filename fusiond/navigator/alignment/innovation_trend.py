@@ -1,4 +1,4 @@
-"""A line through innovations of a position against time: whether they run away."""
+"""Drift of position innovations: a least-squares line against time."""
 
 from __future__ import annotations
 

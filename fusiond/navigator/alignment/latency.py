@@ -1,32 +1,31 @@
 r"""Search for the delay of a receiver's fixes, by the IMU alone.
 
-The velocities of the last seconds are compared with what the IMU has felt
-(fusiond.navigator.alignment.motion_fit), as if each had been true by tau before its stamp.
-Attitude, sensor errors and the first velocity are free within their priors, so that
+The velocities of the last seconds are compared with the motion sensed by the IMU
+(fusiond.navigator.alignment.motion_fit), each assumed valid tau before its stamp. Attitude, sensor
+errors and the first velocity are free within their priors, so that
 
     J(tau) = min cost,   J(tau) - J(tau*) = (tau - tau*)^2 / s^2    near the best tau*
 
-is the profile of twice the negative log likelihood, s^2 = 2 h^2 / (J(tau* + h) - 2 J(tau*) +
-J(tau* - h)). Neither the filter nor a position is asked: what has followed late fixes agrees with
-them. What shows tau is a change of velocity. At constant velocity J is flat, and late positions on
-a straight are the same as ones that have jumped along the track: nobody can tell.
+is the profile of twice the negative log likelihood, s^2 = 2 h^2 / (J(tau* + h) - 2 J(tau*) + J(tau*
+- h)). Neither the filter nor positions are used: a filter that has followed delayed fixes agrees
+with them. A change of velocity shows tau. At constant velocity J is flat: delayed positions on a
+straight cannot be distinguished from ones that have jumped along the track.
 
-It is looked for where a start is found: what begins later is a hypothesis of the bank
-(fusiond.integrity.catalogue). A receiver is late by tau*
-where
+The search runs when a start is found; a delay that begins later is a hypothesis of the bank
+(fusiond.integrity.catalogue). A receiver is delayed by tau* if
 
-    J(tau*) <= chi-square of its degrees    the IMU is sound; one that has turned fits at no tau
+    J(tau*) <= chi-square of its degrees    the IMU works; one that has turned fits at no tau
     J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
     |tau* - now| > PRIOR_SIGMAS s_0         s_0 of the filter's own state for it
 
-in some looks that agree, by fixes of one delay, unless the positions have followed the
-velocities all the way since it was known (fusiond.navigator.alignment.position_jumps). On
-drive_0708 and css_164, which have no late fixes, two of 452 looks met all but the first; the
-smoothing of receivers moves tau* by 0.1 s.
+in several searches that agree, over fixes of one delay, unless the positions have followed the
+velocities since the last known delay (fusiond.navigator.alignment.position_jumps). On drive_0708
+and css_164, which have no delayed fixes, two of 452 searches met all but the first condition; the
+smoothing of receivers shifts tau* by 0.1 s.
 
-What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
-fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
-are published by (fusiond.estimators.published_state).
+The delay is subtracted from the stamps, by the IMU's clock: an IMU cannot be early, so the fixes
+are delayed. From then on solutions are published by that clock
+(fusiond.estimators.published_state).
 
 Source: Wu and Pan (as motion); profile likelihood: Venzon, Moolgavkar, Applied Statistics 37
 (1988), 87; the offset in time as a parameter of alignment: Li, Mourikis, Online temporal
@@ -108,13 +107,13 @@ class Delay(NamedTuple):
     sd: float
 
     def agrees(self, other: Delay) -> bool:
-        """True if both may be the same."""
+        """True if both delays agree within their sigmas."""
         return abs(self.seconds - other.seconds) <= AGREED * math.hypot(self.sd, other.sd)
 
 
 class Found(NamedTuple):
-    """A receiver is late: why all that was made of its fixes must be made anew, and one sigma (s)
-    of what their instants are known to."""
+    """Result of a search: reason to restart from the receiver's fixes, and one sigma (s) of their
+    instants."""
 
     why: str
     sd_s: float
@@ -150,7 +149,7 @@ class _Receiver:
     seen: int = 0
 
     def suspect(self, delay: Delay, t_ns: int) -> None:
-        """Delay by the fixes until `t_ns`; what looks agree upon counts, the best known of it."""
+        """Delay by the fixes until `t_ns`: the best of agreeing searches."""
         before = self.suspected
         if before is None or not delay.agrees(before):
             self.suspected, self.since_ns, self.seen = delay, t_ns, 1
@@ -160,7 +159,7 @@ class _Receiver:
             self.suspected = delay
 
     def settled(self, t_ns: int) -> Delay | None:
-        """Delay, once that is known; a suspicion that has not lasted ends."""
+        """Delay, once known; ends a suspicion that did not last."""
         delay = self.suspected
         if delay is None:
             return None
@@ -239,7 +238,7 @@ class LatencySearch:
         return self._looking is not None
 
     def stop(self) -> None:
-        """A look that has not ended is given up: what was made of the fixes is."""
+        """Abort the present search: the start that it examined was dropped."""
         self._looking, self._due_ns = None, 0
 
     @property
@@ -252,8 +251,8 @@ class LatencySearch:
         return ""
 
     def look(self, imu: ImuBuffer) -> Found | None:
-        """Begin or go on to look; what is found by the samples and fixes of the last seconds before
-        the look began."""
+        """Start or continue a search over the samples and fixes of the last seconds before it; its
+        result, if any."""
         t_ns = imu.latest_ns
         if not self.due(t_ns):
             return None
@@ -276,7 +275,7 @@ class LatencySearch:
         return max((look for look in self._looks if look <= t_ns - LOOKED_NS), default=0)
 
     def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
-        """Run `look` on all present data, one fit at a time."""
+        """Run a search on all present data, one fit at a time."""
         self._catch_up()
         t_ns = imu.latest_ns
         self._due_ns = t_ns + EVERY_NS
@@ -305,7 +304,7 @@ class LatencySearch:
     def _weigh(
         self, receiver: _Receiver, past: sensed_motion.Past, first_ns: int, t_ns: int
     ) -> Generator[None, None, None]:
-        """Weigh the delay by the fixes of a span; the best that they have said counts."""
+        """Estimate the delay by the fixes of a span; the estimate of least sigma counts."""
         of_each = (epoch for received in receiver.received for epoch in received.epochs())
         epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
         looked = [e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns]
@@ -365,8 +364,8 @@ class LatencySearch:
 
 
 def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityCandidate], PositionCandidate | None]:
-    """Velocities of one delay, and a position. What repeats the one before to the bit is no
-    measurement, but of a vehicle that stands."""
+    """Velocities of one delay, and a position. A fix that repeats the one before bit for bit is no
+    measurement, except at rest."""
     left = since_leap(epochs)
     found = [epoch.velocity for epoch in left]
     place = next((e.position for e in reversed(left) if e.position is not None), None)

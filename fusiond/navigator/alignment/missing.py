@@ -1,8 +1,8 @@
 """Reasons why navigation has not started: the missing condition and the remedy.
 
-One sentence: what is missing, then what each allowed source of a heading waits for. It goes out as
-`why`; a change of it is an event, `not_aligned`, once it has lasted for `SETTLED_NS`. Numbers that
-count up are no change.
+One sentence: the missing condition, then what each allowed heading source waits for. It is
+published as `why`. A change that lasts for `SETTLED_NS` is an event, `not_aligned`; a counting
+number is no change.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Journal:
 
 
 def why_not(by: Basis, imu: ImuBuffer, latitude: float | None) -> str:
-    """The sentence; `latitude` (rad) is None where no position is known."""
+    """Reason as a sentence; `latitude` (rad) is None without a position."""
     said = []
     allowed = by.options.heading
     level = bool(by.known.fixes) or by.track.running or by.known.levelled() is not None
@@ -85,7 +85,7 @@ def _no_heading(by: Basis) -> str:
 
 
 def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
-    """Reason for samples at another rate than configured."""
+    """Reason for samples at a different rate than configured."""
     first = imu.index_after(imu.latest_ns - COUNTED_NS)
     span_ns = imu.latest_ns - int(imu.times[first]) if first < imu.end else 0
     if span_ns < LEAST_COUNTED_NS:
@@ -144,7 +144,7 @@ def _of_source(source: str, by: Basis, imu: ImuBuffer, latitude: float) -> list[
 
 
 def _gyrocompass(by: Basis, latitude: float) -> list[str]:
-    """Duration of the rest for gyrocompassing, or that standing does not help."""
+    """Reason for gyrocompassing: the duration of the rest, or why resting does not help."""
     o, n, s = by.options, by.noise, by.known.standstill
     bias = math.hypot(n.rate_bias_initial, n.rate_bias_instability)
     sd = gyrocompass_sd(latitude, bias, n.rate_noise, o.gyrocompass_s)

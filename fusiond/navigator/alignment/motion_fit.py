@@ -1,32 +1,33 @@
-r"""Direction of travel of a vehicle: felt against measured changes of velocity, by least squares.
+r"""Direction of travel: least-squares fit of measured to sensed changes of velocity.
 
     v(t_k) = v_0 + C_0 a_k + g t_k + C_k (w_k x l) + (C_k (f_k - b_f) + g) tau
     a_k = int C(0, t) (f - b_f) dt
 
 C_0 attitude at the first fix, C(0, t) its change by the gyros (less b_w), l the antenna's lever,
-tau how much later than their stamps the velocities are valid. v_0, the rotation vector phi of
-C_0 = exp(phi) R_z(yaw_0), b_f, b_w and tau are sought, with the data sheet's biases, a road's
-slope, the course's sigma and that of the receiver's offset as priors (pulling away by 3 m/s^2 with
-velocities that are 0.1 s late gains 0.3 m/s too much, in 5 s a third of a degree of tilt); C(0, t)
-is integrated anew with the rate bias found, for 3 deg/s turn the axes by a radian in 20 s. At the
+tau the time from the velocities' stamps to their validity. Unknown are v_0, the rotation vector phi
+of C_0 = exp(phi) R_z(yaw_0), b_f, b_w and tau, with the data sheet's biases, a road's slope, the
+course's sigma and that of the receiver's offset as priors (pulling away by 3 m/s^2 with velocities
+that are 0.1 s late gains 0.3 m/s too much, in 5 s a third of a degree of tilt); C(0, t) is
+re-integrated with the estimated rate bias, as 3 deg/s turn the axes by a radian in 20 s. At the
 last fix the attitude is C_T = C_0 C(0, T), and its error follows from those of C_0 and b_w,
 
     phi_T = phi + C_0 D db_w,   D = d C(0, T) / d b_w as a rotation vector (3, 3)
 
-so what is sought is phi_T in place of phi: a vehicle that stood before it drove off tells nothing
-of its yaw rate's bias until then, and a C_0 that is held would turn all that came after. Tilt and
-biases come with the covariance that they share: straight on, a tilt is known no better than the
-accelerometers' bias, and the sum of both far better. The cost J of the best fit is twice
-the negative log likelihood, up to a constant that forward (yaw_0 by the course) and backward (half
-a turn more) share, so that
+so phi_T is estimated in place of phi: a vehicle at rest shows nothing of its yaw rate bias before
+it drives off, and a fixed C_0 would turn everything after. Tilt and biases have a common
+covariance: straight on, a tilt is known no better than the accelerometers' bias, and the sum of
+both far better. The cost J of the best fit is twice the negative log likelihood, up to a constant
+that forward (yaw_0 by the course) and backward (half a turn more) share, so that
 
     ln L_forward - ln L_backward = (J_backward - J_forward) / 2
 
-tells them apart: braking, accelerating and bends do; straight on at constant speed does not.
+distinguishes them while the vehicle brakes, accelerates or turns, but not straight on at constant
+speed.
 
-From no bias to 6 deg/s, which turn the axes by 100 deg in 17 s, Gauss-Newton goes astray now and
-then (tilts 39 deg off at a stated 0.7). So the last seconds are fitted first, and over spans that
-double the fit of each is where the next begins; and a fit that has not converged starts nothing.
+With a bias of up to 6 deg/s, which turns the axes by 100 deg in 17 s, Gauss-Newton from zero
+sometimes finds another minimum (tilts 39 deg off at a stated 0.7). So the last seconds are fitted
+first, then spans of doubled length, each from the fit before; a fit that has not converged starts
+no filter.
 
 Source: Wu and Pan, Velocity/position integration formula part I, IEEE T-AES 49 (2013), for the
 integral form of an alignment in motion; Groves, 2nd ed., section 5.6.3.
@@ -59,7 +60,7 @@ FIRST_RAD = 0.5
 class Fit(NamedTuple):
     """The best fit under one hypothesis: cost, degrees of freedom, attitude C_nb (3, 3) at the last
     fix, biases (6,) of force and rate, the velocities' offset in time (s), covariance (10, 10) of
-    them all. `converged`: it is the best; else the cost is no less than that of the best."""
+    them all. `converged`: the fit is the best; otherwise its cost is an upper bound."""
 
     cost: float
     degrees: int
@@ -107,8 +108,8 @@ def fit(
 
 
 class Asked(NamedTuple):
-    """Fit's constants: IMU noise, gravity, heading (rad) at the last fix, one sigma of the priors
-    (10,) and of the velocities' offset in time (s)."""
+    """Constants of a fit: IMU noise, gravity, heading (rad) at the last fix, one sigma of the
+    priors (10,) and of the velocities' offset in time (s)."""
 
     noise: ImuNoise
     g: float
@@ -124,7 +125,7 @@ class Asked(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """State of Gauss-Newton: the guess, its slopes (3 k + 10, 13) and what is left (3 k + 10,), in
+    """State of Gauss-Newton: the guess, its slopes (3 k + 10, 13) and its residuals (3 k + 10,), in
     sigmas."""
 
     here: Guess

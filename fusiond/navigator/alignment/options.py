@@ -16,10 +16,10 @@ MAX_REVERSE_M_S = 8.0
 @immutable()
 class AlignmentOptions:
     """SI units; `heading` the allowed sources in order of preference, `window_s` the length of the
-    standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from
-    the IMU to the point that does not slide, where it is known, `quiet_rad_s` and `quiet_m_s2` the
-    standard deviations below which the sensor is quiet, `misalignment_rad` how far the axes are out
-    of square, `graded` whether the unit is known by its class."""
+    standstill detector's windows, `rate_sd_rad_s` the rate that a vehicle at rest may have,
+    `no_slip_m` the lever arm to the point that does not slide, if known, `quiet_rad_s` and
+    `quiet_m_s2` the standard deviations below which the sensor is quiet, `misalignment_rad` the
+    axes' deviation from square, `graded` true if the unit is configured by its class."""
 
     heading: tuple[str, ...]
     heading_rad: float | None

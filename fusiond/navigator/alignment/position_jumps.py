@@ -2,19 +2,19 @@ r"""Position jumps of a receiver, detected by its own velocities.
 
     r_k = p_k - p_k-1 - (v_k + v_k-1) / 2 (t_k - t_k-1)
 
-Stamps that begin to be late by tau, or end to be, make a leap of v tau, and what the fixes before
-it say of a delay is not true of those after it. Noise of s an axis has norms of the median
-s sqrt(2 ln 2), which a few leaps do not move.
+A delay tau that starts or ends makes a jump of v tau, and fixes before it are no evidence on the
+delay after it. Noise of s an axis has norms of the median s sqrt(2 ln 2), which a few jumps do not
+change.
 
-And where the sum of r along the track, which telescopes to two positions' noise, stays below v tau,
-none has become late by tau: an inertial unit that was turned for some seconds may fit one as well.
+If the sum of r along the track, which telescopes to the noise of two positions, stays below v tau,
+no delay tau has started, although an inertial unit that was turned for some seconds would fit one.
 
-Velocities alone that are late by tau have positions that go before them,
+If the velocities alone are delayed by tau, the positions lead them,
 
     d_k = sum r = tau (v_k - v_0)
 
-and tau is the slope of the one by the other: what the IMU has felt says how late the velocities
-are, and this whether the positions are as well.
+and tau is the slope of one by the other. The IMU shows the delay of the velocities, this slope that
+of the positions.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
 
 
 def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:
-    """True if the receiver's delay cannot have grown by `by_s` within the data, nor have been
-    larger before: its positions have followed its velocities, which earlier changed by enough to
-    show a delay. Data after a contradiction at `doubted_ns` is no proof, since a solution restarted
-    by delayed fixes agrees with them for a while."""
+    """True if the receiver's delay cannot have grown by `by_s` within the data nor have been larger
+    before: the positions have followed the velocities, which had changed enough to show a delay.
+    Data after a contradiction at `doubted_ns` are no proof: a solution restarted by delayed fixes
+    agrees with them for a while."""
     steps = _steps(epochs)
     if steps is None:
         return False

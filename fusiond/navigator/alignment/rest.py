@@ -22,8 +22,8 @@ def rest_bias(
 ) -> tuple[Array, float]:
     """Rate bias (3,) at rest and its sigma.
 
-    Of the Earth's level rate w a heading that is off by y, one sigma s, takes out the wrong part,
-    w (cos y - 1, sin y): w y is the start's to correlate, the rest, half of it an axis, is
+    A heading error y of one sigma s subtracts a wrong part of the Earth's level rate w, w (cos y -
+    1, sin y). The start correlates w y; the rest, half of it an axis, is
 
         E (sin y - y)^2 + E (1 - cos y)^2 = s^2 + 2 - 2 (1 + s^2) exp(-s^2 / 2)
     """

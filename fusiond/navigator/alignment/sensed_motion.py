@@ -66,9 +66,9 @@ class Measured(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """IMU data from the first of k fixes to the last: times (m + 1,) ns, of the first fix and of
-    samples (m, 6), how many of them (k,) there are until each fix, seconds (k,) from the first to
-    each, and means (k, 6) of the samples around each."""
+    """IMU data from the first of k fixes to the last: times (m + 1,) ns of the first fix and of
+    samples (m, 6), their number (k,) until each fix, seconds (k,) from the first fix, and means (k,
+    6) of the samples around each fix."""
 
     times: NDArray[np.int64]
     samples: Array
@@ -116,8 +116,7 @@ def span_since(imu: ImuBuffer, t_ns: int) -> Span:
 
 
 def measured(fixes: Sequence[VelocityCandidate], most: int) -> Measured:
-    """Measurements of some fixes; `most` of them, evenly, where they are more, the last among
-    them."""
+    """Measurements of fixes, evenly thinned to at most `most`, the last included."""
     every = math.ceil(len(fixes) / most)
     fixes = fixes[::-1][::every][::-1]
     found = [velocity_of(x) for x in fixes]
@@ -130,8 +129,8 @@ def measured(fixes: Sequence[VelocityCandidate], most: int) -> Measured:
 
 
 def rate_before_motion(past: Past, m: Measured) -> Array:
-    """Mean rate (3,) over the first fixes, while they show rest. A linearisation about zero bias
-    would not converge: 3 deg/s turn by 60 deg in 20 s. Zero without a rest."""
+    """Mean rate (3,) over the first fixes at rest; zero without a rest. A linearisation about zero
+    bias would not converge: 3 deg/s turn by 60 deg in 20 s."""
     beyond = np.abs(m.velocity) > STILL_SIGMAS * m.sd
     moves = beyond[:, 0] | beyond[:, 1]
     stood = int(np.argmax(moves)) if moves.any() else len(moves)

@@ -1,5 +1,4 @@
-"""The filter's first state: what alignment found, as navigation state, parameters and
-covariance."""
+"""First state of the filter: navigation state, parameters and covariance from the alignment."""
 
 from __future__ import annotations
 
@@ -80,8 +79,8 @@ def as_geodetic(metres: Array, lat: float) -> Array:
 
 
 def velocity_of(candidate: VelocityCandidate) -> tuple[Array, Array]:
-    """Velocity NED (3,) and one sigma (3,). NMEA measures no vertical velocity: it is then 0, give
-    or take what a road's slope makes of the speed."""
+    """Velocity NED (3,) and one sigma (3,). NMEA has no vertical velocity: it is then 0, with a
+    sigma of the speed times a road's slope."""
     if len(candidate.v_ned) == 3:
         return np.array(candidate.v_ned), np.full(3, max(candidate.sd))
     sd = max(candidate.sd)
@@ -92,7 +91,8 @@ def velocity_of(candidate: VelocityCandidate) -> tuple[Array, Array]:
 class Levelled(NamedTuple):
     """Attitude C_nb (3, 3) at the instant of levelling, and its sigma (rad).
 
-    The sigma is of what roll and pitch have gained since, beside the force errors of then."""
+    The sigma is that of roll and pitch errors gained since, beside the force errors at
+    levelling."""
 
     dcm: Array
     sd: float = LEVEL_SD_RAD
@@ -101,8 +101,8 @@ class Levelled(NamedTuple):
 class Fitted(NamedTuple):
     """Force and rate biases (6,) of a level found in motion.
 
-    With the offset in time (s) of the velocities that it was found from, and the covariance
-    (10, 10) that they share with the attitude, which comes first."""
+    Also the time offset (s) of the velocities used, and the joint covariance (10, 10), the attitude
+    first."""
 
     biases: Array
     delay_s: float
@@ -110,7 +110,7 @@ class Fitted(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """Measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
+    """Measured velocity with the body's rate (3,) and acceleration (3,) NED at its instant."""
 
     candidate: VelocityCandidate
     rate: Array
@@ -121,11 +121,11 @@ class Moves(NamedTuple):
 class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
 
-    `turns`: the heading is known so poorly that the filter should update in the coordinates of
-    `fusiond.estimators.invariant`. `contradicted`: before it, positions have moved otherwise than
-    the velocities of the same receiver. `used`: what of its own instant it was made of, which no
-    filter may be told once more. `confirmed`: nothing has measured the heading where it is false,
-    nor has the way shown it: one that was configured, of a magnet, backward.
+    `turns`: the heading is so uncertain that the filter updates in the coordinates of
+    `fusiond.estimators.invariant`. `contradicted`: positions before the start disagreed with
+    velocities of the same receiver. `used`: measurements of its own instant that the start
+    contains, which must not be fused again. `confirmed`: false for a heading that neither a
+    measurement nor the path has shown, as one configured, of a compass, or backward.
     """
 
     t_ns: int
@@ -173,12 +173,11 @@ def build_start(
     """Start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
-    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors as
-    they were turned then: a vehicle that has taken a bend since has the tilt of before on the axes
-    of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
-    `sd_yaw` is then the least.
-    `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
-    `moves`: what the velocity was measured of, `heading`: the yaw. `grades`: of the unit (13,).
+    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors in
+    the axes of that time; after a bend the sensors have other axes than the tilt. `fitted`:
+    attitude and biases from motion; `sd_yaw` is then a lower bound. `unexplained`: rates (3,) of a
+    quiet vehicle beyond the data sheet, which may be biases. `moves`: the measured velocity,
+    `heading`: the measured yaw, `grades` (13,): those of the unit.
     """
     fix, where, sd_position, sd_height = place
     (lat, _, height), nav = where.tolist(), _first_state(model, place, dcm, velocity)
@@ -213,7 +212,7 @@ def build_start(
 
 
 def _first_state(model: Model, place: Place, dcm: Array, velocity: Array) -> Array:
-    """Navigation state (10,) at a place, that of its fix without the lever arm."""
+    """Navigation state (10,) at a place: the fix minus the lever arm."""
     nav = np.zeros(10)
     nav[:3] = place.where
     nav[3:6] = velocity
@@ -226,7 +225,7 @@ def _first_state(model: Model, place: Place, dcm: Array, velocity: Array) -> Arr
 
 
 def _prior(model: Model, grades: Array) -> Array:
-    """Covariance (n, n) of a model's start, of a unit of those grades (13,)."""
+    """Covariance (n, n) of a model's start, for a unit with grades (13,)."""
     p = np.diag(model.initial**2)
     for column in range(RATE_ERROR, COLUMN_END):
         for slot in model.parameters(column):
@@ -236,7 +235,7 @@ def _prior(model: Model, grades: Array) -> Array:
 
 def _by_heading(model: Model, p: Array, heading: HeadingCandidate) -> None:
     """Correlate the heading error with the device's by an innovation of 0 (fusiond.aiding.compass),
-    phi_D = e - d dev; otherwise further readings would prove dev = 0."""
+    phi_D = e - d dev; without it further readings would seem to prove dev = 0."""
     shared = [
         (slot, rate)
         for block, rates in heading.shared
@@ -253,7 +252,7 @@ def _by_fix(model: Model, by: Array, fix: PositionCandidate, dcm: Array, velocit
 
         dr = e + S db + w dc + v dtau + C dl - [C l x] phi,   e the fix's noise
 
-    and a start without it would take the next fixes for proof that b, c, tau and dl are 0.
+    Without it the next fixes would seem to prove that b, c, tau and dl are 0.
     """
     by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
     for state, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
@@ -287,8 +286,8 @@ def _take_fitted(
     """Set biases, and the offset of slots `time` (0 or 1), to the fitted values, with their
     covariance with the attitude; P's attitude covariance is added to it.
 
-    What was felt as a force bias is b + s f, of which f (3,) is all but gravity: where the model
-    has the scale factor s, b is known no better than s f, and cov(b, s) = -f var(s).
+    The sensed force bias is b + s f, f (3,) nearly gravity alone. If the model has the scale factor
+    s, b is known no better than s f, and cov(b, s) = -f var(s).
     """
     slots, rows = list(range(3)), list(range(3))
     columns = *range(FORCE_ERROR, FORCE_ERROR + 3), *range(RATE_ERROR, RATE_ERROR + 3)
@@ -314,11 +313,11 @@ def _take_fitted(
 def _start_biases(
     model: Model, p: Array, xi: Array, by: Array, dcm: Array, lat: float, bias: Array, sd: float
 ) -> None:
-    """Set the rate bias at rest, where it is better known than by the data sheet.
+    """Set the rate bias at rest, if better known than by the data sheet.
 
-    The rate that was felt is that of a vehicle at rest, whatever its attitude `dcm`: as much of the
-    Earth's as phi puts on other axes is in the bias, db = -C^T (w_ie x phi), rows of `by` (n, n).
-    Without it standing still would tell the heading of the start (fusiond.aiding.standstill).
+    The sensed rate is that of a vehicle at rest for any attitude `dcm`: the part of the Earth's
+    rate that phi turns to other axes is in the bias, db = -C^T (w_ie x phi), rows of `by` (n, n).
+    Without them a rest would seem to confirm the heading of the start (fusiond.aiding.standstill).
     """
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
     by_attitude = dcm.T @ skew(earth)
@@ -336,8 +335,8 @@ def _start_biases(
 def _correlate(
     model: Model, p: Array, dcm: Array, lat: float, height: float, compassed: bool
 ) -> None:
-    """Attitude errors that come of sensor errors: J Pss J^T on attitude, J Pss across. A bias that
-    the model has no state for makes a tilt all the same."""
+    """Add attitude errors caused by sensor errors: J Pss J^T on attitude, J Pss across. A bias
+    without a state in the model also tilts the attitude."""
     size = model.size
     jacobian = np.zeros((3, size))
     by_force = levelling_jacobian(dcm, lat, height)

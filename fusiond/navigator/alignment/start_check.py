@@ -41,8 +41,8 @@ off by half a turn."""
 
 
 class Unshown(NamedTuple):
-    """One sigma (rad) of a claimed heading that nothing has shown, and the place (rad) since which
-    the position rests on it, known to `sd_m`."""
+    """One sigma (rad) of an unconfirmed heading, and the last place (rad), of sigma `sd_m`, that
+    does not depend on it."""
 
     sd_rad: float
     lat_rad: float
@@ -50,7 +50,7 @@ class Unshown(NamedTuple):
     sd_m: float = 0.0
 
     def way_m(self, lat_rad: float, lon_rad: float) -> float:
-        """Way (m) to a place, beyond three sigma of what is known of where it began."""
+        """Distance (m) from the start to a place, minus three sigma of the start."""
         distance_m = horizontal_distance_m(self.lat_rad, self.lon_rad, lat_rad, lon_rad)
         return max(0.0, distance_m - 3.0 * self.sd_m)
 
@@ -94,8 +94,9 @@ class StartCheck:
             self.unconfirmed = reason("not_confirmed_by_motion") if self._unproven else ""
 
     def located(self, measurement: AidingMeasurement) -> None:
-        """A position was fused. A way from the start that positions confirm shows the heading as
-        well as they are known against that way; what is open of the place begins anew there."""
+        """Receive a fused position. A path from the start confirmed by positions bounds the heading
+        error by their sigma over its length; position uncertainty from the heading restarts
+        there."""
         for c in measurement.candidates():
             if self.unshown is None or not isinstance(c, PositionCandidate):
                 continue
@@ -143,8 +144,7 @@ class StartCheck:
         return velocity and self._heading(t_ns, velocity, yaw, sd_yaw, doubted)
 
     def _along(self, velocity: tuple[float, float, float], yaw: float, sd_yaw: float) -> bool:
-        """True if a measured velocity is one along the heading, forward or backward, as far as it
-        tells."""
+        """True if a measured velocity agrees with the heading, forward or backward."""
         north, east, sd_speed = velocity
         speed = math.hypot(north, east)
         residual = abs(wrap_angle(math.atan2(east, north) - yaw))
@@ -160,8 +160,8 @@ class StartCheck:
         doubted: bool,
     ) -> tuple[str, str] | None:
         """Check a configured or saved heading against the measured course, forward or backward: a
-        filter with a wrong heading gates the velocities that contradict it. Once it has doubted its
-        motion, it slowly turns towards the course and corrupts correct sensor errors."""
+        filter with a wrong heading gates the velocities that contradict it; after a doubt of its
+        motion it slowly turns towards the course and corrupts correct sensor errors."""
         north, east, sd_speed = velocity
         speed = math.hypot(north, east)
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
@@ -186,8 +186,7 @@ class StartCheck:
 
 
 class StartTrial:
-    """Trial of each start of a navigator; `on_event(code, text)` hears of a state that is
-    refused."""
+    """Trial of each start of a navigator; `on_event(code, text)` receives a refused state."""
 
     def __init__(self, options: AlignmentOptions, on_event: Callable[[str, str], None]) -> None:
         self._options, self._event = options, on_event
@@ -198,7 +197,7 @@ class StartTrial:
         """A start to be tried before any alignment, and its trial."""
 
     def first(self, imu: ImuBuffer) -> Start | None:
-        """The start from the state of the last run, at the first sample; there is one attempt."""
+        """Start from the state of the last run, at the first sample; tried once."""
         if self.warm is None or not imu.end:
             return None
         try:
@@ -209,7 +208,7 @@ class StartTrial:
             return None
 
     def begin(self, start: Start) -> None:
-        """A filter has been started so."""
+        """Begin the trial of a start."""
         self.check = StartCheck(self._options, start)
         self.look()
 
@@ -220,13 +219,13 @@ class StartTrial:
 
     @property
     def on_trial(self) -> bool:
-        """Started from the state of the last run, and no position measurement has confirmed it
+        """True if the start is from the state of the last run and no position has confirmed it
         yet."""
         return self.warm is not None and self.warm.on_trial
 
     @property
     def unconfirmed(self) -> str:
-        """Condition of the heading that nothing has shown, in words; empty where it does not."""
+        """Text on an unconfirmed heading; empty for a confirmed one."""
         if self.warm is not None and self.warm.on_trial:
             return reason("not_confirmed_by_fix")
         return self.check.unconfirmed if self.check else ""

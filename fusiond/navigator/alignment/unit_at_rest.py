@@ -1,4 +1,4 @@
-"""Grade of an inertial unit by its rests: how good within its class, or how much worse."""
+"""Grade of an inertial unit by its rests: within its class, or worse."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ GRAVITY_SD = 5e-4
 
 
 class UnitAtRest:
-    """`noise` of the inertial unit: its sheet's, or that of one as bad as its rates at rest."""
+    """`noise` of the inertial unit: its data sheet's, or that of a worse class by its rates at
+    rest."""
 
     def __init__(self, options: AlignmentOptions, sheet: ImuNoise) -> None:
         self._options, self._sheet, self.noise = options, sheet, sheet
@@ -34,8 +35,8 @@ class UnitAtRest:
         self._longest_run = 1
 
     def judge(self, w: Window) -> bool:
-        """Take the unit for as bad as the rates about level axes are that gravity does not follow
-        (fusiond.navigator.sensor_ladder). True if that is worse than its sheet."""
+        """Grade the unit by the rates about level axes that gravity does not follow
+        (fusiond.navigator.sensor_ladder). True if it is worse than its data sheet."""
         up = w.mean_force / float(np.linalg.norm(w.mean_force))
         self._ups = [*self._ups[1 - w.run :], up] if w.run > 1 else [up]
         if w.run <= self._longest_run or len(self._ups) < w.run:
@@ -56,7 +57,7 @@ class UnitAtRest:
 
     @property
     def judged(self) -> bool:
-        """True if rates at rest have told whether the unit is as its sheet says."""
+        """True if rates at rest have confirmed or refuted the data sheet."""
         return self._longest_run > 1
 
     @property
@@ -67,8 +68,8 @@ class UnitAtRest:
         return grades_of(self.noise, self._sheet, self._options.misalignment_rad)
 
     def grades(self, s: Standstill, bias: Array, sd: float, g: float) -> Array:
-        """Grades (13,) of the unit (fusiond.navigator.unit_grade), where it has been at rest: by
-        its rate `bias` (3,) and one sigma of that."""
+        """Grades (13,) of the unit (fusiond.navigator.unit_grade) from a rest: rate `bias` (3,) and
+        its one sigma."""
         if not self._options.graded:
             return self.unrested_grades
         n = self.noise

@@ -1,9 +1,9 @@
-r"""Input of the navigator: aiding measurements of a device's, or the name of its refusal.
+r"""Input of the navigator: aiding measurements of a device measurement, or the name of its
+rejection.
 
-Each is checked here once, before anything uses it. The configuration is applied: lever arm, sigma
-where the device states none, floors and gates. Behind it everything is in SI units with a settled
-instant. Each kind of measurement has a module of its own, which `KINDS` lists; nothing else knows
-them.
+Each measurement is checked here once, before any use. The configuration is applied: lever arm,
+sigma if the device states none, floors and gates. The results are in SI units with a settled
+instant. Each kind of measurement has a module of its own, listed in `KINDS`.
 
 Plausibility, by the limits of the vehicle's class (fusiond.configuration.plausibility):
 
@@ -15,24 +15,24 @@ Plausibility, by the limits of the vehicle's class (fusiond.configuration.plausi
     sigma_implausible       larger than anything that still says something, negative, or smaller
                             than the best device's
 
-What is not stated (None; of a sigma, 0 too) is no fault: the section has a value for it, or the
-outcome is `no_sigma`. A fix whose sigma is too small to be true is no worse for it:
-`fusiond.navigator.intake.gnss` has what is believed instead.
+A value that is not stated (None; for a sigma also 0) is no fault: the section has one, or the
+outcome is `no_sigma`. A fix with a sigma too small to be true is kept;
+`fusiond.navigator.intake.gnss` replaces the sigma.
 
 Rate, by a bucket of tokens for a source and kind of measurement:
 
     tokens <- min(BURST, tokens + |t - t_before| rate) - 1
 
-With less than none left the source is too fast: that measurement, and all from it until none was
-too fast for `CALM_NS`, are `too_often`. Who sends false data at a high rate sends honest ones
-between them: nobody can tell which, and the mean of repetitions has no smaller error than one.
+Below 0 the source is too fast: that measurement, and all others until none was too fast for
+`CALM_NS`, are `too_often`. A source that sends false data at a high rate mixes them with true ones,
+which cannot be distinguished, and the mean of repetitions has no smaller error than one.
 
-t is the instant of validity, so that a backlog in which each has its own stamp is as good as one
-that came in time; the sign of a difference is not looked at, since late ones come out of order.
+t is the instant of validity, so that a backlog with stamps of its own counts as received in time;
+the sign of the difference is ignored, as delayed measurements come out of order.
 
-A backlog that comes before the source's UTC is known has one instant, that of its arrival, and
-stamps that advance as they should. Of which instants it is will never be known: what is beyond the
-burst is refused as `backlog`, and the source is not too fast.
+A backlog that arrives before the source's UTC is known has one instant, that of its arrival,
+although its stamps advance. Its instants remain unknown: all beyond the burst is rejected as
+`backlog`, and the source is not too fast.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Intake:
     """Intake of measurements, with `aiding` by source name; a source without a section has its
     kind's defaults.
 
-    `limits` are those of the vehicle's class; `report(code, text)` hears of a source that is too
+    `limits` are those of the vehicle's class; `report(code, text)` receives a source that is too
     fast.
     """
 
@@ -217,7 +217,7 @@ class Intake:
         return {shown_as(*key): each.shown for key, each in self._sections.fix_errors.items()}
 
     def take_up(self, fixes_shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Resume receivers without a fix so far from these sums."""
+        """Resume from these sums, for receivers without a fix so far."""
         self._sections.fixes_shown = fixes_shown
 
     def count_drifts(self, drifts: DriftLevels) -> None:

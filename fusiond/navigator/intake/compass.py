@@ -1,10 +1,10 @@
-"""Heading of a compass: the declination is added here, where the world's magnetic model is asked.
+"""Heading of a compass, with the declination from the World Magnetic Model.
 
-Where and when the vehicle is, the last fix said that had passed the door. The model is asked for a
-cell of `CELL_DEG` and for a month, so that which of two fixes came first does not show: over a cell
-the declination changes by some 0.05 deg where compasses work, in a month by 0.02 deg, and the model
-itself is off by 0.3 deg and more (WMM2025, technical report, section 3), which is part of the
-deviation: a constant, as long as the vehicle stays in the country.
+Place and date are those of the last admitted fix. The model is evaluated for a cell of `CELL_DEG`
+and a month, so that the order of two fixes does not matter: over a cell the declination changes by
+some 0.05 deg where compasses work, in a month by 0.02 deg, and the model itself is off by 0.3 deg
+and more (WMM2025, technical report, section 3), which is part of the deviation: a constant while
+the vehicle stays in one country.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _MODEL = "wmm/WMM_2025.COF"
 def measurements_of(
     m: MagneticHeading, sections: Sections, when: Instants
 ) -> list[AidingMeasurement] | str:
-    """The heading with the declination. Refused are `place_unknown` and `date_unknown` before a
-    fix has said them, `near_magnetic_pole`, `beyond_magnetic_model` (its five years), and
-    `no_magnetic_model` without the package; with a declination of the configuration none is."""
+    """The heading with the declination. Rejections: `place_unknown` and `date_unknown` before a
+    fix, `near_magnetic_pole`, `beyond_magnetic_model` (its five years), `no_magnetic_model` without
+    the package; none with a configured declination."""
     o = sections.of(m.source, CompassAiding)
     found = _declination(o, sections)
     if isinstance(found, str):

@@ -67,9 +67,8 @@ Motion = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class _Receiver(NamedTuple):
-    """Options of a receiver: its own, whether its raw data are the measurement, what its velocities
-    are called, and the blocks of what its fixes share (`blocks`), empty where it is not
-    estimated."""
+    """Options of a receiver: its section, use of raw data, the name of its velocities, and `blocks`
+    of its fixes' shared errors, empty if they are not estimated."""
 
     section: GnssAiding
     raw: bool
@@ -193,9 +192,8 @@ def measurements_of(
 
 
 def _by_phase(m: PositionFix, sections: Sections) -> bool:
-    """True if the fix is one by carrier phase: its quality says so, or it states a sigma that code
-    cannot have; but for a receiver that has stated one of code under the same quality, which would
-    have changed with the ambiguities."""
+    """True if the fix is by carrier phase: by its quality, or by a sigma too small for code, unless
+    the receiver has stated a sigma of code under the same quality."""
     if m.quality in RTK:
         return True
     if m.sd_ned_m is None:
@@ -243,7 +241,7 @@ def _with_geoid(share: Vector3, geoid_sd_m: float, o: GnssAiding) -> Vector3:
 
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:
-    """The blocks of the error that a receiver's fixes share; none where it is not estimated."""
+    """Blocks of a receiver's shared error of fixes; none if not estimated."""
     if section.shared_sd_m == 0.0:
         return ()
     level = sections.own(FIX_BIAS, source, section)
@@ -251,12 +249,12 @@ def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str
 
 
 def _markov_block(source: str, section: GnssAiding, sections: Sections) -> str:
-    """The block of the error that fixes share for seconds; "" where none is estimated."""
+    """Block of the error that fixes share for seconds; "" if not estimated."""
     return sections.own(FIX_MARKOV, source, section) if section.shared_sd_m else ""
 
 
 def _errors(source: str, by_phase: bool, o: GnssAiding, sections: Sections) -> FixErrors:
-    """Errors of a receiver's fixes by code or by phase, at the first of them."""
+    """Error model of a receiver's fixes by code or by phase, made at the first fix."""
     offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
     errors = sections.fix_errors[source, by_phase] = FixErrors(offset_sd_s, not by_phase)
     if shown := sections.fixes_shown.get(shown_as(source, by_phase)):
@@ -265,8 +263,8 @@ def _errors(source: str, by_phase: bool, o: GnssAiding, sections: Sections) -> F
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
-    """Blocks that a receiver's fixes share: their offset in time, that of its velocities, what both
-    grow by, what is left of the lever arm, an error north and east, and one down."""
+    """Blocks of a receiver's shared errors: time offset of fixes, that of velocities, the clock
+    rate of both, the lever arm error, and a position error north and east, and down."""
     found = []
     if section.time_offset_sd_s:
         skew, sd_s = sections.own(CLOCK_SKEW, source, section), section.time_offset_sd_s

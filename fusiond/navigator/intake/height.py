@@ -23,8 +23,8 @@ from fusiond.navigator.intake.kind import Instants, Kind, Sections
 def measurements_of(m: Height, sections: Sections, when: Instants) -> list[AidingMeasurement] | str:
     """Height, with the section's sigma where the device states none, and its rounding error.
 
-    `weather_unknown`: a barometer's height is off by the weather, 100 m and more, for hours alike;
-    without a section of kind `barometer`, whose states know that error, its sigma would be a lie.
+    `weather_unknown`: weather shifts a barometer's height by 100 m and more for hours; without a
+    section of kind `barometer`, whose states model that error, its sigma would be too small.
     """
     if not m.barometric:
         o = sections.of(m.source, HeightAiding)

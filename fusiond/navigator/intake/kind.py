@@ -40,7 +40,7 @@ def raw_receivers(aiding: Mapping[str, AnyAiding]) -> dict[str, RawGnss]:
 
 
 def shown_as(source: str, by_phase: bool) -> str:
-    """Name of the fixes of a receiver that err alike."""
+    """Name of a group of a receiver's fixes with one error model."""
     return f"{source} by {'phase' if by_phase else 'code'}"
 
 
@@ -71,13 +71,13 @@ class Sections:
         """Constants of a section by source and maker."""
 
     def drift_counts(self, block: str, t_ns: int) -> float:
-        """Factor of a typed drift that counts for a measurement of `t_ns`."""
+        """Factor on the configured drift for a measurement of `t_ns`."""
         return 1.0 if self.drifts is None else self.drifts.counts(block, t_ns)
 
     def white_counts(
         self, source: str, t_ns: int, sd: float, lasts_s: float, rounding_sd: float
     ) -> float:
-        """Factor of a typed white noise that counts for a measurement of `t_ns`."""
+        """Factor on the configured white noise for a measurement of `t_ns`."""
         if self.drifts is None:
             return 1.0
         return self.drifts.white.counts(source, t_ns, sd, lasts_s, rounding_sd)
@@ -113,12 +113,12 @@ class Sections:
         return section is not None and section.robust
 
     def own(self, block: str, source: str, section: Aiding) -> str:
-        """The block's name: with the source's, where that has a section of its own that is not
-        simply named after its kind."""
+        """Name of a block: with the source's name, if the source has a section not named after its
+        kind."""
         return self.each_own((block,), source, section)[0]
 
     def each_own(self, blocks: tuple[str, ...], source: str, section: Aiding) -> tuple[str, ...]:
-        """`own` of several blocks: what each measurement asks anew."""
+        """`own` of several blocks, needed by each measurement."""
         key = source, type(section), blocks
         names = self._names.get(key)
         if names is None:
@@ -133,9 +133,9 @@ class Sections:
 class Kind:
     """A kind of device measurement.
 
-    `reported`: its class. `measurements_of(reported, sections, instants)`: the aiding measurements
-    that it stands for, or the name of its refusal. `blocks`: by class of section, the blocks that
-    `blocks(source, section, sections)` adds to the model: errors that successive ones share.
+    `reported`: its class. `measurements_of(reported, sections, instants)`: its aiding measurements,
+    or the name of its rejection. `blocks`: by class of section, `blocks(source, section, sections)`
+    gives the model's blocks of errors that successive measurements share.
     """
 
     reported: type

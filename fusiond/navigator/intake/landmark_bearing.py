@@ -14,7 +14,7 @@ from fusiond.navigator.intake.misalignment import misalignment_block, misalignme
 def measurements_of(
     m: Bearing, sections: Sections, when: Instants
 ) -> list[AidingMeasurement] | str:
-    """The bearing; `unknown_target` where neither it nor the configuration says the place."""
+    """Bearing; `unknown_target` if neither the measurement nor the configuration has the place."""
     o = sections.of(m.source, SarAiding)
     point = m.point
     if point is None:

@@ -1,4 +1,4 @@
-"""The misalignment of a sensor that is mounted a little askew: its block in the model."""
+"""Block of the misalignment of a sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fusiond.navigator.intake.kind import Sections
 
 
 def misalignment_block(block: str, source: str, section: Misaligned, sections: Sections) -> str:
-    """The block of a source's misalignment; empty where none is estimated."""
+    """Block of a source's misalignment; empty if none is estimated."""
     if section.misalignment_sd_arcsec == 0.0:
         return ""
     return sections.own(block, source, section)

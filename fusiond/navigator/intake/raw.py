@@ -24,8 +24,7 @@ from fusiond.navigator.intake.kind import Instants, Kind, Sections
 def measurements_of(
     m: RawGnssEpoch, sections: Sections, when: Instants
 ) -> list[AidingMeasurement] | str:
-    """The epoch; `raw_not_used` where the receiver's fixes are the measurement, not its raw
-    data."""
+    """Epoch; `raw_not_used` if the receiver's fixes are the measurement, not its raw data."""
     receiver = sections.receivers.get(m.source)
     if receiver is None:
         return "raw_not_used"

@@ -22,9 +22,9 @@ COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 5.0
 def measurements_of(
     m: DelayedFix, sections: Sections, when: Instants
 ) -> list[AidingMeasurement] | str:
-    """The fix; the instant of its feedback where that waits; its height where it says anything new.
+    """Fix, the instant of a delayed feedback, and a height that is new information.
 
-    Refused: `multi_value`, `no_sigma`, and by name a place without geometry.
+    Rejections: `multi_value`, `no_sigma`, and a name for a place without geometry.
     """
     o = sections.of(m.source, RdssAiding)
     if m.multi_value:
@@ -73,8 +73,8 @@ def measurements_of(
 
 
 def blocks(source: str, section: RdssAiding, sections: Sections) -> list[Block]:
-    """North and east of the error that fixes share; position compensation needs it for what the
-    moved fix is wrong by. One block, whatever the number of terminals: the first says its noise."""
+    """Block of the fixes' shared error north and east, which position compensation needs for the
+    error of the moved fix. One block for all terminals, with the noise of the first."""
     if section.bias_sd_m > 0.0:
         return [position_bias(BIAS_BLOCK, section.bias_sd_m, section.bias_correlation_s)]
     if section.strategy == "position_compensation":

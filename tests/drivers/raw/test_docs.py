@@ -1,4 +1,4 @@
-"""`docs/gnss-raw.md` says what the code does: its configuration, counters and program are run."""
+"""`docs/gnss-raw.md` and `gnss-signals.md` say what the code does: keys, counters, program."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tests.drivers.raw.frames import measurement, rawx
 from tests.places import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "gnss-raw.md").read_text()
+SIGNALS_PAGE = (REPOSITORY / "docs" / "gnss-signals.md").read_text()
 CODE = "".join(path.read_text() for path in sorted((REPOSITORY / "drivers" / "raw").glob("*.py")))
 COMPOSED = {
     *(
@@ -37,7 +38,7 @@ def block(language: str, chapter: str = "") -> str:
 
 
 def test_configuration_is_accepted_with_every_option() -> None:
-    text = block("toml")
+    text = block("toml", "In five minutes")
     section = tomllib.loads(text)["sources"]["gnss"]
     assert section.pop("driver") == "gnss"
     GnssOptions.model_validate(section)
@@ -56,7 +57,8 @@ def test_aiding_is_accepted() -> None:
 
 
 def test_counters_are_those_of_the_code() -> None:
-    section = PAGE.partition("## What is refused")[2].partition("## When it does not work")[0]
+    title = "## Why a frame or measurement was refused"
+    section = SIGNALS_PAGE.partition(title)[2].partition("## In the filter")[0]
     documented = set(re.findall(r"`(\w+)`", section)) - {"health"}
     for name in documented - COMPOSED - FRAMING:
         assert f'"{name}"' in CODE, f"{name} is not counted"
@@ -70,8 +72,9 @@ def test_counters_are_those_of_the_code() -> None:
 
 def test_signals_are_those_of_the_code() -> None:
     names = {"GPS": "G", "Galileo": "E", "BeiDou MEO, IGSO": "C"}
+    section = SIGNALS_PAGE.partition("### Ionosphere models")[0]
     for name, system in names.items():
-        (row,) = re.findall(rf"^\| {name} \| ([^|]*) \|", PAGE, re.MULTILINE)
+        (row,) = re.findall(rf"^\| {name} \| ([^|]*) \|", section, re.MULTILINE)
         code = {signal for (gnss, _), signal in SIGNALS.items() if SYSTEM_BY_ID[gnss] == system}
         assert set(row.split(", ")) == code
 
