@@ -62,7 +62,8 @@ class NmeaDecoder:
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `datum_refused`, `height_implausible`, `speed_implausible`, `sigma_too_large`; within one
     `heading_mode_refused`, `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`,
-    `gga_awaited`, `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`.
+    `gga_awaited`, `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`,
+    `course_missing`, `speed_held_at_zero`.
     """
 
     def __init__(

@@ -41,6 +41,7 @@ from drivers.nmea.fields import (
     typed_fields,
 )
 from drivers.nmea.mixed_framing import Sentence
+from drivers.nmea.printed_velocity import PrintedSpeed
 from drivers.nmea.time import parse_time_of_day, printed_time
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.quantization import NEAREST_SD
@@ -56,9 +57,6 @@ MAX_CYCLE = 24
 
 KNOT_M_S = 1852.0 / 3600.0
 KM_H_M_S = 1.0 / 3.6
-STANDSTILL_M_S = 0.05
-"""Speed below which an absent course means standing still: the Doppler velocity noise of a receiver
-(u-blox ZED-F9P data sheet: 0.05 m/s)."""
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
 _ESTIMATED = frozenset("EMS")
 _NOT_VALID = frozenset(("V", "N", ""))
@@ -118,8 +116,7 @@ class Epoch:
     """Fix mode of GSA: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
     sd_ned_m: Vector3 | None = None
     """Printed sigmas; `implausible` checks them."""
-    speed_m_s: float | None = None
-    course_deg: float | None = None
+    speed: PrintedSpeed | None = None
     heading_deg: float | None = None
     heading_mode: str | None = None
 
@@ -194,20 +191,11 @@ class Epoch:
         height = (self.altitude_m or 0.0) + (self.separation_m or 0.0)
         if not within(height, HEIGHT_M):
             return "height_implausible"
-        if self.speed_m_s is not None and self.speed_m_s > SPEED_M_S:
+        if self.speed is not None and self.speed.speed_m_s > SPEED_M_S:
             return "speed_implausible"
         if self.sd_ned_m is not None and max(self.sd_ned_m) > SIGMA_M[1]:
             return "sigma_too_large"
         return None
-
-    def v_ned_m_s(self) -> tuple[float, float, None] | None:
-        """Horizontal velocity; None when the receiver gives no course though it moves."""
-        if self.speed_m_s is None:
-            return None
-        if self.course_deg is None:
-            return (0.0, 0.0, None) if self.speed_m_s < STANDSTILL_M_S else None
-        course = math.radians(self.course_deg)
-        return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:
@@ -278,7 +266,8 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     else:
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
     if speed is not None and epoch.rmc_valid:
-        epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
+        step_m_s = step(fields["printed"][6]) * KNOT_M_S
+        epoch.speed = PrintedSpeed(speed * KNOT_M_S, step_m_s, course)
 
 
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
@@ -297,12 +286,13 @@ def _take_vtg(epoch: Epoch, fields: Fields) -> None:
     epoch.modes |= set(mode)
     if mode == "N":
         return
-    if epoch.speed_m_s is not None:
-        epoch.course_deg = course if epoch.course_deg is None else epoch.course_deg
+    if epoch.speed is not None:
+        if epoch.speed.course_deg is None:
+            epoch.speed = epoch.speed._replace(course_deg=course)
     elif knots is not None:
-        epoch.speed_m_s, epoch.course_deg = knots * KNOT_M_S, course
+        epoch.speed = PrintedSpeed(knots * KNOT_M_S, step(fields["printed"][4]) * KNOT_M_S, course)
     elif km_h is not None:
-        epoch.speed_m_s, epoch.course_deg = km_h * KM_H_M_S, course
+        epoch.speed = PrintedSpeed(km_h * KM_H_M_S, step(fields["printed"][6]) * KM_H_M_S, course)
 
 
 def _take_gsa(epoch: Epoch, fields: Fields) -> None:

@@ -24,6 +24,7 @@ from drivers.measurements import (
 )
 from drivers.nmea.epoch_assembly import INTEGRATED, Epoch
 from drivers.nmea.geoid_fallback import Geoid, states_geoid
+from drivers.nmea.printed_velocity import VelocityReader
 from drivers.nmea.reasons import Received, count_name
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
@@ -54,6 +55,7 @@ class EpochConverter:
         self._order = EpochOrder(counters)
         self._trust = TimeTrust()
         self._geoid = Geoid()
+        self._velocity = VelocityReader(counters)
         self._without_gga = 0
         """Consecutive epochs with RMC or GLL but neither GGA nor GNS."""
 
@@ -182,6 +184,7 @@ class EpochConverter:
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:
             self.counters["sigma_too_small"] += 1
             sd_ned_m = None
+        v_ned_m_s, open_sd_m_s = self._velocity.velocity_of(epoch.speed)
         return PositionFix(
             self._source,
             epoch.t_seen_ns,
@@ -194,7 +197,8 @@ class EpochConverter:
             epoch.hdop,
             epoch.vdop,
             sd_ned_m,
-            epoch.v_ned_m_s(),
+            v_ned_m_s,
             rounding_sd_ned_m=epoch.rounding_sd_ned_m,
+            rounding_sd_v_m_s=open_sd_m_s,
             geoid_sd_m=geoid_sd_m,
         )

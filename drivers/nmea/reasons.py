@@ -270,6 +270,16 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
         found["unknown_status"] = (
             f"RMC has the status {status!r}, which NMEA does not know: its velocity is not used"
         )
+    if counters["course_missing"] > max(counters["fixes"] // 2, MANY):
+        found["course_missing"] = (
+            "the receiver moves and gives a speed without a course: its fixes are used without "
+            "velocity; switch the course on in RMC or VTG"
+        )
+    if counters["speed_held_at_zero"] >= MANY:
+        found["speed_held_at_zero"] = (
+            "the receiver prints a speed of 0 whenever it is slow: it is used as one below 1.4 "
+            "m/s; switch static navigation (static hold) off"
+        )
     return found
 
 
