@@ -236,7 +236,7 @@ class InvariantFilter(TiltAxesFilter):
         self.turns |= self._settles and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         if self._settles and not self.turns:
             variance = self.covariance[PHI + 2, PHI + 2]
             self.turns = self.heading_known and bool(variance > LARGE_SD_RAD**2)

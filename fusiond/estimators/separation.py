@@ -71,7 +71,7 @@ class SeparatedEstimator(KalmanEstimator):
         return self._dxs[0, POSITION] - self._dxs[1:, POSITION]
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         if measurement.screened and measurement.renewal is not None:
             super()._renew(measurement.renewal)
         innovation = self._linearise(measurement)

@@ -135,7 +135,7 @@ class FederatedFilter(Estimator):
     # ------------------------------------------------------------------ update
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not.
+        """Update by one measurement, or return the reason for its rejection.
 
         NIS and whitened innovation of the outcome are those of the published estimate; for a
         screened measurement those of the filter that judges its rows.

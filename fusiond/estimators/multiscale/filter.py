@@ -147,7 +147,7 @@ class MultiscaleEstimator(Estimator):
         self._phi[:] = np.eye(len(self._phi))
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         innovation = self._linearise(measurement)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
