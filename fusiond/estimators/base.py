@@ -1,13 +1,12 @@
 r"""Estimators: the interface of a closed-loop error-state filter, and its common part.
 
-One navigation state is propagated through the IMU's samples. Beside it run the statistics of its
-error: one covariance and one error estimate for each filter that the estimator keeps (`covs`,
-`dxs`; filter 0 is what is published). An estimate of the error is taken out of the navigation state
-(`feed_back`); parameters keep their estimates in `xi`.
+One navigation state is propagated through the IMU's samples, with one covariance and one error
+estimate for each filter of the estimator (`covs`, `dxs`; filter 0 is published). An error estimate
+is subtracted from the navigation state (`feed_back`); estimates of parameters stay in `xi`.
 
 Gate: with S = H P H^T + R, nu^T S^-1 nu is chi-square with m degrees of freedom while filter and
-measurement agree; beyond the quantile of the measurement's gate probability the measurement is left
-out.
+measurement agree; beyond the quantile of the measurement's gate probability the measurement is
+rejected.
 
 Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
 """
@@ -58,7 +57,7 @@ _NO_WIDER = np.zeros(WIDER)
 
 
 class _Thresholds(dict[tuple[float, int], float]):
-    """Chi-square quantiles by gate probability and degrees of freedom, found once."""
+    """Chi-square quantiles by gate probability and degrees of freedom, cached."""
 
     def __missing__(self, key: tuple[float, int]) -> float:
         found = self[key] = quantile(key[1], 1.0 - key[0])
@@ -77,11 +76,11 @@ def gate_threshold(probability: float, degrees: int) -> float:
 
 class Outcome(NamedTuple):
     """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
-    L^-1 nu with S = L L^T). `rows`: of a screened measurement, what became of each row
-    (fusiond.estimators.update_with_exclusion); `whitened` is then 0 where a row was left out.
-    `lasting`: of one that is out, the NIS if each of the faults for which it may be out lasts;
-    `evidence_limits`: chi-square between that and its end that innovations without noise show.
-    `first`: innovation of the first row of one that a Kalman filter has fused at once, else NaN."""
+    L^-1 nu with S = L L^T). `rows`: outcome of each row of a screened measurement
+    (fusiond.estimators.update_with_exclusion); `whitened` is 0 for a rejected row. `lasting`: for
+    an excluded measurement, the NIS if each of its possible faults lasts; `evidence_limits`:
+    chi-square by which innovations without noise distinguish that from the fault's end. `first`:
+    innovation of the first row, if a Kalman filter has fused the measurement at once, else NaN."""
 
     name: str
     nis: float = float("nan")
@@ -94,8 +93,8 @@ class Outcome(NamedTuple):
 
 
 class Ran(NamedTuple):
-    """Result of a run of packed measurements: number of those that are finished, `DONE` or the
-    reason of its end, results (k, RESULT)."""
+    """Result of a run of packed measurements: number processed, `DONE` or the reason for stopping,
+    results (k, RESULT)."""
 
     done: int
     how: int
@@ -179,7 +178,7 @@ class Estimator:
 
     @property
     def heading_known(self) -> bool:
-        """True if the heading has been known since the start, of a filter that can lose it."""
+        """True if the heading has been known since the start; a filter may lose it."""
         return False
 
     @property
@@ -194,7 +193,7 @@ class Estimator:
         return {}
 
     def publish_by(self, published: Published) -> None:
-        """Publish so from the next start on."""
+        """Set axes and clock of publication from the next start on."""
         self.published = published
         self._memory.published[:] = published
 
@@ -254,8 +253,8 @@ class Estimator:
         return Ran(done, how, results)
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not; the variances of its rows, up to three, count
-        `noise` times (3,)."""
+        """Update by one measurement, or return the reason for its rejection; `noise` (3,): factors
+        on the variances of its first three rows."""
         raise NotImplementedError
 
     def hold(self) -> None:
@@ -307,13 +306,13 @@ class Estimator:
         feed_back(self.nav, self.xi, dx)
 
     def _screen(self, measurement: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
-        """Update by rows of a screened measurement, without touching `cov` and `dx`; where its
-        clock starts anew, in `cov` too."""
+        """Update by rows of a screened measurement, without changing `cov` and `dx`; a restarted
+        clock changes `cov`."""
         return screened(measurement, rows, self.model, gate_threshold(measurement.gate, 1), cov, dx)
 
     def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing is
-        folded in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
+        """Innovation of an `isolated` measurement, without an update. `lasting` (k, 3): effect of
+        each possible fault on it, if it lasts."""
         rows = self._linearise(measurement)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -338,7 +337,8 @@ class Estimator:
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts, limits)
 
     def adopt(self, mean: Array, spread: Array) -> None:
-        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
+        """Subtract a fault's effect of mean (n,) from the state and add its `spread` (n, n) to
+        P."""
         n = self.model.size
         self._correct(mean)
         self._cov[:n, :n] += spread
@@ -347,7 +347,7 @@ class Estimator:
             self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _correct(self, mean: Array) -> None:
-        """Take a fault's effect (n,) out of the state, as an update does."""
+        """Subtract a fault's effect (n,) from the state, as an update does."""
         self._feed_back(mean)
 
     def _renew(self, renewal: Renewal) -> None:
@@ -381,7 +381,7 @@ class Estimator:
         return reweighted(rows, self.model, self.covariance, self._dxs[0])
 
     def snapshot(self) -> Snapshot:
-        """A copy of everything."""
+        """Copy of the state, for `restore`."""
         if self.hypotheses is not None:
             self.hypotheses.conclude()
         m = self._memory
@@ -390,7 +390,7 @@ class Estimator:
         return Snapshot(self.t_ns, self.sample, m.kept.copy(), held, self._holding, extra)
 
     def restore(self, s: Snapshot) -> None:
-        """Back to a snapshot, bit for bit."""
+        """Restore a snapshot, bit for bit."""
         m = self._memory
         self.t_ns, self.sample, m.kept[:], _, self._holding, extra = s
         m.head[AHEAD] = s.held is not None

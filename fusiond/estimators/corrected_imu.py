@@ -1,4 +1,4 @@
-"""Compiled kernels: what the IMU's samples are once a filter's estimates are taken out."""
+"""Compiled kernels: IMU samples corrected by a filter's estimates."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def slopes(
     """Write the slopes (3,), a second, of rate and force over sample i of `samples` (6 m,); True if
     a gap precedes it.
 
-    Zero where the sample before holds over another length of time: beside a gap, at the start.
+    Zero if the sample before has another duration: beside a gap, at the start.
     """
     silent = i > 0 and times[i] - times[i - 1] > gap_ns
     if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:

@@ -7,10 +7,10 @@ rate d is a state, o <- o + h d):
     P11 <- M P M^T,   P12 <- M P T^T,   P22 <- T P22 T^T
     P <- P + q diag(G),   G = W h + s^2 (1 - D^2),   half of it before, the rest after
 
-W the white noise (trapezoid rule; what a Markov state has of it before decays, so that more of it
-comes after), s the steady sigma of Markov states, D their decay, q a factor on all noise (1, or 1 /
-beta in a federated filter's local filters). From interval to interval P12 alone is kept; `mirror`
-makes P21 of it where somebody reads P.
+W is the white noise (trapezoid rule; the first half decays in Markov states, so the second is
+larger there), s the steady sigma of Markov states, D their decay, q a factor on all noise (1, or 1
+/ beta in a federated filter's local filters). Between intervals only P12 is kept; `mirror` copies
+it to P21 before P is read.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def kept_part(work: Array, width: int) -> Array:
 
 @compiled("void(f8[::1], i8[::1], f8[::1])", forceinline=True)
 def weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
-    """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (28,)."""
+    """Write `weight` (12,): effect of each parameter on its axis error, by `step` (28,)."""
     for i in range(12):
         weight[i] = 0.0
         if sensor_terms[12 + i] == PLAIN:
@@ -64,8 +64,8 @@ def decays(h: float, noise: Array, width: int, kept: Array) -> None:
     From `KEPT` on the factor of each parameter, 1 where it does not decay; `width` behind it the
     variance that each state grows by. `noise` (3 n,) as of the model.
 
-    They are kept from one interval to the next, which is most often as long: an exponential a
-    state, and one more for its estimate, cost a tenth of an interval.
+    They are cached, as most intervals have the same length: two exponentials for each state would
+    cost a tenth of an interval.
     """
     if kept[0] != h:
         kept[0], kept[1] = h, 0.0
@@ -82,9 +82,9 @@ def decays(h: float, noise: Array, width: int, kept: Array) -> None:
 def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
     """`gather` for rows of `width` doubles.
 
-    The loops along a row end at a length that is read from an array: a short loop of a constant
-    length is unrolled before anybody makes vector code of it. Those down a column are of a constant
-    length for that very reason: vector code scatters, which costs more.
+    Loops along a row end at a length read from an array: the compiler would unroll a short constant
+    loop before it vectorises. Loops down a column have a constant length for the same reason:
+    vector code would scatter, which costs more.
     """
     unsigned = np.uint64  # an index that cannot be negative needs no check
     wide = np.uint64(width)
@@ -280,8 +280,8 @@ def transition_for(width: int) -> Callable[..., None]:
 
 @compiled("void(f8[::1], f8, i8[::1], f8[::1])", forceinline=True)
 def propagate_parameters(x: Array, h: float, rate_terms: Indices, kept: Array) -> None:
-    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by what
-    `decays` has `kept` for it."""
+    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by the
+    factors that `decays` has `kept`."""
     rates = rate_terms.shape[0] // 2
     for k in range(rates):
         x[rate_terms[k]] += h * x[rate_terms[rates + k]]

@@ -3,10 +3,10 @@ r"""Partial renewal of errors that successive measurements share.
     t <- R t + w       t in units of their initial sigmas
     t <- R t + G e + w,  and what the states are is given: a clone of the navigation errors e
 
-of states with covariance P, error estimate and parameters, and of the sensitivities V of a bank's
-hypotheses: what of P and V belongs to t is multiplied by R, and P grows by w. A clone's P and V are
-what G makes of those of e. Source: Groves, 2nd edition, 3.2.4; Roumeliotis and Burdick, Stochastic
-cloning, ICRA 2002.
+for covariance P, error estimate, parameters, and the sensitivities V of a bank's hypotheses: the
+parts of P and V of t are multiplied by R, and P grows by w. P and V of a clone are those of e
+multiplied by G. Source: Groves, 2nd edition, 3.2.4; Roumeliotis and Burdick, Stochastic cloning,
+ICRA 2002.
 """
 
 from __future__ import annotations

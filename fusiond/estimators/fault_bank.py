@@ -1,7 +1,7 @@
-r"""Bank of fault hypotheses beside a filter: each a separate-bias estimator that is carried along.
+r"""Bank of fault hypotheses beside a filter: separate-bias estimators, propagated with it.
 
-Hypothesis f: since t_f something is wrong by a constant b (p numbers) that enters the motion or the
-measurements by a known signature,
+Hypothesis f: since t_f a constant fault b (p numbers) acts on the motion or the measurements by a
+known signature,
 
     dx' = F dx + G w + B b          z = H dx + D b + v        dx computed less true
 
@@ -18,17 +18,15 @@ variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt
     left unexplained    J - l                            chi-square of N - p if it is f
     log odds            as of fusiond.estimators.fault_odds
 
-An onset is not known: each kind runs from restarts of several periods T, in turns. What has turned
-out to be a likely onset takes the place of a less likely one of the next longer period before it
-begins anew. A fault of the inertial unit begins as a step of
-states, V = 1 at its onset; one of a measurement is its rows' D. A delay of tau is the filter's own
-past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here; its velocities as they
-are known now: what has been fed back since is taken off the past as well. A change of velocity over
-tau is then what was felt, and holds no noise of the measurements since: a filter that states more
-process noise than there is follows each of them, and would find its innovations in what it follows.
+Onsets are unknown: each kind is restarted with several periods T, in turns. Before a restart, a
+likely onset replaces a less likely one of the next longer period. A fault of the inertial unit
+starts as a step of states, V = 1 at its onset; a fault of a measurement is D of its rows. A delay
+of tau uses the filter's own past, D = p(t) - p(t - tau), of a stored path by dead reckoning.
+Feedback also corrects the stored velocities, so that a change of velocity over tau is the sensed
+one, without noise of later measurements, which a filter with too much process noise follows.
 
-All of it lies in the filter's memory: a snapshot copies it, a rewind restores it to the bit. How is
-said here; onsets are in fusiond.estimators.fault_onsets, signatures and evidence in
+The bank lies in the filter's memory: a snapshot copies it, a rewind restores it bit for bit. This
+module has its layout; onsets are in fusiond.estimators.fault_onsets, signatures and evidence in
 fusiond.estimators.fault_update, odds in fusiond.estimators.fault_odds.
 
 Source: Friedland, Treatment of bias in recursive filtering, IEEE Trans. AC 14 (1969), 359; Willsky,
@@ -158,8 +156,8 @@ class FaultTable(NamedTuple):
 
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
-    """Table of these kinds, `numbers` (k, 7). ValueError where a kind has neither three numbers nor
-    one, a mean of three or of an unknown size, or those of three do not come first."""
+    """Table of these kinds, `numbers` (k, 7). ValueError if a kind has neither three numbers nor
+    one, a mean of three or of an unknown size, or if kinds of three do not come first."""
     sizes = ints[:, SIZE]
     if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
         raise ValueError("kinds have three numbers or one, those of three first")
@@ -200,8 +198,7 @@ def bank_size(table: FaultTable, n: int, width: int) -> int:
 
 
 def columns_of(table: FaultTable) -> int:
-    """Columns of V, and of a measurement's rows: whole steps of vector code, the last ones of
-    nothing."""
+    """Columns of V and of a measurement's rows, padded to whole vector steps."""
     tiles, ones = -(-table.threes // LANES), -(-(table.groups - table.threes) // LANES)
     return -(-(3 * tiles + ones) // 4) * 4 * LANES
 
@@ -242,8 +239,8 @@ def column_of(bank: Array, number: int, component: int) -> int:
 
 @compiled("b1(f8[::1], i8, f8, b1)", forceinline=True)
 def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
-    """True if hypotheses are judged at rows of such kinds: they are `measured`, or known of the
-    vehicle while nothing is. Whoever is alone is the only witness, if a coloured one."""
+    """True if hypotheses are judged at such rows: they are `measured`, or a constraint while
+    nothing else is, as it is then the only evidence."""
     if measured:
         bank[LAST_MEASURED] = t_s
     alone: bool = measured or (measures != NOTHING and t_s - bank[LAST_MEASURED] > ALONE_S)

@@ -81,10 +81,10 @@ class Estimated(NamedTuple):
 class Hypotheses:
     """A bank of `table` in `bank`, beside a filter of `model`: `of` are its state (10,), parameters
     (n,), last step (28,) and axes and clock of publication (3,), and `wider` (9,) the variances
-    that what it publishes has beyond P's.
+    that the published solution has beyond P.
 
-    Rows of one instant are judged once, together, unless something depends on it before the filter
-    goes on: one fails its gate, or a hypothesis has been likely, and may be identified.
+    Rows of one instant are judged once, together, unless one fails its gate or a likely hypothesis
+    may be identified.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Hypotheses:
 
     def of(self, measurement: Linearised) -> tuple[int, int]:
         """Measures of a measurement's rows, as in fusiond.estimators.fault_bank, and its device
-        number; -1 without a kind for it."""
+        number; -1 if no kind affects it."""
         known = self.of_source.get(measurement.source)
         if known is None:
             devices = self.table.devices
@@ -127,14 +127,14 @@ class Hypotheses:
         return known
 
     def is_evidence(self, measurement: Linearised, used: bool) -> bool:
-        """True if hypotheses are judged at a measurement that is `used`, or is not."""
+        """True if hypotheses are judged at a measurement, `used` or not."""
         measures = self.of(measurement)[0] if used else NOTHING
         measured = used and not measurement.constraint
         return bool(is_evidence(self.bank, measures, measurement.t_ns * 1e-9, measured))
 
     @property
     def waits(self) -> bool:
-        """True if V is still that of the last measurement, as after a propagation in passing."""
+        """True if V has not been propagated since the last measurement."""
         return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
@@ -150,8 +150,8 @@ class Hypotheses:
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def begin_again(self, measurement: Linearised, nav: Array, step: Array) -> None:
-        """A measurement's series returns to service: what was shown of it before is why it was out,
-        and its hypotheses begin anew."""
+        """Restart the hypotheses on a series that returns to service, as earlier evidence belongs
+        to its exclusion."""
         begin_again(
             self.bank, self.table.ints, self.n, *self.of(measurement), measurement.t_ns, nav, step
         )
@@ -159,8 +159,8 @@ class Hypotheses:
     def begin_lasting(
         self, t_ns: int, kind: int, onset_s: float, b: Array, sd: Array, log_odds: float
     ) -> None:
-        """A fault of size `b` with `sd` (p,) may last since `onset_s`, with such odds: of its kind
-        the restart that goes on longest begins with what is known, L = M^-1 - S^-1."""
+        """Start a hypothesis that a fault of size `b` with `sd` (p,) has lasted since `onset_s`,
+        with these odds: the restart of longest remaining time gets L = M^-1 - S^-1."""
         level = len(SLOTS_OF) - 1
         turn = int(self.bank[RESTARTED + level])
         at, p = self._at[kind, BEGINS_AT[level] + turn % SLOTS_OF[level]], len(b)
@@ -176,18 +176,18 @@ class Hypotheses:
         self.judge(t_ns)
 
     def keep_fed_back(self, dx: Array) -> None:
-        """An error (n,) is taken out of the filter's state: out of the path behind it as well."""
+        """Subtract an error (n,), removed from the filter's state, from the stored path."""
         keep_fed_back(self.bank, dx)
 
     def adds(self, measurement: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
-        """D b (3,): what a fault of size `b`, of such an age, does to a measurement's rows."""
+        """D b (3,): effect of a fault of size `b` and given age on a measurement's rows."""
         out, table = np.empty(3), self.table
         of = kind, *self.of(measurement)
         rows_of_fault(self.bank, *table[:2], *of, measurement.t_ns * 1e-9, age_s, nav, b, out)
         return out
 
     def judge(self, t_ns: int) -> Array:
-        """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
+        """Compute the odds of all hypotheses at a measurement's epoch; the result `found` (5,)."""
         table = self.table
         judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
@@ -211,7 +211,7 @@ class Hypotheses:
             judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)
 
     def widen(self, nav: Array, step: Array, time_slot: int, wider: Array) -> None:
-        """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
+        """Write `wider` (9,): variances that the weighted hypotheses add to the published ones."""
         of = self.n, nav, step, time_slot
         widen_by_faults(self.bank, self.table.lanes, *of, self.work, wider)
 
@@ -271,7 +271,7 @@ class Hypotheses:
 
     @property
     def explains(self) -> NDArray[np.bool_]:
-        """(k, restarts): no more is left than chance leaves."""
+        """True (k, restarts) if the unexplained rest is within chance."""
         found: NDArray[np.bool_] = self.each(UNEXPLAINED) <= 0.0
         return found
 

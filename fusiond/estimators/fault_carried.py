@@ -1,9 +1,9 @@
-"""Compiled kernel: the sensitivities of a bank of hypotheses, carried on between two measurements.
+"""Compiled kernel: propagation of a bank's sensitivities between two measurements.
 
-What lies between two measurements is one transition, which is carried from crossing to crossing as
-the covariance is (fusiond.estimators.multi_sample_covariance), and V is multiplied by it where a
-measurement is to be folded in. Most rows of it are those of the identity: of navigation errors
-nine, of others those that decay, grow with a rate, or are turned at rest.
+One transition covers the time between two measurements. It is propagated with the covariance
+(fusiond.estimators.multi_sample_covariance), and V is multiplied by it before an update. Most of
+its rows are those of the identity; others are the nine of the navigation errors, and those of
+states that decay, grow with a rate, or are turned at rest.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 r"""Odds of a bank's hypotheses, and the uncertainty that they add to the published solution.
 
     log odds            log(rate T) + l / 2 - max(p log(N) / 2, log det(I + S L) / 2)
-                        of a kind that is known to be of a size
+                        for a kind of known size
                         log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
                         + e^T m - m^T L m / 2
     weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
@@ -10,9 +10,9 @@ r"""Odds of a bank's hypotheses, and the uncertainty that they add to the publis
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
 
-What p unknowns gain by chance is taken off, by the number of rows (Schwarz) or by the size that
-such a fault is expected to have, whichever takes more: what is far smaller is what no model knows
-of a sound receiver. Between kinds that fit alike neither decides (`judge`).
+The gain of p unknowns by chance is subtracted, by the number of rows (Schwarz) or by the expected
+size of such a fault, whichever is more: a far smaller fault cannot be distinguished from unmodelled
+errors of a working receiver. Between kinds that fit alike there is no decision (`judge`).
 
 Source: as of fusiond.estimators.fault_bank; Schwarz, Estimating the dimension of a model, Annals of
 Statistics 6 (1978), 461; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for the moments of a
@@ -115,7 +115,7 @@ BEST, BEST_ODDS, AHEAD, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
     """Write M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,).
 
-    With the mean of its kind's `numbers` (7,) where `share` is 1; by Gauss-Jordan elimination of a
+    With `share` 1 the mean of its kind's `numbers` (7,) is used. Gauss-Jordan elimination of a
     positive definite matrix. Returns e^T b: without a mean the explained chi-square l.
     """
     a = np.empty((3, 6))
@@ -199,8 +199,8 @@ def _gains(bank: Array, lanes: Array) -> None:
 
 @compiled("f8(f8[::1], f8[::1], i8, i8, b1, f8[::1])", forceinline=True)
 def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Array) -> float:
-    """Log of the ratio of a fault's size to its expectation; a size that no unit's fault has
-    explains nothing."""
+    """Log of the ratio of a fault's size to its expectation; an impossible size explains
+    nothing."""
     share = MOST_OF_UNIT**-2 if unit else TINY
     gained = solve(bank, at, size, numbers, share, m)
     bank[at + UNEXPLAINED] += bank[at + EXPLAINED] - gained
@@ -229,8 +229,8 @@ def _of_its_size(bank: Array, numbers: Array, at: int, m: Array) -> bool:
 def _odds(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int, m: Array, counts: Array
 ) -> None:
-    """Write the log odds of a group; m (12,) is work space, `counts` (restarts, 2) the number of
-    rows of those before it, most often that of all kinds, and its log."""
+    """Write the log odds of a group; m (12,) is work space, `counts` (restarts, 2) caches the
+    number of rows, mostly equal for all kinds, and its log."""
     threes, at, kind = int(bank[THREES]), group_at(bank, number), number // RESTARTS
     size = 3.0 if number < threes else 1.0
     a, bank[at + WEIGHT] = bank[at + WEIGHT], 0.0
@@ -265,7 +265,7 @@ def _odds(
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
-    """Lead of a group over those of other kinds; infinite where no decision is needed."""
+    """Lead of a group over those of other kinds; infinite if no decision is needed."""
     own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
@@ -295,14 +295,14 @@ def judge(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, epoch_s: float, found: Array
 ) -> None:
     """Write log odds, weight and unexplained chi-square of each group, and `found` (4,), at an
-    epoch of a measurement. A single measurement accuses the nearest hypothesis; one is found after
-    it has been likely and has explained all for `LASTS_S`. Three numbers of a known size open what
-    is published, and accuse nobody.
+    epoch of a measurement. A single measurement favours the nearest hypothesis; so one is
+    identified after it has been likely and has explained all for `LASTS_S`. Kinds of three numbers
+    of a known size only widen the published covariance.
 
-    It is ahead of another by odds. Between a step of states, which changes what is published, and a
-    fault of a source that is likelier than nothing wrong it counts how well each fits, if that is
-    less: what fits as well is not told apart by rates alone. Compared are those of one onset; else
-    the source's may have lost something.
+    The lead over another is the difference of log odds. Between a step of states, which changes the
+    published state, and a source's fault that is likelier than no fault, the difference of the fits
+    counts if it is less: rates alone must not decide. Only hypotheses of one onset are compared, as
+    a later restart of the source's may have lost evidence.
     """
     groups, m, counts = int(bank[ALL]), np.empty(12), np.zeros((RESTARTS, 2))
     _gains(bank, lanes)
@@ -350,7 +350,8 @@ def judge(
 
 @compiled("b1(f8[::1])", forceinline=True)
 def identified(found: Array) -> bool:
-    """True if a group is so much likelier than all of other classes, as `judge` has `found`."""
+    """True if a group is sufficiently likelier than all of other classes, as `judge` has
+    `found`."""
     apart = found[BEST] >= 0.0 and found[AHEAD] > APART
     return bool(apart)
 

@@ -1,9 +1,9 @@
 r"""Compiled kernels: onset of each hypothesis of a bank, and its initial step of states.
 
-As fusiond.estimators.fault_bank says. One of them is that a source's fault is over, which the
-filter has followed: its error is then what those faults f have done to it, as they are weighed,
+For fusiond.estimators.fault_bank. One hypothesis is the end of a source's fault that the filter has
+followed. Its error is then the effect of those faults f, weighted,
 
-    V = sum w_f V_f b_f / w,   w = sum w_f,   which is as likely to begin as w
+    V = sum w_f V_f b_f / w,   w = sum w_f,   with w as its initial probability
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ COUNTS = 1e-3
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
 def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Array) -> None:
-    """Write the effect of sources' faults on the filter (n,), and their total weight."""
+    """Write the weighted effect of sources' faults on the filter (n,), and their total weight."""
     followed[:] = 0.0
     if not bank[ANY_FAULT] > COUNTS:
         return
@@ -161,7 +161,7 @@ def begin_all(
 def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
     """Replace the less likely onset of the level above, if much less likely.
 
-    By the one whose turn to restart has come."""
+    The replacement is the hypothesis that is due to restart."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return

@@ -1,11 +1,11 @@
 """Compiled kernel: cheap test for a likely hypothesis, before all odds are computed.
 
-With the prior's density taken for its largest, log odds are at most
+With the largest value of the prior's density, log odds are at most
 
     log(rate T) + l / 2        of any kind, as fusiond.estimators.fault_odds has them
 
-so that an epoch of which none is beyond what makes a hypothesis likely needs no odds and no
-weights, unless somebody reads them before the next one.
+so an epoch in which no group exceeds the threshold of a likely hypothesis needs no odds and no
+weights, unless they are read before the next epoch.
 """
 
 from __future__ import annotations

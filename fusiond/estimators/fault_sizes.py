@@ -1,18 +1,18 @@
 r"""Sizes of a bank's hypotheses, and the covariance that they add to the published one.
 
-Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
-the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
+The mixture of fusiond.estimators.fault_odds adds to nine published variances and three products of
+attitude errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
 
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 
-for eight groups side by side. What is published is by the receiver's clock, whose offset tau a
-fault moves, too (fusiond.estimators.published_state): v is V of p - v tau, of v - a tau, of phi + u
-tau.
+for eight groups side by side. The published state is by the receiver's clock, whose offset tau a
+fault changes, too (fusiond.estimators.published_state): v is V of p - v tau, of v - a tau, of phi +
+u tau.
 
-The attitude is that of the axes that were configured, and the vehicle's as far as the unit sits on
-it so: pitch and yaw are open by what the mounting has beyond chance, too, and by all that the unit
-has been found to have turned. In a bank or on a slope a turn d about the vertical axis is one of
-roll by d tan(pitch) and of pitch by d sin(roll).
+The attitude is that of the configured axes, and of the vehicle if the mounting is right: sigma of
+pitch and yaw includes mounting angles beyond chance, and all turns of the unit that were found. In
+a bank or on a slope a turn d about the vertical axis adds d tan(pitch) to roll and d sin(roll) to
+pitch.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
 def _published_rows(
     kept: Single, columns: int, first: int, count: int, motion: Array, time_slot: int, out: Array
 ) -> None:
-    """Write v (9, count) of so many columns of V, for a vehicle that is `moving` (12,)."""
+    """Write v (9, count) of `count` columns of V, for the motion `moving` (12,)."""
     for i in range(CORE_SIZE):
         row, to = kept[i * columns + first :], out[i * count : (i + 1) * count]
         for j in range(to.shape[0]):
@@ -147,8 +147,8 @@ def widen_by_faults(
     work: Array,
     wider: Array,
 ) -> None:
-    """Write `wider` (9,): what the weighed hypotheses leave open of position, velocity, roll, pitch
-    and yaw of nav (10,) with the attitude that `step` (28,) holds, published by the clock whose
+    """Write `wider` (9,): variances that the weighted hypotheses add to position, velocity, roll,
+    pitch and yaw of nav (10,) with the attitude of `step` (28,), published by the clock whose
     offset is parameter `time_slot` (-1: none); `work` (OPENED_WORK,)."""
     kept, motion = bank[int(bank[SENSITIVITIES]) :].view(np.float32), np.empty(MOVING)
     moving(nav, step, motion)
@@ -262,7 +262,7 @@ def judge_and_widen(
     enough.
 
     `published` (3,) as of fusiond.estimators.published_state. `mounting` (2, 2): slots of the
-    mounting's pitch and yaw in xi (n,), or -1, and what of their squares is chance.
+    mounting's pitch and yaw in xi (n,), or -1, and the part of their squares due to chance.
     """
     if measured and used:
         judge(bank, ints, numbers, lanes, epoch_s, found)

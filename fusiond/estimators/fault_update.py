@@ -1,6 +1,6 @@
 """Compiled kernels: measurement rows under each hypothesis of a bank, and the update by them.
 
-As fusiond.estimators.fault_bank says, with the path by dead reckoning that a delay needs.
+For fusiond.estimators.fault_bank, with the path by dead reckoning that a delay needs.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ Indices = NDArray[np.int64]
 def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
     """Extend the path by `step_s` at the velocity of `nav` (10,) and store its point.
 
-    With the velocity before all that has been fed back.
+    The velocity excludes all feedback so far.
     """
     for i in range(3):
         bank[PATH + i] += step_s * nav[VN + i]
@@ -103,7 +103,7 @@ def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
 
 @compiled("void(f8[::1], f8[::1])", forceinline=True)
 def keep_fed_back(bank: Array, dx: Array) -> None:
-    """An error (n,) has been taken out of the state: out of its past velocities as well."""
+    """Subtract an error (n,), removed from the state, from past velocities as well."""
     for i in range(3):
         bank[FED_BACK + i] += dx[DV + i]
 
@@ -137,8 +137,7 @@ def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """True if a kind concerns these rows: of its device, or of any and this one locates or
-    moves."""
+    """True if a kind concerns these rows: of its device, or of any device that locates or moves."""
     if ints[kind, SIGNATURE] <= FOLLOWED:
         return False
     if measures == PLACES and not ints[kind, LOCATES]:
@@ -292,7 +291,7 @@ def account(
     bank: Array, n: int, measures: int, y: Array, g: Array, fused: bool, work: Single
 ) -> None:
     """Update the bank from `work` of `sensitivity_rows` and the whitened innovation y (m,); `fused`
-    where the filter uses the rows, with g (m, w) as `whiten` leaves it."""
+    if the filter uses the rows, with g (m, w) from `whiten`."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n

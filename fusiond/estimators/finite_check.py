@@ -1,4 +1,4 @@
-"""Check that a filter is finite: asked after every tick."""
+"""Check after every tick that a filter is finite."""
 
 from __future__ import annotations
 

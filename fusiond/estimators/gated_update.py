@@ -35,11 +35,11 @@ Indices = NDArray[np.int64]
 def nis_if_sensors_fail(
     bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Single
 ) -> float:
-    """Normalised innovation squared, sensor faults granted.
+    """Normalised innovation squared if the inertial unit is at fault.
 
-    nu^T S^-1 nu of a whitened innovation y (m,), with S widened by what faults of the inertial unit
-    (class 0) and those of sources that are over leave open, as they are weighed. Infinite unless
-    they are likelier than all else together. `work` as `sensitivity_rows` leaves it."""
+    nu^T S^-1 nu of a whitened innovation y (m,), with S widened by the weighted faults of the
+    inertial unit (class 0) and by ended faults of sources. Infinite unless these are likelier than
+    all else together. `work` from `sensitivity_rows`."""
     rows = y.shape[0]
     c, m, likely = np.eye(rows), np.empty(12), 0.0
     for number in range(int(bank[ALL])):
@@ -99,12 +99,12 @@ def fold_and_account(
     work: Single,
     found: Array,
 ) -> float:
-    """Gate and fold as `fusiond.estimators.update.fuse` without holding, and update the bank if
+    """Gate and update as `fusiond.estimators.update.fuse` with feedback, and update the bank if
     present; `measures` and `device` as in `sensitivity_rows`.
 
-    A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
-    would never be found else. Where such a fault, as likely as it is, explains it, it is folded in;
-    what of the same instant has not been judged is judged before, to `found` (5,).
+    A failed row is evidence, too: otherwise a fault of the inertial unit that fails every gate
+    would never be found. If such a fault, at its present probability, explains the row, the row is
+    used; rows of the same instant that have not been judged are judged before, to `found` (5,).
     """
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:

@@ -1,30 +1,30 @@
 r"""Gyro error after an update that changes the estimated turn rate.
 
-While tilt and force bias hide each other (fusiond.estimators.tilt_frame_after_heading_update), both
-stay as they are on the vehicle: of a computed attitude C that turns about the vertical at w, with a
-tilt t and a rate bias error e, what moves the vehicle changes with
+While only the sum of tilt and force bias is known
+(fusiond.estimators.tilt_frame_after_heading_update), both are constant on the vehicle. For a
+computed attitude C that turns about the vertical at w, with tilt t and rate bias error e,
 
     (C e)_h + w z x t = 0   to some 0.01 deg/s                         z down, h horizontal
 
 (t' = -(C e)_h, and with the turn that the yaw gyro's error only pretends + (C e)_D z x t: in truth
-(C e)_h = -w_true z x t.) An update that tells dx of the gyros' biases makes w of it less by
-(C dx)_D, and if P stays as it is, the next measurements say
+(C e)_h = -w_true z x t.) An update by dx of the gyros' biases reduces w by (C dx)_D; with P
+unchanged the next measurements imply
 
     (C+ e)_h + w+ z x t = 0
 
-as well. Both at once are true of t = 0 alone: 2 deg/s of yaw rate that were none, with 5 deg of
-tilt, pass for 0.2 deg/s. The transform after the update that carries the first over to the second,
+as well. Both hold together only for t = 0: a false yaw rate of 2 deg/s with 5 deg of tilt looks
+like 0.2 deg/s. The transform after the update from the first to the second,
 
     C+ e <- R(psi) (C e) + (C dx)_D z x R(psi) t        psi of
     fusiond.estimators.tilt_frame_after_heading_update
 
-leaves the second alone. That holds of a bias that was always wrong, and would be false of one that
-has just changed: after a doubt of the motion there is none until the filter starts anew. Cars that
-start on the move, of gyros with 3 deg/s, are the ones that it is for: what they turn at is known
-only once they accelerate, or do not slide, and then within a second.
+leaves only the second. It holds for a bias that was always wrong, not for one that has just
+changed: after a doubt of the motion it is not applied until the filter restarts. It is needed for
+starts on the move with gyro biases of 3 deg/s: their turn rate becomes known only once the vehicle
+accelerates or does not slide, and then within a second.
 
-Source: as of fusiond.estimators.tilt_frame_after_heading_update, whose error this is in other
-states.
+Source: as of fusiond.estimators.tilt_frame_after_heading_update, which treats the same error in
+other states.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Indices = NDArray[np.int64]
 
 
 def gyro_slots(model: Model) -> Indices:
-    """Slots (3,) of the gyros' biases; none where an axis has several, or none."""
+    """Slots (3,) of the gyros' biases; empty if an axis has several or none."""
     found = [model.parameters(RATE_ERROR + axis) for axis in range(3)]
     one = all(len(slots) == 1 for slots in found)
     return np.array([slots[0] for slots in found] if one else [], dtype=np.int64)
@@ -54,9 +54,9 @@ def gyro_slots(model: Model) -> Indices:
 def keep_turn(
     m: Array, before: Array, after: Array, psi: float, told: Array, gyros: Indices
 ) -> None:
-    """M (n, k) <- T M: what was known of the turn at the attitude q_nb (4,) `before` is known of
-    the one `after`, which is by `psi` (rad) about the vertical, with T P T^T. Of the biases, slots
-    `gyros` (3,), the update has told `told` (3,); the tilt of M is in the axes of after."""
+    """M (n, k) <- T M: transfer the information on the turn from attitude q_nb (4,) `before` to
+    `after`, `psi` (rad) further about the vertical; P becomes T P T^T. `told` (3,): the update of
+    the biases in slots `gyros` (3,); the tilt of M is in the axes of `after`."""
     c, s = math.cos(psi), math.sin(psi)
     old, new = dcm_elements(before), dcm_elements(after)
     less = old[6] * told[0] + old[7] * told[1] + old[8] * told[2]

@@ -1,52 +1,51 @@
 r"""Error-state filter in invariant coordinates, consistent under a large heading error.
 
-A heading error turns all that was felt since the heading was last of no matter: a vehicle that has
-driven off in an unknown direction is somewhere on an arc. In dx that is a bent distribution; here
-it is a normal one. Of a state with attitude C^, velocity v^ and position p^, all computed:
+A heading error turns the preintegrated motion: a vehicle that has driven off in an unknown
+direction is somewhere on an arc. In dx that distribution is curved; in xi it is normal. For a
+computed state with attitude C^, velocity v^ and position p^:
 
     C = E C^                               E = R(psi) exp(t x), R a turn about the vertical
     v = v^ - v_t + E v_t - R eta_v
     p = p^ - p_t + E p_t - R eta_p
 
-xi = (t_n, t_e, psi, eta_v, eta_p, parameters), psi of any size. v_t and p_t are what of velocity
-and position turns with the heading, and P itself tells them: the regression on psi,
+xi = (t_n, t_e, psi, eta_v, eta_p, parameters), psi of any size. v_t and p_t are the parts of
+velocity and position that turn with the heading, from P by regression on psi,
 
     cov(dv, psi) / var(psi) = v_t x z,   cov(dr, psi) / var(psi) = p_t x z        z down
 
-for turned about the vertical a solution of the equations of motion is one again (gravity is down;
-but for the Earth's own rate), and F gathers that in P. From rest v_t = v^ and p_t is the way since,
-and xi is the right-invariant error of the group SE_2(3) about the place of departure, in which such
-a distribution stays normal exactly. What was measured in north and east by itself does not turn:
-its v_t and p_t are 0, and no fix at rest tells a heading. (The invariant error proper turns all,
-the noise of the fixes too; a Gauss-Newton step then sees a heading in it.)
+because a solution of the equations of motion, turned about the vertical, is a solution again
+(gravity is down; apart from the Earth's rate), which F accumulates in P. From rest v_t = v^ and p_t
+is the path since, and xi is the right-invariant error of the group SE_2(3) about the place of
+departure, in which the distribution stays exactly normal. Measured north and east components do not
+turn: their v_t and p_t are 0, and no fix at rest shows a heading. (The invariant error proper turns
+everything, the noise of the fixes, too; a Gauss-Newton step then finds a heading in it.)
 
-Once the heading is known to `WIDE_SD_RAD` v_t is v^: the vehicle goes the way it faces, and what
-turns is its speed, v = E (v^ - eta_v) with eta_v of any size. No slip (C^T v) is then linear in
-eta_v whatever speed and heading, where the plain error has it depend on a speed that the next fix
-may double, and grows sure of heading and pitch for it. To first order, at the state of xi_i,
+Once the heading is known to `WIDE_SD_RAD`, v_t is v^: the vehicle moves forward, and its speed
+turns, v = E (v^ - eta_v) with eta_v of any size. The no-slip constraint (C^T v) is then linear in
+eta_v at any speed and heading. In the plain error it depends on a speed that the next fix may
+double, and makes heading and pitch too certain. To first order, at the state of xi_i,
 
     dx = J_i xi,   dv = R eta_v + [E v_t x] R phi,   dr = R eta_p + [E p_t x] R phi
 
-with E (v_t - eta_v) in place of E v_t, and E eta_v, where v_t is the speed. What does not turn
-keeps the axes of the estimate: R in R eta is that of xi_i, and no slope of psi. Between updates P
+with E (v_t - eta_v) in place of E v_t, and E eta_v, if v_t is the speed. Parts that do not turn
+keep the axes of the estimate: R in R eta is that of xi_i and has no slope by psi. Between updates P
 is that of dx, so kernels and measurements are those of every filter. An update runs in xi about the
-state before it and is linearised about the one that it leads to (Gauss-Newton): with
-P_xi = J_0^-1 P J_0^-T
+prior state and is linearised about the resulting one (Gauss-Newton): with P_xi = J_0^-1 P J_0^-T
 
     nu_i = z(x_i) + H_i J_i xi_i,   xi_(i+1) = K_i nu_i,   P = J_i P_xi J_i^T  after it
 
 the covariance transform of an error that is reset, without which tilt and velocity errors would,
-after a correction of 90 deg, be correlated with the sensor errors of the wrong axes (nor does what
-the force biases make downward change: fusiond.estimators.tilt_frame_after_heading_update). One
-start of Gauss-Newton finds a heading that is off by up to 150 deg; with a sigma that reaches beyond
-it is begun at four headings, and the likeliest counts.
+after a correction of 90 deg, be correlated with the sensor errors of the wrong axes (the downward
+effect of force biases does not change, either: fusiond.estimators.tilt_frame_after_heading_update).
+Gauss-Newton finds a heading error of up to 150 deg; for a larger sigma it starts at four headings,
+and the likeliest result is used.
 
-Where the model has the IMU's mounting m against the vehicle, C is the vehicle's attitude,
-C_nb exp[m x]^T, since it is the vehicle that does not slide; the IMU's own error is then
+If the model has the IMU's mounting m against the vehicle, C is the vehicle's attitude, C_nb exp[m
+x]^T, as the vehicle does not slide; the IMU's own error is then
 
     phi_nb = phi + C dm
 
-without which each change of the speed would seem to tell m apart from the heading.
+without which each change of speed would seem to distinguish m from the heading.
 
 Source: Barrau and Bonnabel, The invariant extended Kalman filter as a stable observer, IEEE TAC 62
 (2017), eq. 8 and section IV; Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton
@@ -108,8 +107,8 @@ LARGE_SD_RAD = 2.0 * PLAIN_SD_RAD
 
 
 class Turning(NamedTuple):
-    """Part of velocity and position that turns with the heading; and whether that is the speed, so
-    that an error of the velocity changes it."""
+    """Parts of velocity and position that turn with the heading; `speeds`: the velocity part is the
+    speed, changed by an error of the velocity."""
 
     velocity: Array
     place: Array
@@ -117,8 +116,8 @@ class Turning(NamedTuple):
 
 
 class Sought(NamedTuple):
-    """Result of an update: the error xi (n,), P_xi (n, n) after it, and how the innovation stands
-    to its gate; of a screened measurement what became of each row."""
+    """Result of an update: the error xi (n,), P_xi (n, n) after it, the innovation and its gate;
+    the outcome of each row of a screened measurement."""
 
     error: Array
     covariance: Array
@@ -134,16 +133,16 @@ class Sought(NamedTuple):
         return self.rows.count(KEPT) if self.rows else len(self.whitened)
 
     def likelier(self, other: Sought) -> bool:
-        """True if more rows fit, or as many and better."""
+        """True if more rows fit, or the same number with a better fit."""
         return (-self.degrees, self.nis) < (-other.degrees, other.nis)
 
 
 class InvariantFilter(TiltAxesFilter):
     """Centralised filter whose updates run in xi while it `turns`.
 
-    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
-    when it was known and is no better than to `LARGE_SD_RAD`: a fault that was taken out has left
-    it so, or bends in which the inertial unit was silent.
+    A filter that `settles` stops turning once the heading is known to `PLAIN_SD_RAD`, and turns
+    again if sigma later exceeds `LARGE_SD_RAD`, as after the removal of a fault or a bend with a
+    silent inertial unit.
     """
 
     def __init__(
@@ -170,7 +169,8 @@ class InvariantFilter(TiltAxesFilter):
         self._knows[KNOWN] = true
 
     def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
-        """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""
+        """M (n, n): conversion from dx with the vehicle's attitude error to the IMU's; with -1 the
+        inverse."""
         m = np.eye(self.model.size)
         mount(m, nav, xi, self._mounts, self.model.active, sign)
         return m
@@ -196,7 +196,7 @@ class InvariantFilter(TiltAxesFilter):
         return 2.0 * np.eye(self.model.size) - self.jacobian(nothing, turning)
 
     def without(self, nav: Array, xi: Array, error: Array, turning: Turning) -> tuple[Array, Array]:
-        """The state (10,) and parameters (n,) less an `error` (n,) in xi."""
+        """State (10,) and parameters (n,) minus an `error` (n,) in xi."""
         nav, xi = nav.copy(), xi.copy()
         take_out(nav, xi, error, *turning, self._mounts, self.model.active)
         return nav, xi
@@ -208,7 +208,7 @@ class InvariantFilter(TiltAxesFilter):
         return j
 
     def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
-        """Error (n,) in xi of this filter's state, if another's were true."""
+        """Error (n,) in xi of this filter's state relative to another's."""
         mine, true = np.empty((3, 3)), np.empty((3, 3))
         vehicle_axes(self.nav, self.xi, self._mounts, mine)
         vehicle_axes(nav, xi, self._mounts, true)
@@ -236,7 +236,7 @@ class InvariantFilter(TiltAxesFilter):
         self.turns |= self._settles and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         if self._settles and not self.turns:
             variance = self.covariance[PHI + 2, PHI + 2]
             self.turns = self.heading_known and bool(variance > LARGE_SD_RAD**2)
@@ -244,7 +244,7 @@ class InvariantFilter(TiltAxesFilter):
         return super().update(measurement, noise)
 
     def _turn_in(self, measurement: Linearised) -> Outcome:
-        """Fold one measurement in by an update in xi, or return its refusal."""
+        """Update by one measurement in xi, or return its rejection."""
         self.turned = 0.0
         # A way that turns with the heading leaves no clone behind where it was.
         self.xi[self._clone] = 0.0
@@ -316,8 +316,8 @@ class InvariantFilter(TiltAxesFilter):
             self._account_for(measurement, rows, kept, found.passed)
 
     def _unfelt(self, p: Array) -> None:
-        """Remove the coupling of a velocity within its noise from P (n, n): F would treat noise at
-        rest as motion that turns, which reveals a heading to a parked vehicle."""
+        """Remove the heading coupling of a velocity within its noise from P (n, n): F would treat
+        noise at rest as motion that turns, and show a false heading of a parked vehicle."""
         turned = p[DV : DV + 2, PHI + 2] / p[PHI + 2, PHI + 2]
         own = p[DV : DV + 2, DV : DV + 2] - np.outer(turned, turned) * p[PHI + 2, PHI + 2]
         if float(turned @ turned) < SENSED_SIGMAS**2 * float(np.trace(own)):

@@ -1,8 +1,8 @@
 """Kernels for a state with an error in invariant coordinates.
 
-`velocity` and `place` (3,) are what of a filter's velocity and position turns with the heading, and
-`speeds` whether that is the speed; `mounting` (0 or 2,): the slots of the IMU's pitch and yaw
-against the vehicle.
+`velocity` and `place` (3,): the parts of velocity and position that turn with the heading;
+`speeds`: true if the velocity part is the speed; `mounting` (0 or 2,): slots of the IMU's pitch and
+yaw against the vehicle.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _product(a: Array, b: Array, out: Array) -> None:
 
 @compiled("void(f8, f8[:, ::1])")
 def about_down(psi: float, turn: Array) -> None:
-    """Write a turn by psi (rad) about the vertical (3, 3)."""
+    """Write the rotation (3, 3) by psi (rad) about the vertical."""
     turn[:] = 0.0
     turn[0, 0] = turn[1, 1] = math.cos(psi)
     turn[1, 0] = math.sin(psi)
@@ -57,7 +57,7 @@ def turns_of(error: Array, level: Array, whole: Array) -> None:
 
 @compiled("void(f8[::1], f8[::1], i8[::1], f8[:, ::1])", allocates=True)
 def vehicle_axes(nav: Array, xi: Array, mounting: Indices, axes: Array) -> None:
-    """Write C_nv (3, 3) of the vehicle, which moves the way it faces."""
+    """Write C_nv (3, 3) of the vehicle."""
     quaternion_to_dcm(nav[Q0:], axes)
     if mounting.size:
         dcm, turn = axes.copy(), np.empty((3, 3))
@@ -109,7 +109,7 @@ def write_jacobian(error: Array, velocity: Array, place: Array, speeds: bool, j:
 
 @compiled("void(f8[:, ::1], f8[::1])")
 def rotation_vector(dcm: Array, phi: Array) -> None:
-    """Write the phi (3,) of exp(phi x); of half a turn about down, where no axis is told."""
+    """Write phi (3,) of exp(phi x); for half a turn without a defined axis that about down."""
     x = 0.5 * (dcm[2, 1] - dcm[1, 2])
     y = 0.5 * (dcm[0, 2] - dcm[2, 0])
     z = 0.5 * (dcm[1, 0] - dcm[0, 1])

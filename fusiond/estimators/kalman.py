@@ -1,7 +1,7 @@
 r"""Extended Kalman filter on the error state, closed loop: one filter for all measurements.
 
-The error state is estimated, taken out of the navigation state at once and is zero again, so only
-its covariance is propagated.
+The error estimate is fed back to the navigation state at once and is zero again, so only its
+covariance is propagated.
 
 Source: Groves, 2nd ed., sections 3.2.6 and 14.1.
 """
@@ -50,8 +50,8 @@ class KalmanEstimator(Estimator):
         self._run_by(NO_AXES)
 
     def _run_by(self, axes: Axes) -> None:
-        """Run packed measurements with axes of its updates; not without a bank, whose one fix a
-        second costs less than a run, and not a filter with other updates."""
+        """Run packed measurements, with the axes of the updates; not for filters without a bank,
+        where single updates cost less, or with other updates."""
         bank, model = self.hypotheses, self.model
         if bank is not None and self.packs:
             work = np.zeros(AT_H + LENT_ROWS * (model.size + model.width))
@@ -123,7 +123,7 @@ class KalmanEstimator(Estimator):
     def _account_for(
         self, measurement: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
     ) -> None:
-        """Update the bank by rows of a measurement that will be fused, or have failed."""
+        """Update the bank by rows that will be fused or have failed."""
         bank, count = self.hypotheses, int(np.count_nonzero(kept))
         assert bank is not None
         z, h, r = rows

@@ -1,23 +1,20 @@
 r"""Compiled kernel: propagation of covariances over several accumulated samples at once.
 
-A sample's transition is that of a step of strapdown navigation: C_nb, the force in navigation axes,
-rate and force in body axes (fusiond.navigation.error_model). All of it enters linearly, so that the
-transition over H seconds is to the first order that of the means,
+The transition of a sample is linear in C_nb, the force in navigation axes, and rate and force in
+body axes (fusiond.navigation.error_model). So to first order the transition over H seconds is that
+of the means,
 
     sum h = H,   sum h (f_n, w_b, f_b, C_nb) / H,   sum h n / H  (the noise n of each sample)
 
-and the second order (velocity from a gyro, position from a tilt) comes of the three steps in which
-an interval is crossed. What that leaves out is how rate and force change within H times what they
-do within H, a fraction of what one crossing adds, with either sign: over a drive with bends and
-stops the largest difference of a sigma is 1e-4 of it or less
-(tests/estimators/test_multi_sample_covariance.py).
+and the second order (velocity from a gyro, position from a tilt) follows from the three steps that
+cross an interval. The neglected term is the change of rate and force within H times their effect
+within H, a fraction of one crossing, of either sign: over a drive with bends and stops it changes a
+sigma by 1e-4 at most (tests/estimators/test_multi_sample_covariance.py).
 
-Covariances are brought to an instant where the time, in whole multiples of `GRID_NS`, goes past one
-of them: at the first sample that ends there, whatever the calls are that it takes to get there;
-where a measurement is to be folded in; and around samples that are no part of a mean: a gap, an
-interval at rest, each one where errors or a transition are carried along. Between two of them
-somebody may ask what P is now: covariances are then ahead of the sums, and how they were is kept
-(`HELD`).
+Covariances are propagated at the first sample beyond each multiple of `GRID_NS`, independent of the
+calls; before an update; and around samples that are not part of a mean: a gap, an interval at rest,
+and each sample if errors or a transition are propagated. P may be read between two of these
+instants: covariances are then ahead of the sums, and the earlier ones are stored (`HELD`).
 """
 
 from __future__ import annotations
@@ -77,9 +74,9 @@ def widen_for_gap(
     """Add to `cov`, flat and of `width` rows, the uncertainty of h seconds in an IMU silence of
     `whole` seconds.
 
-    A vehicle that turns goes where it heads: its velocity turns with it, dv = v x dphi, and its
-    place by half of that a second. Told apart from each other, a constraint to go straight on would
-    take the velocity for a witness of the heading.
+    The velocity of a turning vehicle turns with it, dv = v x dphi, and its position by half of that
+    a second. Without this correlation the no-slip constraint would take the velocity as evidence of
+    the heading.
     """
     turned = GAP_RATE_RAD_S**2 * whole * h
     n, e, d = nav[VN], nav[VN + 1], nav[VN + 2]
@@ -167,10 +164,9 @@ def cross_for(width: int) -> Callable[..., None]:
         """Propagate the first `used` of the covariances, `covs` flat, over the interval of `sums`
         (25,) to `nav` (10,); write its coefficients `c` (58,).
 
-        They are `held` where they are `ahead`, and afterwards where they are to be kept; the sums
-        begin anew where they are not. `silence` (s) of the IMU, of which the sums are a part, or 0;
-        `turn` (5,) where the vehicle `rests`; `turning` where a turn that is not known turns the
-        axes of a tilt.
+        They start from `held` if they are `ahead`, and are stored there if they are to be kept;
+        otherwise the sums restart. `silence` (s): of the IMU, including the sums, or 0; `turn` (5,)
+        if the vehicle `rests`; `turning`: an unknown turn rotates the axes of a tilt.
         """
         whole = used * square
         if ahead:

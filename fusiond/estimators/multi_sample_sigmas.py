@@ -1,20 +1,20 @@
 r"""Compiled kernels: sigmas at the samples inside a block of the covariance's propagation.
 
-Where a solution is recorded at each sample, its sigmas are wanted at each, of a covariance that is
-brought from one crossing to the next (fusiond.estimators.multi_sample_covariance). What they are
-made of (`entries` of fusiond.estimators.published_state) is known at both, and in between, s
-seconds of H after the first,
+A solution recorded at each sample needs sigmas at each, while the covariance is propagated from
+crossing to crossing (fusiond.estimators.multi_sample_covariance). Their `entries`
+(fusiond.estimators.published_state) are known at both, and in between, s seconds of H after the
+first,
 
     p(s) = p(0) + L(s) + (s / H)^2 (p(H) - p(0) - L(H))
 
-with L the first order of what has been felt until then: by the velocity gained u, the mean
-attitude C and the noise densities N,
+with L the first-order effect of the motion until then: by the velocity gained u, the mean attitude
+C and the noise densities N,
 
     d phi = -s C e,   dv = u x phi + s C a,   dr = s dv of the first;   d var = 2 cov(d, .) + s N
 
-What is left is of the second order and grows with the square of the time, but for how rate and
-force change within H: of the sigmas of recorded drives 2e-5 at 99 of 100 samples, of a velocity's
-where an engine shakes the IMU 6e-4 at most. At each crossing it is exact.
+The rest is of second order and grows with the square of the time, apart from changes of rate and
+force within H: 2e-5 of the sigmas of recorded drives at 99 of 100 samples, 6e-4 at most for a
+velocity with engine vibration. At each crossing the result is exact.
 """
 
 from __future__ import annotations

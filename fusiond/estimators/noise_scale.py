@@ -1,27 +1,27 @@
 r"""Scale of a series' stated noise variance, estimated from its innovations.
 
 Whitened innovations y (d,) of a series are N(0, I) and white while filter and series are as
-modelled. Where the series states too little, or its errors last from one to the next, their
-long-run variance is more than one, component by component,
+modelled. If the series states too little, or if its errors are correlated, their long-run variance
+exceeds one, component by component,
 
     s = gamma_0 + 2 sum_k (1 - k / (K + 1)) gamma_k,    gamma_k = E[u_i u_(i-k)],   u = y sqrt(s)
 
-and white errors of s times the stated variance have the same sums, which is what a filter that
-looks back further than the errors last makes of them. Only more than one counts: a receiver that
-states too little is weighed, not accused, and one that states too much is believed. The estimate
-itself scatters, with white innovations by
+and white errors of s times the stated variance have the same sums, which matter for a filter with a
+memory longer than the correlation. Only s above one is used: a receiver that states too little gets
+less weight, one that states too much keeps its value. The estimate itself scatters, with white
+innovations by
 
     var(s) = (2 + 4 sum_k (1 - k / (K + 1))^2) / N = 12.1 / N
 
-so that max(1, s) would be too large by 0.4 of its sigma on the average, of a series that states
-what it has: 0.08 after 300 innovations. What counts is the non-negative garrote,
+so that max(1, s) would be too large by 0.4 of its sigma on average for a series that states its
+true variance: 0.08 after 300 innovations. So the non-negative garrote is used,
 
     1 + (s - 1) (1 - (2 sigma_s / (s - 1))^2)    where s - 1 is more than 2 sigma_s, else 1
 
-whose mean is too large by 0.016 sigma_s then, and which leaves what is surely more as it is.
+whose mean is then too large by 0.016 sigma_s, and which keeps large s.
 
-What is shown lately may be the beginning of a fault: it counts when it is `WAITS_NS` old, and not
-if the series has left service meanwhile.
+Recent innovations may be the start of a fault: they count when they are `WAITS_NS` old, and not at
+all if the series has left service meanwhile.
 
 Source: Bartlett's estimate of a spectrum at zero, as Newey and West, Econometrica 55 (1987), 703;
 Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15 (1970);
@@ -118,7 +118,7 @@ def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int)
 
 @compiled("void(f8[::1])")
 def forget_lately(packed: Array) -> None:
-    """Discard the rows that wait: they are of a fault."""
+    """Discard the waiting rows, which belong to a fault."""
     for j in range(_LAGS):
         packed[_WAITS + j] = packed[_NEW + j] = 0.0
     packed[_WAITING] = packed[_NEW_COUNT] = packed[_HELD] = 0.0

@@ -1,15 +1,13 @@
 """Compiled kernels: propagation of the navigation state and its error statistics over IMU samples.
 
-The loop over samples lives here; what an interval does to a covariance is in
-fusiond.estimators.covariance_propagation. One pass carries a bank of covariances and error
-estimates along one navigation state, for filters that keep several, and a transition matrix where a
-filter asks for it.
+This module has the loop over samples; fusiond.estimators.covariance_propagation has the covariance
+over an interval. One pass propagates one navigation state with a bank of covariances and error
+estimates, and a transition matrix if a filter requests it.
 
-The force that turns with an attitude error is the felt one, but for a vehicle that is known to
-rest: there gravity alone acts, and what is felt in north and east is noise. A heading error would
-turn that noise as it turns motion, each zero velocity would tell of the heading what noise has no
-direction to tell, one effective interval of about four seconds at most 1 / rad^2, and 5 deg would
-be 4.4 after 200 s at rest.
+An attitude error turns the sensed force, but for a vehicle known to rest only gravity: the sensed
+force north and east is noise. Otherwise a heading error would turn that noise like motion, and each
+zero velocity would add false information on the heading: up to 1 / rad^2 for an effective interval
+of about four seconds, 5 deg would become 4.4 deg after 200 s at rest.
 """
 
 from __future__ import annotations
@@ -103,8 +101,8 @@ def published_ahead(
     time_slot: int,
     out: Array,
 ) -> None:
-    """Write `out` (13,): what `in_fix_time` makes of `nav` (10,) `ahead_s` later, while sample
-    `newest` less `estimate` (12,) holds, and its roll, pitch and yaw."""
+    """Write `out` (13,): `nav` (10,) extrapolated by `ahead_s` with sample `newest` minus
+    `estimate` (12,), converted by `in_fix_time`, and its roll, pitch and yaw."""
     if ahead_s > 0.0:
         nav = nav.copy()
         rate, force, zero = np.empty(3), np.empty(3), np.zeros(3)
@@ -211,10 +209,10 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         beyond `noise`. Samples from `sample` on may be used; the last one only as far as `target`,
         so a target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
         solution and a covariance's sigmas at the end of each whole sample go into the IMU's rows,
-        CARRY, with which the error estimates are propagated too, TURN_TILT, with which a turn that
-        is not known turns the axes of a tilt, and PASSING, with which nothing is folded in at
-        `target`: covariances are brought there, but go on from where they were. Each covariance has
-        its noise divided by its share.
+        CARRY, with which the error estimates are propagated, too, TURN_TILT, with which an unknown
+        turn rotates the axes of a tilt, and PASSING, without an update at `target`: covariances are
+        computed there, but continue from their earlier state. The noise of each covariance is
+        divided by its share.
         """
         hold_height = (options & HOLD_HEIGHT) != 0
         record, carry = (options & RECORD) != 0, (options & CARRY) != 0

@@ -1,31 +1,29 @@
 r"""Compiled kernels: the published state, by the receiver's clock or the filter's own.
 
-A receiver defines the time that others label a solution with. Where a filter estimates by how much
-tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it
-publishes for t is
+Users label a solution with the receiver's time. If a filter estimates the delay tau from stamp to
+validity of its fixes, its own instant t is t - tau by the receiver's clock, and the published state
+for t is
 
     p + v tau,   v + a tau,   q (x) exp(w tau)
     var(p_i) = P_rr - 2 v_i P_rt + v_i^2 P_tt,   var(v_i) = P_vv - 2 a_i P_vt + a_i^2 P_tt
     cov(phi) = P_pp + u P_tp + P_pt u^T + u u^T P_tt,   u = C_nb w
 
-P_tt is of tau's error, true minus estimate as of all parameters; that of p, v and phi is as
-fusiond.navigation.error_model has it. Fixes measure p and v: there the offset's own sigma cancels.
-Nothing measures the attitude by the receiver's clock, and in a bend w times the sigma of tau can be
-the most of what is unknown of the heading. a is smoothed.
+P_tt is the variance of tau's error, true minus estimate as for all parameters; errors of p, v and
+phi are those of fusiond.navigation.error_model. Fixes measure p and v, so the offset's own sigma
+cancels there. The attitude is not measured by the receiver's clock: in a bend w times the sigma of
+tau can dominate the heading's sigma. a is smoothed.
 
-By a receiver whose fixes have shown to be late nobody sets a clock. What is published is then for
-the filter's own t, and tau is by how much that clock, the IMU's, is off: nothing estimates it, so
-it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
-clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
+A receiver with delayed fixes does not define the time. The published state is then for the filter's
+own t, and tau is the error of that clock, the IMU's: not estimated, of sigma `clock_sd_s`,
+uncorrelated with the state. The same sums hold with P_tt = clock_sd_s^2 and the rest of P's row
+zero: a position has v times that sigma.
 
-What hypotheses of a fault leave open, as they are weighed, is added to it: variances (9,) that are
-no part of P (fusiond.estimators.fault_odds).
+Weighted fault hypotheses add variances (9,) that are not part of P (fusiond.estimators.fault_odds).
 
-Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
-its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
-over: nothing says how they sit against the nominal ones beyond `axes_sd_rad`, about each axis, and
-cov(phi) grows by its square. The best turn to axes of which each pair of angles is off by m is off
-by m / sqrt(2); what a drive's bends make of the rest is as much.
+The attitude is that of the nominal axes of the configured inertial unit. C_nb is that of its gyros'
+axes, out of square within the data sheet, or of a spare's. Their orientation against the nominal
+axes is known to `axes_sd_rad` about each axis, and cov(phi) grows by its square. For a deviation m
+of each pair of axes the best rotation has an error of m / sqrt(2); bends add as much.
 """
 
 from __future__ import annotations
@@ -63,9 +61,9 @@ ENTRIES, MOVING = 22, 12
 
 
 class Published(NamedTuple):
-    """Axes and clock of publication: the parameter that is the offset of the receiver's clock, or
-    -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what the unit
-    in use is turned by against that of which the attitude is published."""
+    """Axes and clock of publication: slot of the receiver's clock offset, or -1 and one sigma (s)
+    of the filter's own clock; one sigma (rad) about each axis of the unit in use against the
+    published axes."""
 
     time_slot: int
     clock_sd_s: float = 0.0
@@ -114,7 +112,7 @@ def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) 
 
 @compiled("void(f8[::1], i8, i8, f8, f8[::1])", forceinline=True)
 def entries(cov: Array, width: int, time_slot: int, clock_sd_s: float, out: Array) -> None:
-    """Write `out` (22,): of P, flat and of `width` rows, what sigmas are made of. Variances of
+    """Write `out` (22,): entries of P, flat and of `width` rows, for the sigmas. Variances of
     position and velocity (n, e, d), of phi, its covariances (ne, nd, ed), those of position,
     velocity and phi with the clock of `Published`, and its variance."""
     for i in range(3):

@@ -1,21 +1,21 @@
-r"""Robust update: rows whose residuals are large are taken to have more noise than they state.
+r"""Robust update: less weight for rows with large residuals.
 
-Noise is not Gaussian but Student's, with m degrees of freedom: what an update minimises is, instead
-of the sum of squares,
+Noise is Student's with m degrees of freedom, not Gaussian: an update minimises, instead of the sum
+of squares,
 
     (x - dx)^T P^-1 (x - dx) / 2 + sum_i (m + 1) / 2 ln(1 + t_i^2 / m)
     t_i = (z_i - h_i x) / sqrt(r_i)
 
-by weights in turn: with r / w for r the residuals follow from
+by iterated weights: with r / w for r the residuals follow from
 
     e = z - H x = R_w (H P H^T + R_w)^-1 (z - H dx),   R_w = diag(r / w)
 
-and new weights w = (m + 1) / (m + t^2) from them, until they stay. That is expectation and
-maximisation: every turn lowers the sum. It may have several minima; the one sought is reached from
-w = 1. The update is then the ordinary one with R_w, its covariance too.
+and new weights w = (m + 1) / (m + t^2) from them, until they converge. This is
+expectation-maximisation: every iteration lowers the sum. Of several minima the one reached from w =
+1 is used. The update and its covariance are then the ordinary ones with R_w.
 
-A receiver's clock jumps, with all ranges at once, without one of them being wrong: for the weights
-its offset is unknown.
+A jump of a receiver's clock moves all ranges without a fault of any: for the weights its offset is
+unknown.
 
 Source: Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989),
 881.
@@ -41,7 +41,7 @@ SETTLED, MOST_TURNS = 1e-6, 100
 def reweighted(rows: Innovation, model: Model, p: Array, dx: Array) -> Innovation:
     """Rows with r / w for r, for P (n, n) and the error estimate `dx` (n,) before the update.
 
-    As they are where one has no finite innovation: the filter names that itself.
+    Unchanged if an innovation is not finite, which the filter rejects.
     """
     z, h, r = rows
     innovation = z - h @ dx

@@ -1,14 +1,12 @@
-"""Compiled kernels: a filter taken from measurement to measurement, with its bank of hypotheses, in
-one call.
+"""Compiled kernels: a filter with its bank over many measurements in one call.
 
-Measurements come as rows of numbers in order of validity (fusiond.aiding.packed). Each is what
-fusiond.estimators.kalman makes of it: propagated to, gated, folded in, taken for evidence, and the
-axes of a tilt carried over. The call ends where something is to be decided that is no arithmetic of
-a filter: a measurement fails its gate, a hypothesis is likely, a checkpoint is due, a heading is
-wide.
+Measurements come as rows of numbers in order of validity (fusiond.aiding.packed). Each is processed
+as by fusiond.estimators.kalman: propagation, gate, update, evidence, and rotation of the tilt axes.
+The call ends before any decision outside the filter's arithmetic: a measurement fails its gate, a
+hypothesis is likely, a checkpoint is due, a heading is uncertain.
 
-What hypotheses leave open of what is published is computed where somebody may read it: not before
-a measurement that is measured, whose epoch says it anew.
+The covariance that hypotheses add is computed only if it may be read: not before another measured
+epoch, which computes it again.
 """
 
 from __future__ import annotations
@@ -169,7 +167,7 @@ def _judged(
     noise: Array,
 ) -> int:
     """Result `JUDGE` for a fused measurement whose odds cannot be deferred; else `DONE`, after
-    learning from its innovation y."""
+    learning the noise scale from its innovation y."""
     nav, xi, step, _, dx = state
     bank, ints, numbers, lanes, found, _, work = of_bank
     m, t_s = of[ROWS], of[T_NS] * 1e-9
@@ -299,8 +297,9 @@ def run_for(width: int) -> Callable[..., tuple[int, int, int, int]]:
     ) -> tuple[int, int, int, int]:
         """Run the filter over `measurements` (k, SIZE), with the noise of their `series` (s, .).
 
-        It goes from `now` and the next `sample` on to the first that comes `every_ns` after the
-        last checkpoint. Next sample, new time, number of rows done and how it ended.
+        The run starts at `now` and the next `sample`, and ends at the first measurement `every_ns`
+        after the last checkpoint. Returns next sample, new time, number of rows done and the reason
+        for stopping.
         """
         head = state[:LINE].view(np.int64)
         n, room = head[STATES], head[ROOM]

@@ -1,7 +1,7 @@
 """Compiled kernels: sums of rows of sensitivities V, several in one pass.
 
-As fusiond.estimators.fault_bank says, in single precision; what is added up in one pass is added in
-the order of the rows, so that the sums are the same to the bit as row by row.
+For fusiond.estimators.fault_bank, in single precision. One pass adds in the order of the rows, so
+that the sums equal those row by row, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Indices = NDArray[np.int64]
 def add_rows(
     v: Single, columns: int, first: int, of: Indices, count: int, c: Array, out: Single
 ) -> None:
-    """Add to `out` c (n,) times V, from column `first` on: of its rows `count`, `of` which c is not
-    zero, four in one pass."""
+    """Add c (n,) times V to `out`, from column `first` on: the `count` rows with c not zero, listed
+    in `of`, four in one pass."""
     at = 0
     while at < count:
         more = at + 4 <= count
@@ -43,8 +43,8 @@ def add_rows(
 
 @compiled("void(f8[:, ::1], f8[:, ::1], i8, i8, f4[::1])")
 def take_off_before(h: Array, g: Array, a: int, columns: int, work: Single) -> None:
-    """Take off row `a` of `work` what it has in common with the rows before it, as `whiten` does:
-    four rows in one pass, one after the other."""
+    """Subtract from row `a` of `work` its part in common with the rows before, as `whiten` does;
+    four rows in one pass."""
     s, n, b = work[a * columns : (a + 1) * columns], h.shape[1], 0
     while b < a:
         s_0, c_0 = work[b * columns : (b + 1) * columns], 0.0

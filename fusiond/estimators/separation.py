@@ -1,21 +1,20 @@
-r"""Solution separation in the filter: beside the estimate of all measurements one without each
+r"""Solution separation in the filter: one estimate from all measurements, and one without each
 device.
 
     x_0   of all measurements                                P_0
     x_k   of all measurements but those of device k          P_k
 
-All are error estimates of the one navigation state: a measurement is linearised once, and each
-subset folds it in with its own gain after its own gate; what is fed back is x_0, and x_k <- x_k -
-x_0. Then, where the noise is as modelled and both have taken the same measurements,
+All are error estimates of one navigation state: a measurement is linearised once, and each subset
+applies it with its own gain after its own gate; x_0 is fed back, and x_k <- x_k - x_0. Then, with
+the modelled noise and the same measurements accepted,
 
     cov(x_k - x_0) = P_k - P_0
 
-as the error of an optimal estimate is orthogonal to what the same data could still change. A subset
-gates for itself: the measurements that agree with a device that is wrong are not those that agree
-without it. With one device its subset is the IMU with what else there is (wheels, standstill): it
-drifts.
+as the error of an optimal estimate is orthogonal to all estimates from the same data. A subset has
+its own gate: measurements that agree with a faulty device are not those that agree without it. With
+one device its subset is the IMU with the other measurements (wheels, standstill): it drifts.
 
-The initial estimate is common to all: a start from a fix that was wrong shows in no separation.
+The initial estimate is common to all: a start from a wrong fix shows in no separation.
 
 Source: Brenner, Integrated GPS/inertial fault detection availability, NAVIGATION 43 (1996), 111;
 Young, McGraw, Fault detection and exclusion using normalized solution separation and residual
@@ -43,8 +42,8 @@ POSITION = slice(6, 9)
 
 class SeparatedEstimator(KalmanEstimator):
     """The centralised filter with a subset for each of `devices`: sources of position, by the name
-    that their measurements begin with. What is published is, to rounding, the filter's without
-    subsets."""
+    that their measurements begin with. The published state equals, to rounding, that of the filter
+    without subsets."""
 
     packs = False
 
@@ -72,7 +71,7 @@ class SeparatedEstimator(KalmanEstimator):
         return self._dxs[0, POSITION] - self._dxs[1:, POSITION]
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         if measurement.screened and measurement.renewal is not None:
             super()._renew(measurement.renewal)
         innovation = self._linearise(measurement)
@@ -98,9 +97,9 @@ class SeparatedEstimator(KalmanEstimator):
             super()._renew(renewal)
 
     def look(self, measurement: Linearised, lasting: Array | None = None) -> Outcome:
-        """Innovation of a measurement that is not fused; the measurement is `isolated`, nothing
-        that is published changes. The subsets judge for themselves: there the measurement may be
-        the sound one."""
+        """Innovation of a measurement that is not fused; the measurement is `isolated`, the
+        published state does not change. Subsets apply their own gates, as there the measurement may
+        be right."""
         outcome = super().look(measurement, lasting)
         innovation = self._linearise(measurement)
         if not isinstance(innovation, NotApplicable):
@@ -109,8 +108,8 @@ class SeparatedEstimator(KalmanEstimator):
         return outcome
 
     def adopt(self, mean: Array, spread: Array) -> None:
-        """Remove a fault's effect from the common state: its mean (n,), and P grows by `spread` (n,
-        n)."""
+        """Subtract a fault's effect of mean (n,) from the common state and add its `spread` (n, n)
+        to P."""
         super().adopt(mean, spread)
         n = self.model.size
         self._covs[1:, :n, :n] += spread
@@ -122,13 +121,13 @@ class SeparatedEstimator(KalmanEstimator):
         self._take_out()
 
     def _take_out(self) -> None:
-        """Feed the published estimate back: the others are of what is left."""
+        """Feed the published estimate back, and subtract it from the others."""
         if self._dxs[0].any():
             self._feed_back(self._dxs[0])
             self._dxs -= self._dxs[0].copy()
 
     def _device(self, measurement: Linearised) -> int | None:
-        """Device of a measurement; None where from none of them."""
+        """Device of a measurement; None if it has none."""
         if measurement.source not in self._device_of:
             self._device_of[measurement.source] = local_of(measurement.source, self.devices)
         return self._device_of[measurement.source]

@@ -1,7 +1,7 @@
 """State of a filter in one array, and the model's description for the kernels.
 
 A call of a compiled kernel costs 25 ns an argument, so `fusiond.estimators.propagation` takes this
-array and the IMU buffer's, and what differs from call to call.
+array, the IMU buffer's, and only the values that differ from call to call.
 """
 
 from __future__ import annotations

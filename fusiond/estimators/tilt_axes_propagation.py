@@ -1,9 +1,8 @@
 """Compiled kernels: effect of an interval on the tilt axes of a covariance.
 
 The equations are in fusiond.estimators.tilt_frame_after_heading_update. Covariances (width, width)
-are flat, and nothing of P21 comes into what else they hold: it is made of P12
-(fusiond.estimators.covariance_propagation). What `rest_axes` does to one is what `turn_rows` there
-does after an update, to one that is whole.
+are flat, and P21 is not used: it is copied from P12 (fusiond.estimators.covariance_propagation).
+`rest_axes` does the same as `turn_rows` after an update, which needs a complete covariance.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Compiled kernels: rotation of P and sensitivities after an update that rotated the tilt axes.
 
-As fusiond.estimators.tilt_frame_after_heading_update says, with what turn_rate and antenna_place
-add.
+Equations: fusiond.estimators.tilt_frame_after_heading_update, gyro_error_of_update and
+unknown_lever_arm.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def heading_turn(before: Array, after: Array) -> float:
 
 @compiled("void(f8[:, :], f8[::1], f8[::1], i8[::1], i8[::1])")
 def keep_down_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indices) -> None:
-    """M (n, k) <- T M: (C b)_D stays as it was known of the attitude q_nb (4,) `before`, in those
-    of the one `after`; `slots` and `axes` as for `turn_rows`."""
+    """M (n, k) <- T M: keep (C b)_D of attitude q_nb (4,) `before` in the axes of `after`; `slots`
+    and `axes` as in `turn_rows`."""
     old, new = dcm_elements(before), dcm_elements(after)
     if slots.size == 0 or abs(new[8]) < UPRIGHT:
         return
@@ -57,11 +57,11 @@ def keep_down_rows(m: Array, before: Array, after: Array, slots: Indices, axes: 
 
 @compiled("void(f8[:, :], f8[::1], f8[::1], i8[::1], i8[::1])")
 def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indices) -> None:
-    """M (n, k) <- T M: as well as tilt and force biases together were known of the attitude q_nb
-    (4,) `before`, they are of the one `after` with T P T^T.
+    """M (n, k) <- T M: transfer the information on tilt and force biases from attitude q_nb (4,)
+    `before` to `after`; P becomes T P T^T.
 
-    `slots` (j,) of the force biases and their `axes`, the first of them the one of the vertical
-    axis that takes what is left; empty where a model has none.
+    `slots` (j,) of the force biases and their `axes`, first that of the vertical axis, which takes
+    the remainder; empty if a model has none.
     """
     psi = heading_turn(before, after)
     c, s = math.cos(psi), math.sin(psi)
@@ -220,9 +220,9 @@ def carry_over(
 ) -> float:
     """Transform P <- T P T^T and V <- T V after an update.
 
-    Of P (w, w) with n states, of a `bank` if it has any room, and of an estimate `before`;
-    `keep_downward` of xi (n,). Returned is by how much (rad) the update has turned the axes about
-    the vertical.
+    P (w, w) has n states; V is that of a `bank`, if it has any room; `before` is the earlier
+    estimate. Applies `keep_downward` to xi (n,). Returns the rotation (rad) of the axes about the
+    vertical by the update.
     """
     keep_downward(before, nav, xi, biases)
     turned = heading_turn(before[Q0:NAV_SIZE], nav[Q0:])

@@ -1,61 +1,61 @@
 r"""Frame of the tilt covariance, when an update changes the heading without a real rotation.
 
-Straight on at one speed, tilt and accelerometer bias are known by their sum alone, which moves the
-vehicle: of a computed attitude C with a tilt t (rad, north and east) and a bias error b
+Straight on at one speed, only the sum of tilt and accelerometer bias is known, as it moves the
+vehicle. For a computed attitude C with a tilt t (rad, north and east) and a bias error b
 
     C b - g z x t = 0   to some 1e-3 m/s^2,   g t and b each to 0.1               z down
 
-An update that turns C by psi about the vertical and leaves P's t in its axes says next
+After an update that turns C by psi about the vertical and leaves t of P in its axes, the next
+measurements imply
 
     R(psi) C b - g z x t = 0
 
-as well, and both at once are true of b = 0 alone: each of the headings that a vehicle is taken to
-have tells some more of b, of which nothing was measured. What an angle known to s_a makes of a bias
-known to s_b is an acceleration of s_a s_b, and that counts once the sum is known as well: a heading
-known to 0.3 deg does it, if b is large. The error is one in the axes that turn with the heading,
+as well. Both hold together only for b = 0: each new heading estimate adds false information on b,
+which nothing has measured. An angle of sigma s_a and a bias of sigma s_b make an acceleration of
+s_a s_b, which matters once the sum is known as well: for a large b even a heading known to 0.3 deg
+does. The error is therefore written in axes that turn with the heading,
 
     C = R(psi) exp(t x) C^        (as in fusiond.estimators.invariant)
 
-and its transform, once psi is taken out, is t <- R(psi) t, after which the first sum is the only
-one. So with the down axis, which knows (C b)_D: a tilt that is corrected by dt puts dt b_x of
-another bias there, and what is left of b_z is taken for what is left of (C b)_D,
+and its transform, once psi is corrected, is t <- R(psi) t, after which only the first sum holds.
+The same applies to the down axis, which measures (C b)_D: a tilt correction dt adds dt b_x of
+another bias, so the error of b_z is replaced by that of (C b)_D,
 
     b_z <- ((C b)_D - C+_Dx b_x - C+_Dy b_y) / C+_Dz        C+ after the update
 
-So with what lies between two updates. Where the vehicle turns, C b turns with it and t stays, and
-that does tell them apart. A turn r that the yaw gyro's error only pretends turns C b just the same,
-and nothing has turned: in the axes of C
+The same applies between two updates. In a real turn C b turns and t does not, which distinguishes
+them. A false turn r by the yaw gyro's error turns C b as well, although nothing has turned: in the
+axes of C
 
     t <- R(r) t,      var(r) = P_psi after an interval - P_psi before it
 
 r and t are independent to the first order, and t's covariance grows by var(r) (z x t)(z x t)^T
-(TURN_TILT of fusiond.estimators.propagation); once an update takes r out of the heading, t is
-turned by as much, though it had not stayed behind: an error of that very variance. So with a tilt
-r that only the gyros' errors have made since the last update: C b turns with the computed C, and
-an update that takes r out again leaves (C b)_D where that had put it,
+(TURN_TILT of fusiond.estimators.propagation); once an update removes r from the heading, t is
+turned by r, an error of that variance. The same applies to a tilt r that the gyros' errors have
+made since the last update: C b turns with the computed C, and an update that removes r leaves (C
+b)_D in error,
 
     var((C b)_D) <- var((C b)_D) + var(r_N) var((C b)_E) + var(r_E) var((C b)_N)
 
-without which a straight road told a tilt by its vertical velocities. All are of the second order,
-psi b, dt b, r b.
+without which vertical velocities on a straight road would show a false tilt. All terms are of
+second order: psi b, dt b, r b.
 
-At rest nothing turns but C^, by the gyros' noise, and back as updates take that out again. Both are
-turns of the estimate, and both are known: while it is known to rest (STEP_RESTS_S of
-fusiond.navigation.strapdown) each interval is followed by the T of an update that has turned C^ as
-it has, in place of the two variances (`rest_axes`). As a noise, what moved C^ was worth as much as
-what corrected it was taken to tell: each velocity told more of tilt and bias, which at rest nothing
-can tell apart. After a doubt a tilt known to 2.8 deg was known to 0.7 after twenty minutes.
+At rest only the estimate C^ turns, by the gyros' noise and by its corrections. Both turns are
+known: while the vehicle is known to rest (STEP_RESTS_S of fusiond.navigation.strapdown), each
+interval is followed by the T of its turn of C^, in place of the two variances (`rest_axes`). As
+noise instead, each velocity added false information on tilt and bias, which cannot be distinguished
+at rest: after a doubt, sigma of a tilt fell from 2.8 to 0.7 deg in twenty minutes.
 
-So is what an update makes of the estimate itself. With d the third row of C, tilt and biases that
-hide each other move the vehicle downward by half of the tilt times the bias: a tilt that is
-corrected by dt, and biases by db = g dt, change that by g dt^2 / 2 beside what the update has told,
-each time in the same direction. A tilt alone, or a bias, changes nothing that was learned with it.
-So it is the biases' change along the mean of the axes before and after that has been told:
+The effect of an update on the estimate itself is of second order, too. With d the third row of C,
+tilt and biases of which only the sum is known move the vehicle downward by half of the tilt times
+the bias. A correction of the tilt by dt and of the biases by db = g dt changes that by g dt^2 / 2,
+always in the same direction, although nothing was measured. So the vertical bias takes the
+difference from the change of the biases along the mean of the axes before and after:
 
     b^_z <- b^_z - (d+ - d) db / (2 d+_z)
 
-After a doubt a roll known to 4 deg, corrected by one to three of them at each of ten fixes of a
-bend, had made 0.02 m/s^2 of it, and a vertical velocity eight sigma off.
+Without it, a roll known to 4 deg, corrected by 1 to 3 deg at each of ten fixes of a bend, gave 0.02
+m/s^2 and a vertical velocity eight sigma off.
 
 Twelve cars with accelerometers of 50 mg and gyros of 3 deg/s, each
 tilt known by its sum with a bias, after a minute and its one bend: NEES a degree 169 of the tilt
@@ -96,11 +96,11 @@ Indices = NDArray[np.int64]
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """Centralised filter that carries the tilt's axes along with the heading.
+    """Centralised filter whose tilt axes turn with the heading.
 
-    In its P the axes of a tilt turn with the heading, the gyros' part stays with the turn that it
-    is known of (fusiond.estimators.gyro_error_of_update), and, where a lever arm is estimated, so
-    does the place of an antenna (fusiond.estimators.unknown_lever_arm)."""
+    P keeps three quantities over an update: the tilt in axes that turn with the heading, the gyro
+    errors relative to the turn (fusiond.estimators.gyro_error_of_update), and, with an estimated
+    lever arm, the antenna's position (fusiond.estimators.unknown_lever_arm)."""
 
     def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
         super().__init__(model, gap_s, faults=faults)
@@ -125,12 +125,14 @@ class TiltAxesFilter(KalmanEstimator):
         self.undoubted = True
 
     def adopt(self, mean: Array, spread: Array) -> None:
-        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
+        """Subtract a fault's effect of mean (n,) from the state and add its `spread` (n, n) to
+        P."""
         self.undoubted = False
         super().adopt(mean, spread)
 
     def _correct(self, mean: Array) -> None:
-        """Take a fault's effect (n,) out of the state, as an update does: it turns the axes."""
+        """Subtract a fault's effect (n,) from the state, as an update does, which turns the
+        axes."""
         before = self._estimate()
         super()._correct(mean)
         self._carry_over(before)
@@ -145,7 +147,7 @@ class TiltAxesFilter(KalmanEstimator):
         self._knows[UNDOUBTED] = true
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         if self.turns and not self._holding:
             return self._turn_in(measurement)
         self.turned = 0.0
@@ -192,5 +194,5 @@ class TiltAxesFilter(KalmanEstimator):
         return gyros, self._lever, self._time
 
     def _keep(self, rows: Array, before: Array) -> None:
-        """M (n, k) <- T M: what is known of the gyros, and of the antenna's place."""
+        """M (n, k) <- T M for gyro errors and antenna position."""
         keep_rows(rows, before, self.nav, self.xi, self.turned, *self._kept)

@@ -1,27 +1,27 @@
 r"""Antenna position of an unmeasured lever arm, preserved when an update rotates the vehicle.
 
-A fix tells the place of the antenna, and nothing of the lever arm that leads there:
+A fix measures the antenna's position, not the lever arm:
 
     dr + (C l) x phi - C dl - v dtau = noise          (fusiond.aiding.position, its sum z)
 
-with attitude C, lever arm l and velocity v as they were estimated then. An update that makes them
-C+, l+ and v+ and leaves P as it is has the next fix say
+with the estimates of attitude C, lever arm l and velocity v. After an update to C+, l+ and v+ with
+P unchanged, the next fix implies
 
     dr + (C+ l+) x phi - C+ dl - v+ dtau = noise
 
-as well, and both at once are true of (C+ - C) dl = 0 alone: half a degree and a metre are what RTK
-shows of a true turn, so each correction of the attitude tells some of the lever, whatever its
-truth. And since l_x and -v tau are one way to go at one speed, it parts what only another speed
-can part. (Twelve cars with fixes of 2 cm: the antenna's place 0.5 to 2 m off at 4 to 6 sigma.) The
-transform after the update that carries the first sum over to the second,
+as well. Both hold together only for (C+ - C) dl = 0: RTK resolves half a degree times a metre, so
+each correction of the attitude adds false information on the lever arm. It also separates l_x and
+-v tau, which are indistinguishable at one speed. (Twelve cars with fixes of 2 cm: the antenna's
+position 0.5 to 2 m off at 4 to 6 sigma.) The transform after the update from the first sum to the
+second,
 
     dr <- dr - (C+ (l+ - l)) x phi + (C+ - C) dl + (v+ - v) dtau
 
-leaves the second alone. C+ l+ - C l is taken for C+ (l+ - l): what is left turns l by the same
-angle that phi is. Where the vehicle truly turns, C does and dr stays, and that does tell dl.
+leaves only the second. C+ l+ - C l is approximated by C+ (l+ - l); the rest turns l by the same
+angle as phi. In a real turn C changes and dr does not, which shows dl.
 
-Source: as of fusiond.estimators.tilt_frame_after_heading_update, whose error this is in another
-state.
+Source: as of fusiond.estimators.tilt_frame_after_heading_update, which treats the same error in
+another state.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ Indices = NDArray[np.int64]
 def antenna_slots(model: Model) -> tuple[Indices, Indices]:
     """Slots of a lever arm's error (3,) and of its fixes' time offset (0 or 1,).
 
-    None where the model estimates no lever arm, or several: what is known of one place is then
-    known by two ways."""
+    Empty if the model estimates no lever arm, or several: one position is then known by two
+    paths."""
     levers = [block.name for block in model.blocks if block.name.startswith(ANTENNA_LEVER)]
     if len(levers) != 1:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -62,8 +62,9 @@ def keep_antenna(
     lever: Indices,
     time: Indices,
 ) -> None:
-    """M (n, k) <- T M: the antenna is known of `after` with T P T^T as it was of `before`, both nav
-    (10,), and the estimates of its lever (3,); `lever` (3,) and `time` (0 or 1,): their slots."""
+    """M (n, k) <- T M: transfer the information on the antenna's position from nav (10,) `before`
+    to `after`, with the estimates of its lever arm (3,); P becomes T P T^T. `lever` (3,) and `time`
+    (0 or 1,): their slots."""
     old, new = dcm_elements(before[Q0:]), dcm_elements(after[Q0:])
     moved = np.empty(3)
     for i in range(3):

@@ -4,8 +4,8 @@ Rows must be uncorrelated. With S = H P H^T + R = L L^T and z the innovation
 
     y = L^-1 z,   G = L^-1 H P,   nu^T S^-1 nu = y^T y,   dx <- dx + G^T y,   P <- P - G^T G
 
-which is one scalar row after another, of which the factor is kept: all of them are taken off P in
-one pass over it, and the same to the bit above the diagonal as below it.
+which is the update by one scalar row after another with a stored factor. All rows are subtracted
+from P in one pass, bit for bit the same above and below the diagonal.
 
 Source: Bierman, Factorization Methods (1977), section V.2; Groves, 2nd ed., eq. 3.58.
 """
@@ -154,7 +154,7 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
 
 
 def work(rows: int, width: int) -> tuple[Array, Array]:
-    """Workspace of `fuse` for so many rows: y (m,) and g (m, w)."""
+    """Workspace of `fuse` for m rows: y (m,) and g (m, w)."""
     return np.empty(rows), np.empty((rows, width))
 
 
@@ -178,7 +178,7 @@ def fuse(
     """Gate, update and feedback in one; the normalised innovation squared.
 
     Nothing changes if it is above `threshold` or not finite. With `holding` the estimate `dx` (n,)
-    is kept and added to instead of fed back; `z` is then the innovation before `dx` is taken off.
+    is kept and updated instead of fed back; `z` is then the innovation before `dx` is subtracted.
     `y` (m,) is left as the whitened innovation, `g` (m, w) as `whiten` leaves it.
     """
     innovation = z

@@ -2,13 +2,12 @@ r"""Compiled kernel: update with many rows of which some may be wrong (pseudoran
 
 Each row is judged twice, both times against a chi-square quantile with one degree of freedom:
 
-    before   nu^2 / (h P h^T + r)                      its own gate, whatever the others say
+    before   nu^2 / (h P h^T + r)                      its own gate, independent of the others
     after    v^2 / (r - h P+ h^T),  v = z - h dx+      the residual test of the update
 
 The residual's variance follows from v = (I - H K) nu; its square over that variance is the
-statistic of leaving the row out (Teunissen, Testing Theory, 2006, section 4.4: the w-test). While
-the largest fails, that row goes and the update is made anew from the rest. The order of the rows
-does not matter.
+statistic of excluding the row (Teunissen, Testing Theory, 2006, section 4.4: the w-test). While the
+largest fails, that row is excluded and the update repeated. The order of the rows does not matter.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ def _grouped(
     """Find groups of successive rows of h (m, n) with nearly the same states; their number.
 
     Group k has the rows from `begin[k]` to `begin[k + 1]` and measures `counts[k]` states, whose
-    slots are `columns[k]` in their order; `values[p]` (m,) is what rows have for the p-th of their
-    group. `used` (m + 1, n) is work space. A row begins a group where more than a quarter of its
-    states are new.
+    slots are `columns[k]` in their order; `values[p]` (m,) are the rows' entries for the p-th state
+    of their group. `used` (m + 1, n) is work space. A row starts a new group if more than a quarter
+    of its states are new.
     """
     m, n = h.shape
     groups = 0
@@ -127,7 +126,8 @@ def _residuals(
 
 @compiled("void(f8[:, ::1], i8, f8[:, ::1])", forceinline=True)
 def _take_off(cov: Array, i: int, g: Array) -> None:
-    """Take g^T g, of `g` (k, w), off row `i` of `cov`: by four rows in one pass, in their order."""
+    """Subtract g^T g, of `g` (k, w), from row `i` of `cov`: four rows in one pass, in their
+    order."""
     row, width, fours = cov[i], cov.shape[0], g.shape[0] // 4
     for q in range(fours):
         g0, g1, g2, g3 = g[4 * q], g[4 * q + 1], g[4 * q + 2], g[4 * q + 3]
@@ -162,9 +162,9 @@ def _fold_in(
     """Fold the rows that are KEPT, one after another, into `cov` and `dx`, in place; y and the
     result as in `screened_update`.
 
-    What a row takes off P goes to `g` (m + 1, w) behind a row of zeros; `taken` (n,) says how many
-    of these are off each row of P: those that the group does not measure wait until one measures
-    them, and the last one is taken off in the pass that reads P for the next.
+    The factors that rows subtract from P go to `g` (m + 1, w) behind a row of zeros; `taken` (n,)
+    counts those already subtracted from each row of P: rows of P outside the group wait until a
+    group measures them, and the last factor is subtracted in the pass that reads P for the next.
     """
     n, width = dx.shape[0], cov.shape[0]
     nis = 0.0
@@ -244,10 +244,10 @@ def screened_update(
 ) -> float:
     """Fold the rows z = h dx + noise (variances r) that pass into `cov_out` and `dx_out`.
 
-    cov and cov_out (w, w) symmetric, dx and dx_out (n,), z, r, y (m,), h (m, n). `codes` (m,) says
-    what became of each row; rows not KEPT at the call are left out from the start. y[a] is left as
-    the whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares,
-    nu^T S^-1 nu.
+    cov and cov_out (w, w) symmetric, dx and dx_out (n,), z, r, y (m,), h (m, n). `codes` (m,)
+    receives the outcome of each row; rows not KEPT at the call are excluded from the start. y[a] is
+    the whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares, nu^T S^-1
+    nu.
     """
     m, n = h.shape
     width = cov.shape[0]
@@ -291,7 +291,7 @@ def screened_update(
 
 
 def jumped(codes: Codes, h: Array, offsets: Sequence[int]) -> bool:
-    """True if the better half of the ranges fails; of the rows, `codes` (m,) and `h` (m, n), with
+    """True if the better half of the ranges fails, from `codes` (m,) and `h` (m, n) of the rows and
     the slots of the clock's offsets."""
     if np.count_nonzero(codes) < FEWEST_JUMPING:  # KEPT is 0
         return False
@@ -314,11 +314,11 @@ class Screened(NamedTuple):
 def screened(
     measurement: Linearised, rows: Innovation, model: Model, threshold: float, cov: Array, dx: Array
 ) -> Screened:
-    """Update by rows of a screened measurement, without touching `cov` and `dx`.
+    """Update by rows of a screened measurement, without changing `cov` and `dx`.
 
-    A receiver that sets its clock moves all ranges at once: where it says so, or where the better
-    half of the ranges fails while the rates pass, the clock offset starts anew, in `cov` too, and
-    the rows are judged again.
+    A receiver that resets its clock moves all ranges at once. If it reports that, or if the better
+    half of the ranges fails while the rates pass, the clock offset restarts, in `cov` too, and the
+    rows are judged again.
     """
     z, h, r = rows
     offsets = model.slots_of(CLOCK_OFFSET)

@@ -1,7 +1,6 @@
 """Events of protection levels that pass the alert limits.
 
-What computes the levels (fusiond.navigator.protection_levels) is imported where a limit is
-configured.
+The computation (fusiond.navigator.protection_levels) is imported only if a limit is configured.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ NO_BOUND = Bound(BoundState.OFF)
 
 
 class ProtectionWatch:
-    """Levels of an estimator; nothing where no alert limit is configured.
+    """Protection levels of an estimator; inactive without an alert limit.
 
     `on_event(code, text)` receives `protection_level` when a level passes its limit and
     `protection_restored` when both are back.
@@ -53,7 +52,7 @@ class ProtectionWatch:
         self._last: tuple[int, Level] | None = None
 
     def look(self, measurement: AidingMeasurement) -> None:
-        """A measurement has been looked at; the estimator is where that left it."""
+        """Update the levels after a processed measurement, from the estimator's state."""
         if self._levels is not None:
             self._levels.look(measurement)
 
@@ -78,7 +77,7 @@ class ProtectionWatch:
         return Bound(state, found.hpl_m, vertical)
 
     def report(self) -> None:
-        """Compute the levels of the estimator's present state; events where they pass a limit."""
+        """Compute the levels of the estimator's present state; report each that passes a limit."""
         if self._levels is None:
             return
         t_ns, found = self._levels.t_ns, self._levels.now()
@@ -93,7 +92,7 @@ class ProtectionWatch:
             self._event("protection_restored", f"horizontal {found.hpl_m:.1f} m")
 
     def _passed(self, found: Level) -> list[str]:
-        """Levels beyond their limits, in words; a level that is not a number is."""
+        """Text on levels beyond their limits, levels that are not a number among them."""
         levels = zip(("horizontal", "vertical"), (found.hpl_m, found.vpl_m), strict=True)
         return [
             f"{name} {level:.1f} m, limit {limit:g} m"

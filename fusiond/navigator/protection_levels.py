@@ -1,9 +1,9 @@
 """Protection levels of the solution.
 
-Each bounds the error by itself: that of solution separation in the filter
+Each level bounds the error: that of solution separation in the filter
 (fusiond.integrity.protection), and that of each raw receiver's epochs
-(fusiond.navigator.raw_araim). The least of them is published; each is computed at its equal
-part of the integrity risk, so that the least holds whichever it is.
+(fusiond.navigator.raw_araim). The least is published. Each is computed at an equal part of the
+integrity risk, so that any of them may be chosen.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from fusiond.navigator.raw_gnss import RawEpochMeasurement
 
 
 class Level(NamedTuple):
-    """Horizontal and vertical level (m; vertical None where the model holds the height), and what
-    does not fit, in words."""
+    """Horizontal and vertical level (m; vertical None if the model holds the height), and text on
+    contradicting sources."""
 
     hpl_m: float
     vpl_m: float | None
@@ -58,7 +58,7 @@ class Levels:
         return self._estimator.t_ns
 
     def look(self, measurement: AidingMeasurement) -> None:
-        """A measurement has been looked at; the estimator is where that left it."""
+        """Update the levels after a processed measurement, from the estimator's state."""
         if isinstance(measurement, RawEpochMeasurement):
             self._epochs.look(measurement, self._estimator.state)
 
@@ -67,7 +67,7 @@ class Levels:
         self._epochs.clear()
 
     def now(self) -> Level:
-        """The levels."""
+        """Levels of the present state."""
         e = self._estimator
         vertical = not e.model.hold_height
         # What is not told yet may be the IMU's fault, which no mode stands for.

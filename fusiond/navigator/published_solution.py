@@ -1,26 +1,23 @@
-"""Status and solution of a running navigation, as they are published.
+"""Published status and solution of a running navigation.
 
-The mode is judged from what is published of the estimator, and from what has become of the
-measurements. The first reason that holds is given; the order is that of their weight. What each
-mode means to who reads it: `fusiond.navigation.solution`.
+The mode follows from the published solution and from the outcomes of the measurements. The first
+reason that holds is given, in the order of weight. Meaning of the modes:
+`fusiond.navigation.solution`.
 
-The solution is that of the estimator's state, at its own instant or later.
+The solution is the estimator's state, at its own instant or extrapolated.
 
-Once the inertial unit is silent for longer than a solution is carried ahead by its last sample
-nobody knows what the vehicle does. For each second of that, one sigma is that what it did last goes
-on or ends, and that it brakes or turns by a, of which five are the hardest that vehicles of its
-class do (fusiond.configuration.plausibility):
+If the inertial unit is silent for longer than the extrapolation, the motion is unknown. For each
+second of it, one sigma is that the last motion continues or ends, and that the vehicle brakes or
+turns by a; 5 a is the hardest manoeuvre of its class (fusiond.configuration.plausibility):
 
     velocity  |a_last| + a      position  |v| + velocity t / 2      yaw  |w_last| + a / |v|
 
-and a road is banked for its bends, by (|a_last| + a) / g at most, as soon as one lasts.
+and in a lasting bend the road is banked by (|a_last| + a) / g at most.
 
-A heading that was claimed and that nothing has shown yet may be the other way round: half a turn is
-five sigma, and less once positions have confirmed the way from the start
-(fusiond.navigator.alignment.start_check). What it does to the velocity is as much of the speed, and
-to the position of the way since the last position. Of an inertial unit whose bias is n sigma of its
-data sheet, which its rates have not shown to be the unit's own yet
-(fusiond.navigator.imu_unit_check), an attitude is known n times as poorly.
+An unconfirmed heading may be reversed: half a turn is five sigma, and less once positions have
+confirmed the path from the start (fusiond.navigator.alignment.start_check). It turns the velocity,
+and the path since the last position. If the bias of the inertial unit is n sigma of its data sheet
+and unproven (fusiond.navigator.imu_unit_check), sigma of the attitude is multiplied by n.
 """
 
 from __future__ import annotations
@@ -76,10 +73,9 @@ def solution_of(
     unshown: Unshown | None = None,
     worse: float = 1.0,
 ) -> Solution:
-    """The solution at `t_ns`; where that is later than the estimator's instant, carried ahead by
-    holding the rates of the newest sample, for `most_ns` at most. `limits` of the vehicle's class;
-    `unshown`: what a claimed heading leaves open that nothing has shown; `worse`: how many times
-    worse than its data sheet the inertial unit shows to be."""
+    """Solution at `t_ns`; after the estimator's instant extrapolated with the rates of the newest
+    sample, for `most_ns` at most. `limits`: those of the vehicle's class; `unshown`: uncertainty of
+    an unconfirmed heading; `worse`: factor of the inertial unit's errors on its data sheet."""
     ahead_ns = min(t_ns - estimator.t_ns, most_ns)
     ahead_s = ahead_ns * 1e-9 if ahead_ns > 0 and imu.end else 0.0
     e, model, errors, out = estimator, estimator.model, estimator.sensor_errors, np.empty(_SIZE)
@@ -138,8 +134,8 @@ def _widen_by_silence(
 def _widen_by_claim(
     sd: list[float], place: tuple[float, float], v: tuple[float, float], unshown: Unshown
 ) -> None:
-    """Add to sigma (9,) what a claimed heading leaves open, of a vehicle at `place` (rad) with
-    velocity `v`, north and east."""
+    """Add the uncertainty of an unconfirmed heading to sigma (9,), at `place` (rad) with velocity
+    `v`, north and east."""
     doubt = unshown.sd_rad
     for row, more in enumerate((unshown.way_m(*place), math.hypot(*v))):
         for axis in (3 * row, 3 * row + 1):
@@ -151,9 +147,8 @@ def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:
     """Publish by the filter's own clock, the IMU's, from the next start on, since the receiver's
     clock is unusable.
 
-    That is known as well as what lies between it and the clock of a receiver that is on time: what
-    the model takes for granted of that before anything shows it, or `sd_s`, one sigma of how late
-    the fixes are, where it has no offset in time.
+    Its sigma against the clock of a receiver without delay is the model's prior of the time offset,
+    or `sd_s`, one sigma of the fixes' delay, if the model has no time offset.
     """
     slot = estimator.model.time_slot
     clock_sd_s = float(estimator.model.initial[slot]) if slot >= 0 else sd_s
@@ -169,7 +164,7 @@ class Failure(NamedTuple):
 
 
 class NavigationStatus:
-    """Judge of one navigator's solution, by its parts."""
+    """Mode of one navigator's solution, from its parts."""
 
     def __init__(
         self,
@@ -190,7 +185,7 @@ class NavigationStatus:
         self._units, self._trial, self._outcomes = units, trial, outcomes
 
     def of(self, t_ns: int, started: bool, aligning: str) -> tuple[Mode, str]:
-        """The mode at `t_ns`; without a navigation `aligning` is what the alignment waits for."""
+        """Mode at `t_ns`; `aligning`: what the alignment waits for, if there is no navigation."""
         if not self._imu.end:
             return Mode.WAITING, self._screening.silence(None)
         if self._units.wrong is not None:
@@ -248,7 +243,7 @@ class NavigationStatus:
         return None
 
     def _unaided(self, diagnosis: Diagnosis) -> str:
-        """Reason why a solution without positions in service cannot go on, or empty."""
+        """Reason why a solution without positions in service must end, or empty."""
         if (device := diagnosis.contradicts) is not None:
             return reason("filter_disagrees", device=device)
         sd = self._estimator.sigmas()
@@ -258,9 +253,10 @@ class NavigationStatus:
 
 
 class OutcomeWatch:
-    """Hears of each entry of a timeline that has been applied, again after a rewind.
+    """Record of each applied entry of a timeline, repeated after a rewind.
 
-    `coast_after_ns`: without a position for longer the next one is the `basis` of navigation."""
+    `coast_after_ns`: after a longer time without a position the next one is a new `basis` of
+    navigation."""
 
     def __init__(
         self,
@@ -290,13 +286,13 @@ class OutcomeWatch:
         return name
 
     def begin(self, start: Start) -> str:
-        """A filter has been started so; why it navigates."""
+        """Record a start of the filter and its reason."""
         self.position_ns = max(start.t_ns, self.position_ns)
         self.basis = reason("heading_from", how=start.how)
         return self.basis
 
     def receive(self, entry: Entry) -> None:
-        """An entry has been applied."""
+        """Receive an applied entry."""
         outcome, measurement = entry.outcome, entry.measurement
         if outcome is None:
             return

@@ -1,35 +1,36 @@
-r"""Check of rates in rad/s by positions: the way between fixes against the gyro's turns.
+r"""Check of the unit of rates: the path between fixes against the gyro's turns.
 
-A vehicle that drives forward goes from fix to fix in a direction of those that it has faced in
-between. Of chord i, between two fixes that are far enough apart, with the gyro's heading G since
-some instant, and k = 1 for rates in rad/s, pi / 180 for rates in deg/s,
+A vehicle that drives forward moves from fix to fix in a direction between its headings. For chord i
+between two fixes that are far enough apart, G the gyro's heading since some instant, k = 1 for
+rates in rad/s and pi / 180 for rates in deg/s,
 
     psi_i = theta + arg mean exp(j k G) - b t_i + q_i + e_i
 
-theta heading at G = 0, anything; b bias of the rates, t_i the middle of the chord's time. e_i is
-what the fixes' errors turn a chord by: those of one fix, across it, over its length, with the
-opposite sign in the next. q_i is what an unknown speed does: the direction is anywhere among those
-faced, whose range R_i makes an error of R_i / sqrt(12). All of it is normal, so that
+theta is the heading at G = 0, unknown; b the bias of the rates, t_i the middle of the chord's time.
+e_i is the effect of the fixes' errors: the lateral error of a fix over the chord's length, with the
+opposite sign in the next chord. q_i is the effect of the unknown speed: the direction is anywhere
+among the headings, whose range R_i makes an error of R_i / sqrt(12). All are normal, so that
 
     -2 ln L_k = min over theta of r^T C^-1 r + ln det C + ln (1^T C^-1 1)
 
-is known for both units, with r what is left of psi without theta, and C the covariance of b t, q
-and e. The bias of a gyro in deg/s is one of its data sheet, s; read in rad/s it is 57 times that,
-which is why it is asked at all, and a gyro in rad/s with such a bias has one of that size as well.
+is known for both units, with r the residual of psi without theta, and C the covariance of b t, q
+and e. The bias of a gyro in deg/s is within its data sheet, s; read in rad/s it is 57 times larger.
+A gyro in rad/s may also have a bias of that size, so the bias alone does not decide.
 
     2 ln (L_1 / L_57) > 2 ln 10^6
 
-has a probability of less than one in a million while rates are in deg/s: the expectation of
-L_1 / L_57 is one under the hypothesis that it speaks against (Markov's inequality; for all of the
-instants at which it is asked, Ville's). What is believed must fit as well, by its chi-square.
+has a probability below one in a million for rates in deg/s: the expectation of L_1 / L_57 is one
+under the rejected hypothesis (Markov's inequality; for all instants of the test, Ville's). The
+accepted unit must also fit by its chi-square.
 
-With fixes of 20 m each 11 s, on 150 drawn drives of 220 s with two noises each: a gyro in rad/s
-that is off by 0.6 or 2 deg/s was shown on 294 and 292 of 300, half of them 70 s after they had set
-off, one in deg/s on 290, after 103 s; the wrong one never, and of the 27.6 that it takes no more
-than 13.3 spoke for it.
+With fixes of 20 m every 11 s, on 150 drawn drives of 220 s with two noises each: a gyro in rad/s
+with a bias of 0.6 or 2 deg/s was recognised on 294 and 292 of 300, half of them within 70 s of
+driving off; one in deg/s on 290, after 103 s. The wrong unit was never accepted; its statistic
+reached 13.3 of the required 27.6.
 
-Fixes whose errors last are nearer to each other than this takes them to be. A vehicle that reverses
-fits neither unit, and nothing is told until it has gone forward for as long as is remembered.
+Fixes with lasting errors are closer to each other than assumed here, which is safe. A vehicle that
+reverses fits neither unit; there is no decision until it has driven forward for the whole stored
+path.
 
 Source: Ville, Etude critique de la notion de collectif (1939); Groves, 2nd ed., section 5.1.
 """
@@ -84,7 +85,8 @@ class _Chord(NamedTuple):
 
 
 class WayTurns:
-    """Turns by the gyro against those of the track; `bias_sd` (rad/s) is the data sheet's."""
+    """Comparison of the gyro's turns with those of the track; `bias_sd` (rad/s) is the data
+    sheet's."""
 
     def __init__(self, bias_sd: float) -> None:
         self._bias_sd = bias_sd
@@ -98,7 +100,8 @@ class WayTurns:
         self._chords: deque[_Chord] = deque(maxlen=MOST_CHORDS)
 
     def samples(self, times: NDArray[np.int64], yaw_rates: Array) -> bool:
-        """Rates (m,) about the vertical, means until `times` (m,) ns; whether a chord has ended."""
+        """Add rates (m,) about the vertical, means until `times` (m,) ns; True if a chord has
+        ended."""
         known = self._chords[-1] if self._chords else None
         instants = times.tolist()
         before_ns = self._latest_ns or instants[0]
@@ -121,13 +124,13 @@ class WayTurns:
         return bool(self._chords) and self._chords[-1] is not known
 
     def fix(self, position: PositionCandidate) -> None:
-        """A fix, in order of validity; one that comes out of order is left out."""
+        """Add a fix in order of validity; one out of order is ignored."""
         newest = self._waiting[-1] if self._waiting else self._last
         if newest is None or position.t_ns > newest.t_ns:
             self._waiting.append(position)
 
     def log_odds(self) -> float:
-        """Log odds 2 ln (L_1 / L_57) where the likelier unit fits; 0 where neither does."""
+        """Log odds 2 ln (L_1 / L_57) if the likelier unit fits; 0 if neither does."""
         if len(self._chords) < 3:
             return 0.0
         costs = [self._likelihood(unit) for unit in range(len(UNITS))]
@@ -135,7 +138,7 @@ class WayTurns:
         return costs[1][0] - costs[0][0] if better[1] else 0.0
 
     def restart(self) -> None:
-        """Forget the way so far."""
+        """Forget the path so far."""
         self._chords.clear()
 
     # ------------------------------------------------------------------ inside
@@ -170,7 +173,7 @@ class WayTurns:
         self._begin(position, follows=True)
 
     def _begin(self, position: PositionCandidate, follows: bool) -> None:
-        """The next chord begins here; the heading before it is not needed any more."""
+        """Start the next chord here; drop the heading before it."""
         self._last, self._follows = position, follows
         old = max(0, bisect_left(self._times, position.t_ns) - 1)
         del self._times[:old], self._turned[:old]
@@ -201,7 +204,7 @@ class WayTurns:
 def _directions(faced: Array) -> tuple[float, float]:
     """Mean of directions (m,) and one sigma (rad) of any of them.
 
-    They were faced one after the other, each in its own turn."""
+    The headings are in order of time and may exceed a full turn."""
     begin = float(faced[0])
     mean = complex(np.exp(1j * (faced - begin)).mean())
     spread = float(faced.max() - faced.min())

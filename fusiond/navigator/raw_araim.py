@@ -1,13 +1,13 @@
 r"""Protection levels from raw epochs, each by advanced RAIM.
 
-The position x_e of an epoch's ranges alone has levels PL_e that hold whatever one satellite or
-constellation does (fusiond.integrity.araim). With x_0 the published solution after the epoch
+The position x_e of an epoch's ranges alone has levels PL_e that hold for any fault of one satellite
+or constellation (fusiond.integrity.araim). With x_0 the published solution after the epoch
 
     |error of x_0|  <=  |x_0 - x_e| + |error of x_e|
 
-so |x_0 - x_e| + PL_e bounds it, too, whatever the filter has made of the ranges: screened them, or
-left the whole receiver out. With the corrected ranges z less what the solution predicts, S of the
-satellites that are kept, and t the displacement that the model has all ranges share,
+so |x_0 - x_e| + PL_e bounds it, too, even if the filter has rejected some ranges or excluded the
+receiver. With z the corrected ranges minus their prediction by the solution, S of the remaining
+satellites, and t the model's displacement common to all ranges,
 
     x_0 - x_e = S z - t
 
@@ -79,7 +79,7 @@ NO_BOUND = EpochLevel(math.inf, math.inf)
 @dataclass(slots=True)
 class _Received:
     """An epoch at `t_ns`: its ranges z (n,) m less the solution's, the shared displacement t (3,) m
-    north, east, down; its level once that was asked for."""
+    north, east, down; its level once computed."""
 
     t_ns: int
     satellites: tuple[str, ...]

@@ -1,8 +1,8 @@
 r"""Tight coupling: a receiver's raw epochs become measurements of corrected ranges and rates.
 
-What a receiver broadcasts on (ephemerides, ionosphere) is kept; each epoch is corrected for the
-place where the filter is at its instant (100 m off moves a correction by 1 cm). Before there is a
-filter, the solution of the epoch alone starts the alignment.
+Broadcast data (ephemerides, ionosphere) are stored. Each epoch is corrected for the filter's
+position at its instant (an error of 100 m changes a correction by 1 cm). Before the filter starts,
+the solution of the epoch alone serves the alignment.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Memory:
     levels: RangeBiases | None = None
 
     def is_after(self, before: _Memory) -> bool:
-        """True if the epoch was followed from that one."""
+        """True if the carriers were tracked from that epoch to this one."""
         return self.followed is not None and self.after is before.kept
 
 
@@ -95,8 +95,8 @@ class _Memory:
 class RawEpochMeasurement(AidingMeasurement):
     """Epoch with chosen signals, corrected for the filter's position at its instant.
 
-    So the order of arrival leaves no trace: what an epoch comes to depends on the state at its own
-    instant, not on how far the filter had got when the epoch came in.
+    The result depends on the state at the epoch's own instant, not on the filter's progress at
+    arrival, so the order of arrival does not matter.
     """
 
     screened: ClassVar[bool] = True
@@ -217,8 +217,8 @@ class RawGnss:
         return measurement
 
     def followed(self, measurement: RawEpochMeasurement) -> TrackedSignals:
-        """Epoch followed through all earlier ones, in any order of arrival: a delayed epoch changes
-        later ones."""
+        """Epoch with carriers tracked through all earlier epochs, in any order of arrival: a
+        delayed epoch changes later ones."""
         recent = self.recent
         at = bisect_left(recent, measurement.t_ns, key=_instant)
         while (
@@ -340,7 +340,7 @@ class RawGnss:
         codes: Sequence[int],
         whitened: Sequence[float],
     ) -> None:
-        """The filter has looked at an epoch; one that a rewind brings again counts once."""
+        """Record a processed epoch; one repeated by a rewind counts once."""
         self._judged = measurement, corrected, codes, whitened
         self._guess = corrected.guess
         self._count(measurement, corrected.rows.refused)
@@ -354,7 +354,7 @@ class RawGnss:
                 self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
     def _count(self, measurement: RawEpochMeasurement, refused: Sequence[tuple[str, str]]) -> None:
-        """Satellites that do not serve, once an epoch."""
+        """Count the refused satellites of an epoch."""
         if not measurement.memory.counted:
             measurement.memory.counted = True
             for satellite, reason in refused:

@@ -1,4 +1,4 @@
-"""Sky of a receiver's last raw epoch: who serves, who is refused and why, where all stand."""
+"""Sky of a receiver's last raw epoch: satellites in use, refused ones with reasons, directions."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ REASONS = {KEPT: "used", RESIDUAL: "residual"}
 
 
 class Seen(NamedTuple):
-    """Direction of a satellite (rad; None for one that was refused before that was looked at) and
-    its strongest signal (dB-Hz; None where the receiver does not say)."""
+    """Direction of a satellite (rad; None if refused before it was computed) and its strongest
+    signal (dB-Hz; None if the receiver states none)."""
 
     azimuth_rad: float | None
     elevation_rad: float | None
@@ -33,7 +33,7 @@ class Seen(NamedTuple):
 @immutable()
 class Sky:
     """The last epoch: satellites used, refused ones by reason, DOPs, RMS of the normalised
-    innovations of the ranges that were used; where all of them stand."""
+    innovations of the ranges used; directions of all."""
 
     used: tuple[str, ...] = ()
     refused: dict[str, str] = field(default_factory=dict)
@@ -50,8 +50,8 @@ def sky_of(
     codes: Sequence[int],
     whitened: Sequence[float],
 ) -> Sky:
-    """Sky of an epoch for a vehicle at about `place` (ECEF, m), with what the filter made of the
-    measurement's rows."""
+    """Sky of an epoch for a vehicle near `place` (ECEF, m), with the filter's outcome of each
+    row."""
     used, refused, squares = [], dict(rows.refused), []
     whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
     for (satellite, what), code, innovation in zip(
@@ -76,7 +76,7 @@ def sky_of(
 
 
 def _seen(epoch: RawGnssEpoch, rows: Rows) -> dict[str, Seen]:
-    """Every satellite of an epoch; rows have the direction of those that could serve."""
+    """Every satellite of an epoch; rows have the direction of the usable ones."""
     angles = zip(rows.azimuth_rad.tolist(), rows.elevation_rad.tolist(), strict=True)
     directions = dict(zip(rows.satellites, angles, strict=True))
     strongest: dict[str, float | None] = {}

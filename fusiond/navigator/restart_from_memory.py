@@ -1,35 +1,35 @@
 r"""Start from the state of a daemon killed moments ago: an IMU gap instead of an alignment.
 
-Over the gap T, from the snapshot's instant to the first IMU sample (exact, since both are of one
+Over the gap T, from the snapshot's instant to the first IMU sample (exact, as both are of one
 monotonic clock), turn rate w and acceleration a of the vehicle are two Markov processes after
 Singer: known at the snapshot, forgotten with the time constant tau, rms TURN and PUSH.
 
-    psi = w tau (1 - e),  dv = a tau (1 - e),  e = exp(-T / tau)      the way it goes on
+    psi = w tau (1 - e),  dv = a tau (1 - e),  e = exp(-T / tau)      expected motion
     P   <- Phi P Phi^T + Q
     Phi :  phi, dv turned by psi,  dr += T dv,  clock offset += T rate,  Markov states decay
-    Q   :  turn    theta of heading, and of velocity and way with it,
+    Q   :  turn    theta of heading, and of velocity and path with it,
                    dv = theta (v_e, -v_n),  dr = int(theta) (v_e, -v_n)
            push    dv, dr = int(dv)  on each axis
            tilt    of the road at either end, at most
            parameters: their own noise over T
 
-What is unknown of a process x of rms 1 has the covariance S of y = int(x) and z = int(y), x = T/tau
+The unknown part of a process x of rms 1 gives y = int(x) and z = int(y) the covariance S, x = T/tau
 
     S_yy = tau^2 (2 x - 3 + 4 e - e^2)
     S_yz = tau^3 (1 - 2 x + x^2 - 2 e + 2 x e + e^2)
     S_zz = tau^4 (1 + 2 x - 2 x^2 + 2 x^3 / 3 - 4 x e - e^2)
 
-so that (theta, int(theta)) ~ N(0, TURN^2 S) and (dv, dr) ~ N(0, PUSH^2 S). The way does not follow
-from the velocity at its end: with dr = T dv / 2 the first velocities of a receiver told the place
-to 9 cm, and 23 % of restarts were 3 to 15 sigma off two seconds later.
+so that (theta, int(theta)) ~ N(0, TURN^2 S) and (dv, dr) ~ N(0, PUSH^2 S). The path does not follow
+from the velocity at its end: with dr = T dv / 2 a receiver's first velocities gave the place to 9
+cm, and 23 % of restarts were 3 to 15 sigma off two seconds later.
 
-P is the covariance of the errors (computed minus true, fusiond.navigation.error_model; there
-phi_d = +theta for a vehicle that turned right unseen). A prior of white force and rate, as
-fusiond.estimators.propagation has it for a silent IMU, knows less: after 1 s in a bend it is 4.8
-sigma off in heading (90 deg in 6 s), where this is inside 3.
+P is the covariance of the errors (computed minus true, fusiond.navigation.error_model; there phi_d
+= +theta for a vehicle that turned right unseen). A prior of white force and rate, as
+fusiond.estimators.propagation has for a silent IMU, is worse: after 1 s in a bend it is 4.8 sigma
+off in heading (90 deg in 6 s), this one less than 3.
 
-What comes of it is on trial: until the first position measurement has passed its gate nobody should
-steer by it, and one that does not pass ends it.
+The start is on trial until the first position measurement has passed its gate; one that fails ends
+it.
 
 Source: Singer, Estimating Optimal Tracking Filter Performance for Manned Maneuvering Targets, IEEE
 Trans. AES-6 (1970), eq. 4 to 11: covariance of the integrals of such a process.
@@ -89,10 +89,10 @@ Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 class WarmState:
     """A navigation state: instant, nav (10,), parameters (n,), P (n, n) as its lower triangle.
 
-    `t_ns` is CLOCK_MONOTONIC_RAW of the boot `boot_id`, `asleep_ns` what that has been suspended;
-    `config` the digest of the configuration whose states these are, `how` the heading's origin,
-    `confirmed` whether anything has shown that heading. `turn_rad_s` is the rate of the heading,
-    `push_m_s2` the acceleration along the way.
+    `t_ns` is CLOCK_MONOTONIC_RAW of the boot `boot_id`, `asleep_ns` the suspended time of that
+    boot; `config` the digest of the configuration, `how` the heading's origin, `confirmed` true if
+    a measurement has confirmed the heading. `turn_rad_s` is the rate of the heading, `push_m_s2`
+    the acceleration along the way.
     """
 
     boot_id: Annotated[str, Field(min_length=1, max_length=64)]
@@ -114,7 +114,7 @@ class WarmState:
 class WarmStart:
     """Start from `state` for a filter of `model`, and its trial.
 
-    Raises `DamagedStateError` for a state that is none.
+    Raises `DamagedStateError` for an invalid state.
     """
 
     def __init__(self, state: WarmState, model: Model) -> None:
@@ -126,7 +126,7 @@ class WarmStart:
         """Source of the position measurement that contradicted the state."""
 
     def start(self, t_ns: int) -> Start:
-        """The start at `t_ns` (monotonic ns), the first IMU sample. Raises `RefusedStateError`."""
+        """Start at `t_ns` (monotonic ns), the first IMU sample. Raises `RefusedStateError`."""
         gap_s = (t_ns - self._state.t_ns) * 1e-9
         if not 0.0 <= gap_s <= LONGEST_GAP_S:
             raise RefusedStateError(
@@ -136,8 +136,8 @@ class WarmStart:
         return _after_gap(self._state, self._model, self._covariance, t_ns, gap_s)
 
     def judge(self, source: str, outcome: str) -> None:
-        """A position measurement of `source` has been applied: the first to be fused or gated
-        decides."""
+        """Judge the start by an applied position measurement of `source`: the first fused or gated
+        one decides."""
         if self.on_trial and outcome in ("fused", "gated"):
             self.on_trial = False
             if outcome == "gated":

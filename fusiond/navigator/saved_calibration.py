@@ -1,8 +1,8 @@
-"""The calibration on disk: what one drive has shown serves the next start.
+"""Calibration on disk: results of one drive for the next start.
 
-It lies beside the saved state, in a file of its own, because it outlives a drive: that state is
-forgotten as soon as the vehicle moves. What it says lies beyond the values configured then, so it
-holds only while axes, mounting, lever arms and delays are configured as they were.
+It has its own file beside the saved state, because it outlives a drive: the saved state becomes
+void as soon as the vehicle moves. Values are relative to the configured ones, so they hold only
+while axes, mounting, lever arms and delays keep their configuration.
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ class SavedCalibration:
 
     def refuted(self, parameters: Iterable[Parameter]) -> str | None:
         """Contradiction of a restored calibration: a value beyond four sigma of the possible
-        change, by chance one time in 16,000. Offsets in time may wander on a long drive. None
-        without one."""
+        change, by chance one time in 16,000. Time offsets may drift on a long drive. None without
+        one."""
         for p in parameters:
             if p.name in self.values and p.kind not in WANDERING:
                 value, sd = self.values[p.name]
@@ -147,7 +147,7 @@ def mounting_digest(config: Config) -> str:
 def saved_calibration(
     parameters: Iterable[Parameter], digest: str, noise: SavedNoise | None = None
 ) -> SavedCalibration | None:
-    """Part of a calibration to save: all that has been observed; None for nothing."""
+    """Observed part of a calibration, to be saved; None if nothing was observed."""
     values = {
         p.name: (p.value, p.sd) for p in parameters if p.state is not CalibrationState.NOT_OBSERVED
     }
@@ -162,7 +162,7 @@ def save_calibration(path: Path, saved: SavedCalibration) -> None:
 def load_calibration(path: Path, model: Model, digest: str) -> SavedCalibration | None:
     """Saved calibration; None without a valid one.
 
-    Raises `DamagedStateError` for what is none, `RefusedStateError` for one of another mounting.
+    Raises `DamagedStateError` for an invalid file, `RefusedStateError` for one of another mounting.
     """
     saved = read_state(path, _SAVED)
     if saved is None:

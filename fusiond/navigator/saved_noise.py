@@ -1,11 +1,11 @@
 """Saved noise estimates for the next start, with less weight, and less with age.
 
-Sums of evidence, of which a share is so much less of the same: how the errors of a receiver's fixes
-divide (fusiond.aiding.fix_errors), which share of what the samples show is noise
-(fusiond.navigator.imu_noise_share), and how much of typed drifts and white noise there is
-(fusiond.navigator.sensor_drift_magnitudes, fusiond.navigator.sensor_white_noise). The next drive is
-through other streets, so no more than `CARRIED` of it counts: two of ten minutes, which two minutes
-of it outweigh. A week on, antenna and load may be others: less by e.
+Sums of evidence, which can be scaled to less weight: division of a receiver's errors of fixes
+(fusiond.aiding.fix_errors), noise share of the samples (fusiond.navigator.imu_noise_share), size of
+configured drifts and white noise (fusiond.navigator.sensor_drift_magnitudes,
+fusiond.navigator.sensor_white_noise). The next drive has other streets, so only `CARRIED` of the
+sums counts: two of ten minutes, which two new minutes outweigh. With antenna and load possibly
+changed, the weight falls by e each week.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ Level = Annotated[tuple[Sum, ...], Field(min_length=1 + len(LEVELS), max_length=
 class SavedNoise:
     """Sums of each receiver's fixes by name; log likelihoods of shares of the samples' noise, of
     how many predictions; of levels of drifts by block, after the number of instants; number and sum
-    of a sensor's pairs of innovations by source; POSIX time (s), where it was known. Raises
-    pydantic's `ValidationError` for what is none."""
+    of a sensor's pairs of innovations by source; POSIX time (s), if known. Raises pydantic's
+    `ValidationError` for invalid values."""
 
     utc_s: Annotated[float, Field(ge=0.0, le=1e11)] | None
     fixes: Annotated[dict[Name, Sums], Field(max_length=64)]
@@ -49,8 +49,7 @@ class SavedNoise:
     whites: Annotated[dict[Name, Pairs], Field(max_length=64)] = field(default_factory=dict)
 
     def at(self, now_utc_s: float | None) -> SavedNoise:
-        """The part that counts for a start at that time; where nobody knows how old it is, as of a
-        week."""
+        """Part that counts for a start at that time; for an unknown age, that after a week."""
         age_s = FADES_S
         if now_utc_s is not None and self.utc_s is not None:
             age_s = max(now_utc_s - self.utc_s, 0.0)

@@ -1,4 +1,4 @@
-"""Last solution on disk, so that a restart at the same place needs no new heading."""
+"""Last solution on disk, for a restart at the same place without a new heading."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SavedState:
     """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s); no
     height if unknown.
 
-    Raises pydantic's `ValidationError` for what no vehicle can have.
+    Raises pydantic's `ValidationError` for impossible values.
     """
 
     utc_s: Annotated[float, Field(ge=0.0, le=1e11)]
@@ -58,8 +58,8 @@ def save_state(path: Path, state: SavedState) -> None:
 def load_state(path: Path, now_utc_s: float | None, max_age_s: float) -> SavedState | None:
     """Saved state; None without a valid one.
 
-    Raises `DamagedStateError` for what is none, `RefusedStateError` for one of the wrong time, or
-    while the time (`now_utc_s`, POSIX) is not known.
+    Raises `DamagedStateError` for an invalid file, `RefusedStateError` for a wrong time or if the
+    time (`now_utc_s`, POSIX) is unknown.
     """
     state = read_state(path, _SAVED)
     if state is None:

@@ -1,23 +1,23 @@
 r"""Magnitudes of configured drifts: side slip, wheel drift, compass disturbance.
 
-No device states them, and a configuration has what fits any vehicle. Each is a Markov state x of
-typed sigma s, of which c x counts in its measurement. By x^ and P as the filter has them the
-measurements alone say x~ of variance R, some correlation times apart (as
+No device states them, and the configured values fit any vehicle. Each is a Markov state x of
+configured sigma s, of which c x acts on its measurement. From the filter's x^ and P, some
+correlation times apart, the measurements alone give x~ of variance R (as in
 fusiond.navigator.unit_grade),
 
     1 / R = 1 / P - 1 / s^2,   x~ = x^ R / P,   x~ ~ N(0, g s^2 / c^2 + R)
 
-g the level, of variances. The likelihood is summed up on a grid of g, each as likely at first as
-the next, while the vehicle moves: at rest wheels and tyres do not slip. An instant counts
+g is the level, as a variance ratio. The log likelihood is summed on a grid of g with a uniform
+prior, while the vehicle moves: at rest wheels and tyres do not slip. An instant counts as
 
     w = (s^2 / c^2 / (s^2 / c^2 + R))^2 min(1, T / (2 tau))
 
-of one at which x was measured without noise: its part of the Fisher information of log g, and of
-instants T apart within a correlation time tau so many are one. With n their sum c^2 is
+of an instant at which x is measured without noise: its part of the Fisher information of log g,
+reduced for instants T apart within a correlation time tau. With n their sum c^2 is
 
     (n E[g] + FIRST) / (n + FIRST)
 
-No level is above what is typed: that a series errs by more, its innovations say
+No level is above the configured one: larger errors show in the innovations
 (fusiond.estimators.noise_scale).
 
 Source: Gelman, Carlin, Stern, Dunson, Vehtari, Rubin, Bayesian Data Analysis, 3rd ed. (2013),
@@ -114,7 +114,7 @@ class DriftLevels:
             drift.counted = [(0, drift.found)]
 
     def counts(self, block: str, t_ns: int) -> float:
-        """c of a measurement of `t_ns`; 1 of a block that is none of them."""
+        """Factor c for a measurement of `t_ns`; 1 for any other block."""
         drift = self._drifts.get(block)
         return 1.0 if drift is None else drift.at(t_ns)
 

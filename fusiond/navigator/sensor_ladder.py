@@ -1,17 +1,16 @@
-r"""Inertial unit that is worse than its class: what its sheet says is a prior, and may be wrong.
+r"""Detection of an inertial unit that is worse than its configured class.
 
-Rates of a body at rest are biases, or the body turns. Turns about the vertical a deck or a table
-makes; one about a level axis at w turns gravity in the body, and where the mean force stays within
-d of where it was for t seconds it is no faster than d / (g t). So the rates across the force are
-biases, k of them of variance g s^2 + R: g = 1 where the unit is of its class, which it is but for
-one in `WRONG`, else any that is larger, each octave as likely as the next.
+Rates of a body at rest are biases, or the body turns. A turn about the vertical may be that of a
+deck or a table. A turn about a level axis at w turns gravity in the body; if the mean force stays
+within d for t seconds, w is at most d / (g t). So the rates across the force are biases, k of them
+of variance g s^2 + R. The prior: g = 1, the unit's class, except for one unit in `WRONG`; else a
+larger g, uniform by octave.
 
-Classes lie on a ladder: a unit whose gyros have biases between those of two has the other errors
-between theirs too, by logarithm. What it is worse than its sheet says, it is in all of them.
+Classes are ordered: a unit with gyro biases between those of two classes also has its other errors
+between theirs, by logarithm.
 
-On the move biases come out of a fit (fusiond.navigator.alignment.motion_fit), with those of its
-class as a prior: there a worse class is taken where its fit is better by more than what makes it
-likelier.
+On the move biases come from a fit (fusiond.navigator.alignment.motion_fit) with the class as a
+prior: a worse class is accepted if its fit improves by more than its prior costs.
 
 Source: Berger, Robust Bayesian analysis: sensitivity to the prior, J. Stat. Plan. Inference 25
 (1990), 303 (a contaminated class of priors).
@@ -43,8 +42,8 @@ AS_SAID = "bias_correlation_s"
 
 
 def worse_than_said(seen: Array, prior: float, noise: float) -> float:
-    """E[g] by rates (k,) that are biases, the sheet's variance of them, and that of what they are
-    seen with; 1 where it is likelier than not that the unit is of its class."""
+    """E[g] from biases (k,), the data sheet's variance of them, and their measurement variance; 1
+    if the unit is more likely of its class."""
     grades = np.concatenate(([1.0], WORSE))
     variance = grades * prior + noise
     log = -0.5 * (len(seen) * np.log(variance) + float(seen @ seen) / variance)
@@ -56,7 +55,7 @@ def worse_than_said(seen: Array, prior: float, noise: float) -> float:
 
 
 def widened(noise: ImuNoise, grade: float) -> ImuNoise:
-    """Errors of a unit whose gyros' biases have so many times the variance."""
+    """Errors of a unit with that factor on the variance of its gyro biases."""
     if grade <= 1.0:
         return noise
     bias = math.sqrt(grade) * noise.rate_bias_initial
@@ -71,7 +70,7 @@ def widened(noise: ImuNoise, grade: float) -> ImuNoise:
 
 
 def worse_classes(noise: ImuNoise) -> list[ImuNoise]:
-    """Units as bad as each class whose gyros are worse, the best first."""
+    """Noise of each class with worse gyros, the best first."""
     bias = noise.rate_bias_initial
     return [
         widened(noise, (each.rate_bias_initial / bias) ** 2)
@@ -81,16 +80,16 @@ def worse_classes(noise: ImuNoise) -> list[ImuNoise]:
 
 
 def evidence_against(noise: ImuNoise, worse: ImuNoise) -> float:
-    """By how much lower (chi-square) a fit of biases must be with those of a worse unit for it to
-    be likelier: one unit in `WRONG` is, and it spreads its biases over so much more."""
+    """Decrease of chi-square that makes a worse unit likelier: its prior is one in `WRONG`, and its
+    biases spread over a larger volume."""
     rate = math.log(worse.rate_bias_initial / noise.rate_bias_initial)
     force = math.log(worse.force_bias_initial / noise.force_bias_initial)
     return 2.0 * (math.log(WRONG) + 3.0 * rate + 3.0 * force)
 
 
 def grades_of(noise: ImuNoise, sheet: ImuNoise, misalignment_rad: float) -> Array:
-    """Grades (13,) of a unit with that `noise` against what its `sheet` says, which has axes out of
-    square by `misalignment_rad`: fusiond.navigator.unit_grade."""
+    """Grades (13,) of a unit with `noise` relative to its data `sheet`, whose axes are out of
+    square by `misalignment_rad` (fusiond.navigator.unit_grade)."""
     pairs = (
         (noise.rate_bias_initial, sheet.rate_bias_initial),
         (noise.force_bias_initial, sheet.force_bias_initial),
@@ -106,6 +105,6 @@ def grades_of(noise: ImuNoise, sheet: ImuNoise, misalignment_rad: float) -> Arra
 
 @lru_cache(maxsize=1)
 def _ladder() -> list[ImuNoise]:
-    """Of the classes, the best gyros first."""
+    """Classes, those with the best gyros first."""
     found = [imu_noise(Imu.model_validate({"sensor_class": name})) for name in CLASSES]
     return sorted(found, key=lambda each: each.rate_bias_initial)

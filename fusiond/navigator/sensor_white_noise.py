@@ -1,22 +1,21 @@
-r"""Typed white noise of wheels, side slip and compasses: how much of it a vehicle shows.
+r"""Observed share of the configured white noise of wheels, side slip and compasses.
 
-No device measures it: what a section or a file states is typed, and fits any vehicle. The
-innovations of a series have it anew in each, and what they share besides does not: the filter's
-own error, and a drift of which the filter has a state and which lasts for tau. So of two that lie a
-lag of tau / 2 apart or little more, with q the variance of the rounding, which is known,
+No device measures it: the value of a section or a file fits any vehicle. White noise is new in each
+innovation of a series; the filter's own error and the drift state, with correlation time tau, are
+common to neighbours. So for two innovations about tau / 2 apart, with q the known variance of the
+rounding,
 
-    D = E[(nu_k - nu_j)^2] / 2 = W + q + (what drift and filter have changed by)^2 / 2
+    D = E[(nu_k - nu_j)^2] / 2 = W + q + (change of drift and filter error)^2 / 2
 
-is no less than the white variance W, whatever P says of the rest (Allan's structure function, as of
-a receiver's fixes: fusiond.aiding.fix_errors). A wheel that repeats its speed, or a bus that
-smooths it, looks white to nobody at that lag: its error moves on. With n such pairs of a vehicle
-that drives, c^2 of the typed variance s^2 counts,
+is no less than the white variance W for any P (Allan's structure function, as for a receiver's
+fixes: fusiond.aiding.fix_errors). A repeated or smoothed wheel speed has changed its error within
+that lag. With n such pairs while driving, c^2 of the configured variance s^2 counts,
 
     c^2 = (n max(LEAST, min(1, (D - q) / s^2)) + FIRST) / (n + FIRST)
 
-None is above what is typed: that a series errs by more, its innovations say
-(fusiond.estimators.noise_scale). Of no slip it is the side's: down there is no state of a drift,
-and what is typed stands for springs and road as well.
+c is at most 1: larger errors show in the innovations (fusiond.estimators.noise_scale). Of the
+no-slip constraint only the lateral noise is learned: downwards there is no drift state, and the
+configured value includes springs and road.
 
 Source: Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15
 (1970), for noise from the innovations of a filter that is not optimal; Allan, Statistics of atomic
@@ -59,7 +58,7 @@ class _Series:
     """Start (ns) of each c's validity."""
 
     def pair(self, t_ns: int, innovation: float) -> None:
-        """Take the next innovation of a vehicle that drives."""
+        """Add the next innovation of a moving vehicle."""
         if self.last is None or t_ns - self.last[0] > LATEST * self.lag_ns:
             self.last = t_ns, innovation
             return
@@ -80,7 +79,7 @@ class _Series:
 
 
 class WhiteNoise:
-    """White noise of the series of one vehicle, by source; those that ask for it are learned."""
+    """White noise of one vehicle's series by source; learned for each series that requests it."""
 
     def __init__(self) -> None:
         self.series: dict[str, _Series] = {}
@@ -93,13 +92,14 @@ class WhiteNoise:
         return {name: (each.count, each.total) for name, each in self.series.items()}
 
     def take_up(self, shown: Mapping[str, tuple[float, ...]]) -> None:
-        """Resume series that nothing has come of with those of another drive."""
+        """Resume series without data so far from those of another drive."""
         self._saved = shown
 
     def counts(
         self, source: str, t_ns: int, sd: float, lasts_s: float, rounding_sd: float = 0.0
     ) -> float:
-        """c of a measurement of `t_ns` with typed `sd`, whose drift lasts for `lasts_s`."""
+        """Factor c for a measurement of `t_ns` with configured `sd`, whose drift has the
+        correlation time `lasts_s`."""
         one = self.series.get(source)
         if one is None:
             lag_ns = round(PART * lasts_s * 1e9)
@@ -110,7 +110,7 @@ class WhiteNoise:
         return next((c for since, c in reversed(one.counted) if since <= t_ns), 1.0)
 
     def receive(self, source: str, t_ns: int, innovation: float) -> None:
-        """A measurement has been applied, or again after a rewind; NaN: it was not fused."""
+        """Receive an applied measurement, possibly repeated by a rewind; NaN: it was not fused."""
         one = self.series.get(source)
         if one is None:
             return
@@ -120,9 +120,9 @@ class WhiteNoise:
             one.waiting[t_ns] = innovation
 
     def settle(self, t_ns: int, counts_ns: int, moving: bool) -> None:
-        """Nothing comes any more that is earlier than `t_ns`; what is found counts from `counts_ns`
-        on. Without `moving` what was valid since the last time shows nothing: at rest wheels and
-        tyres do not slip."""
+        """Evaluate the data before `t_ns`, to which nothing is added any more; the result counts
+        from `counts_ns` on. Data at rest (`moving` false) are dropped: wheels and tyres do not slip
+        then."""
         for one in self.series.values():
             due = sorted(at for at in one.waiting if at <= t_ns)
             if not moving:

@@ -1,8 +1,7 @@
 """Active faults and the service of each source, for publication.
 
-A fault of a source lasts from its finding until every series that it spoils is nominal again: while
-one of them is out of service or on probation, and has been since that finding or before. A fault
-that was corrected is over at once; it is told for `CORRECTED_SHOWN_NS`.
+A fault of a source lasts from its finding until every series that it spoils is nominal again. A
+corrected fault is over at once and is published for `CORRECTED_SHOWN_NS`.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Fault(NamedTuple):
 class SourceService:
     """Service state of sources, read from timeline and estimator without a change.
 
-    `names`: the estimator's own sources, of which a name may stand for several series.
+    `names`: the estimator's own sources; one name may stand for several series.
     """
 
     def __init__(self, timeline: Timeline, names: tuple[str, ...]) -> None:
@@ -51,8 +50,8 @@ class SourceService:
         return sorted(found, key=lambda fault: fault.finding.t_ns)
 
     def states(self, source: str) -> dict[str, Service]:
-        """State of each series of a source: of a device all that it sends, else the one of that
-        name. A filter that isolates by itself knows two states of each of its own sources."""
+        """State of each series of a source: all series of a device, else the one of that name. A
+        filter with its own isolation has two states for each source."""
         if (local := self._local(source)) is not None:
             out = self._names[local] in self._timeline.estimator.isolated
             return {source: Service.OUT if out else Service.NOMINAL}
@@ -60,7 +59,7 @@ class SourceService:
         return {name: s.state for name, s in series.items() if source in (name, s.device)}
 
     def reason(self, source: str) -> str | None:
-        """Reason why a source of measurements is left out; None if it is not."""
+        """Reason for a source's exclusion; None if it is in use."""
         if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
             return reason
         local = self._local(source)
@@ -71,7 +70,7 @@ class SourceService:
 
 
 def worst(states: Iterable[Service]) -> Service | None:
-    """The worst of some states; None of none."""
+    """Worst of some states; None without any."""
     found = set(states)
     return next((state for state in WORST_FIRST if state in found), None)
 

@@ -1,13 +1,13 @@
-"""Small files of state that a start reads: written whole or not at all, believed once validated.
+"""Small state files: written atomically, validated before use.
 
-A start must outlive whatever lies at the path: nothing, half a file, a directory, a pipe, numbers
-that no vehicle has. So the size is looked at before anything is read, a parser that bounds depth
-and numbers reads it, a model of the state judges ranges, and what fails any of that is put aside,
-where a person can look at it and the next start does not meet it again.
+A start must survive anything at the path: no file, half a file, a directory, a pipe, impossible
+numbers. So the size is checked before reading, the parser bounds depth and numbers, and a model of
+the state checks ranges. A file that fails is set aside: a person can examine it, and the next start
+does not read it again.
 
-A bit that a disk has lost makes another digit of a digit, and a heading that is possible and wrong:
-the first member, `crc32`, is the check (CRC-32 of IEEE 802.3, hexadecimal) of the text without it.
-Files of before it was written have none.
+A bit lost on disk may change a digit into another one, a wrong but possible heading. So the first
+member, `crc32`, is the CRC-32 (IEEE 802.3, hexadecimal) of the text without it. Older files have
+none.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ CHECK_BEGINS, CHECK_SIZE = b'{"crc32":', len(CHECK % 0)
 
 
 class DamagedStateError(Exception):
-    """File at the path is not a state: the text says why."""
+    """File at the path is not a state; the text gives the reason."""
 
 
 class RefusedStateError(Exception):
-    """The state is sound but cannot be used now: the text says why."""
+    """Valid state that cannot be used now; the text gives the reason."""
 
 
 def read_state(path: Path, kind: TypeAdapter[State]) -> State | None:
@@ -77,7 +77,7 @@ def _checked(text: bytes) -> bytes:
 def write_state(path: Path, text: bytes, durable: bool) -> None:
     """Write `text`, a JSON object, with its checksum.
 
-    Whole: whenever the process dies, the old file or the new one is there. OSError passes.
+    Atomic: if the process dies, the old or the new file exists. OSError passes.
 
     `durable`: also after a power cut; it costs the disk two flushes.
     """
@@ -104,7 +104,7 @@ def write_state(path: Path, text: bytes, durable: bool) -> None:
 def set_aside(path: Path) -> str:
     """Rename an unusable file so that the next start ignores it; a description.
 
-    What was put aside before gives way.
+    It replaces a file that was set aside before.
     """
     aside = path.with_name(path.name + ".bad")
     if path.is_dir():

@@ -1,10 +1,9 @@
-"""The timeline: measurements in order of validity, checkpoints of the filter, exact rewinding.
+"""Timeline: measurements in order of validity, checkpoints of the filter, exact rewinding.
 
-A measurement whose instant has passed takes the filter back to the last checkpoint before it; it is
-applied at its own instant, and everything after it runs again. The state that results is, bit for
-bit, the one that would have come of arrival in order of validity, as long as the measurement is
-younger than the oldest checkpoint. Measurements of one instant are ordered by source, not by
-arrival; a feedback that is due comes first.
+A delayed measurement rewinds the filter to the last checkpoint before its instant; it is applied
+there, and everything after it runs again. The resulting state equals, bit for bit, that of arrival
+in order of validity, if the measurement is younger than the oldest checkpoint. Measurements of one
+instant are ordered by source, not by arrival; a feedback that is due comes first.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class _Checkpoint:
 
 @dataclass(slots=True)
 class Counters:
-    """Outcomes by source; `rewinds` and how far they went in all."""
+    """Outcomes by source; number and total length of `rewinds`."""
 
     outcomes: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     rewinds: int = 0
@@ -76,7 +75,7 @@ class Counters:
 class Timeline:
     """Timeline of an estimator: IMU samples and measurements in order of validity.
 
-    `on_outcome` is called with each entry whenever it has been applied, again after a rewind.
+    `on_outcome` is called with each applied entry, again after a rewind.
     """
 
     def __init__(
@@ -109,8 +108,8 @@ class Timeline:
         self._rows = MeasurementRows(estimator)
 
     def start(self, used: Collection[Candidate] = ()) -> None:
-        """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
-        it was made of, `used`, once more."""
+        """Start at the estimator's state: earlier measurements are too old, and those that it
+        contains, `used`, are not applied again."""
         self._next = 0
         self.diagnosis.reset()
         self._checkpoints = [
@@ -140,7 +139,7 @@ class Timeline:
 
     @property
     def oldest_ns(self) -> int:
-        """The earliest instant that a measurement may still be valid at."""
+        """Earliest instant of validity that is still accepted."""
         return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
 
     def insert(self, measurement: AidingMeasurement, serial: int = 0) -> Entry:
@@ -202,11 +201,11 @@ class Timeline:
 
     @contextmanager
     def past(self, t_ns: int) -> Iterator[None]:
-        """Context in which the estimator is as at `t_ns`, from `oldest_ns` on, after every
-        measurement valid until then; afterwards it is restored bit for bit.
+        """Context with the estimator's state at `t_ns` (from `oldest_ns` on), after all
+        measurements valid until then; restored bit for bit afterwards.
 
-        It is run from the checkpoint before, so it costs as much as a rewind to that instant, but
-        not beyond it: nothing is counted and nobody is told.
+        It runs from the last checkpoint before, at the cost of a rewind to that instant; nothing is
+        counted or reported.
         """
         estimator = self.estimator
         present = estimator.snapshot()
@@ -251,7 +250,7 @@ class Timeline:
         return ran.done > 0 or ran.how == KEEP
 
     def _judged(self, entry: Entry, outcome: Outcome) -> Outcome:
-        """Outcome of a measurement that is judged."""
+        """Outcome of a measurement, judged by gate and hypotheses."""
         measurement, self.decided = entry.measurement, True
         try:
             one = self.diagnosis.series[measurement.source]
@@ -306,7 +305,7 @@ class Timeline:
         return outcome
 
     def _rests(self, measurement: AidingMeasurement, outcome: Outcome) -> None:
-        """Keep what a measurement of rest proves, for the propagation from here on."""
+        """Store a measurement of rest, for the propagation after it."""
         if measurement.constraint and measurement.rests_s:
             self.estimator.step[STEP_RESTS_S] = measurement.rests_s * (outcome.name == "fused")
 
@@ -327,7 +326,7 @@ class Timeline:
         )
 
     def _rewind(self, key: Key) -> None:
-        """Back to the last checkpoint that `key` could still follow."""
+        """Rewind to the last checkpoint before `key`."""
         before = self.estimator.t_ns
         while len(self._checkpoints) > 1 and not self._precedes(self._checkpoints[-1], key):
             self._checkpoints.pop()
@@ -339,7 +338,7 @@ class Timeline:
         self.counters.rewound_ns += max(0, before - key[0])
 
     def _following(self, checkpoint: _Checkpoint) -> int:
-        """Row of the first entry that the checkpoint has not seen."""
+        """Row of the first entry after the checkpoint."""
         last_key = checkpoint.last_key
         return 0 if last_key is None else bisect_left(self._keys, last_key) + 1
 
@@ -371,7 +370,7 @@ class Timeline:
 
 
 def _same(one: Candidate, other: Candidate) -> bool:
-    """True if two offers are alike; vectors may be arrays, as a caller from Python gives them."""
+    """True if two candidates are equal; vectors may be arrays, if given by a caller in Python."""
     return type(one) is type(other) and all(
         a is b or np.array_equal(np.asarray(a), np.asarray(b))
         for a, b in zip(one, other, strict=True)

@@ -1,16 +1,14 @@
-"""An innovation in metres or m/s: how far estimate and measurement are apart, before the filter
-has judged it.
+"""Innovation in metres or m/s before the gate: estimate minus measurement.
 
     z = H_p dr + ...   or, where no position is measured,   z = H_v dv + ...
 
-Measurements give their rows as their filter wants them, RDSS fixes whitened by their covariance.
-The raw innovation is solved for what the rows measure directly: as many axes (north, east, down) as
-there are rows; else each row along the direction of its own, z_i / |H_i|, as for a vehicle's
-wheels. Angles and pseudoranges have none: the rows of the latter are metres and m/s, but dozens an
-epoch.
+Rows have the form of the filter; those of RDSS fixes are whitened by their covariance. The raw
+innovation is solved for the measured axes (north, east, down) if there are as many as rows; else
+each row is taken along its own direction, z_i / |H_i|, as for wheels. Angles and pseudoranges have
+no raw innovation.
 
-While an estimate is held back (RDSS by optimal prediction), the estimate is the navigation state
-without it.
+While feedback is delayed (RDSS by optimal prediction), the estimate is the navigation state without
+it.
 """
 
 from __future__ import annotations
@@ -30,8 +28,8 @@ VELOCITY_AND_POSITION = slice(3, 9)
 
 
 class RawInnovation(NamedTuple):
-    """Estimate minus measurement. `axes` has a letter a value, of `ned`; it is empty where each
-    value is along a direction of its own."""
+    """Estimate minus measurement. `axes`: a letter of `ned` for each value; empty if each value has
+    its own direction."""
 
     values: tuple[float, ...]
     unit: Literal["m", "m/s"]

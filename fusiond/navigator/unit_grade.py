@@ -1,26 +1,26 @@
 r"""Grade of an inertial unit within its class: the factor of its errors.
 
-A class is wide: sheets state limits, and a unit that somebody calls `consumer` may be ten times
-better. What a drive shows of biases and scale factors tells how good this one is. With b^ and P as
-the filter has them and s their prior sigma, the drive alone says b~ of variance R,
+A class states limits; a unit of class `consumer` may be ten times better. Biases and scale factors
+of a drive show the grade of this unit. From the filter's b^ and P and the prior sigma s, the drive
+alone gives b~ of variance R,
 
     1 / R = 1 / P - 1 / s^2,   b~ = b^ R / P,   b~ ~ N(0, g s^2 + R)
 
-g the grade, of variances, alike for all that the class says: who makes a better sensor trims it
-better, and aligns it better. That is an assumption, and what it is for is what no drive shows: by
-how much axes are out of square. g is as likely at first in each octave of `GRID`; what counts is
-E[g]. What a state has hardly shown (R above s^2) weighs by itself little.
+g is the grade, a factor on variances, common to all errors of the class. This assumes that a maker
+of better sensors also trims and aligns them better; it is needed for the axes' deviation from
+square, which no drive shows. The prior of g is uniform by octave of `GRID`; E[g] is used. A state
+that was hardly observed (R above s^2) has little weight.
 
-At rest, before there is a filter, the gyros show their biases, and the force along the vertical
-that of one accelerometer (`graded_at_rest`). That is four values, and what counts of them is the
-bias of the other two accelerometers, which nothing shows before the vehicle turns. So there gyros
-and accelerometers have a grade each, which lie apart by `SPREAD`:
+At rest, before the filter starts, the gyros show their biases, and the vertical force that of one
+accelerometer (`graded_at_rest`): four values. The grade is needed for the other two accelerometers,
+whose bias does not show before the vehicle turns. So there gyros and accelerometers have a grade
+each, which differ by `SPREAD`:
 
     ln g_f = ln g_w + N(0, SPREAD^2)
 
-Of units of a fifth and a third of their class's sigmas the square of what is not seen is then 0.79
-and 0.89 of what it counts as in the mean, of those that are just as their class says 1.18 (tested):
-there up to twice its sigmas count.
+For units with a fifth and a third of their class's sigmas the mean square of the unseen errors is
+then 0.79 and 0.89 of its assumed value, for units exactly of their class 1.18 (tested), where up to
+twice the class's sigmas are assumed.
 
 Source: Gelman, Carlin, Stern, Dunson, Vehtari, Rubin, Bayesian Data Analysis, 3rd ed. (2013),
 section 5.4 (hierarchical normal model with unknown scale).
@@ -51,15 +51,14 @@ three axes each, and of how far those are out of square."""
 
 
 class Values(NamedTuple):
-    """Errors as they are seen (k,), the class's variances of them, and those of what they are seen
-    with."""
+    """Observed errors (k,), their variances by the class, and their measurement variances."""
 
     seen: Array
     prior: Array
     noise: Array
 
     def log_likelihood(self) -> Array:
-        """Of each grade of `GRID`, up to a constant."""
+        """Log likelihood of each grade of `GRID`, up to a constant."""
         variance = GRID[:, None] * self.prior + self.noise
         found: Array = -0.5 * (np.log(variance) + np.square(self.seen) / variance).sum(axis=1)
         return found
@@ -67,7 +66,7 @@ class Values(NamedTuple):
 
 def graded_at_rest(rates: Values, force: Values) -> Array:
     """Grades (13,) as of `AS_ITS_CLASS`: by the rates of all gyros at rest, and by the force along
-    the vertical. Axes are as good as what is worse of the two."""
+    the vertical. Axes have the worse grade of the two."""
     of_rates, of_force = rates.log_likelihood(), force.log_likelihood()
     alike = np.exp(-0.5 * np.square(np.log(GRID[:, None] / GRID) / SPREAD))
     alike /= alike.sum(axis=0)
@@ -101,13 +100,13 @@ class UnitGrade:
         """Variances of the class, and those that the filter has begun with."""
 
     def begin(self, grades: Array) -> None:
-        """The filter has begun with these grades (13,) of what it does not know by anything else;
-        what is worse than its class is of the one that it is as bad as."""
+        """Start with grades (13,) of the unobserved errors; a unit worse than its class has the
+        class that it fits."""
         self._prior = self._sheet * grades[self._column]
         self._class = self._sheet * np.maximum(grades, 1.0)[self._column]
 
     def of(self, xi: Array, covariance: Array) -> float:
-        """E[g] by parameters (n,) and P (n, n); no unit is taken to be worse than its class."""
+        """E[g] from parameters (n,) and P (n, n), at most that of the class."""
         p = covariance[self._slots, self._slots]
         shown = (p > 0.0) & (p < self._prior)
         p, prior = p[shown], self._prior[shown]

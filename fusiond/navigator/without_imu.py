@@ -1,21 +1,21 @@
 r"""Navigation without an inertial unit: position and velocity by fixes and a constant velocity.
 
 While the unit is absent, or has been silent for longer than navigation can bridge
-(`fusiond.navigator.imu_screening`), the same timeline, filters and measurements run on samples that
-a vehicle would feel which is level, faces north and goes on as it goes:
+(`fusiond.navigator.imu_screening`), the same timeline, filters and measurements run on the samples
+of a level vehicle that faces north and keeps its velocity:
 
     w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
 
-so that velocity changes by the model's noise and by what is measured alone. Attitude is not known
-and not published; a lever arm counts by its upward part (`AidingMeasurement.without_attitude`). Of
-a vehicle that does not slide a heading says which way it goes, and a wheel how fast: both together
-carry the position on where no fix comes. Bearings count with the attitude of a star tracker or
-another sensor, and on a road with a heading (`fusiond.aiding.landmark_bearing`); alone they say
-nothing. With `[estimator] filter = "federated"` the receivers have a local filter each, as in
-experiments 3 and 4 of paper 004; every other filter is here the Kalman filter.
+so that only the model's noise and the measurements change the velocity. Attitude is unknown and not
+published; of a lever arm only the upward part counts (`AidingMeasurement.without_attitude`). For a
+vehicle that does not slide, a heading and a wheel speed together propagate the position between
+fixes. Bearings need the attitude of a star tracker or another sensor, or on a road a heading
+(`fusiond.aiding.landmark_bearing`). With `[estimator] filter = "federated"` each receiver has a
+local filter, as in experiments 3 and 4 of paper 004; any other filter is replaced by the Kalman
+filter here.
 
-The first fix, or an operator's position, makes a start that knows next to nothing, and is then a
-measurement like any other. When the inertial unit has aligned, its navigation takes over.
+The first fix, or an operator's position, gives the start, with wide priors, and is then fused as an
+ordinary measurement. Inertial navigation takes over once it has aligned.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ MOST_REMEMBERED = 128
 
 
 class _Received:
-    """Received measurement, and the position that it alone gives, on demand."""
+    """Received measurement, with the position from it alone on demand."""
 
     __slots__ = ("_asked", "_position", "measurement")
 
@@ -85,8 +85,7 @@ class _Received:
 
 
 def _slips_m_s(o: NonHolonomic) -> float:
-    """One sigma of the lateral velocity where positions are measured; infinite for a vehicle that
-    may slide."""
+    """One sigma of the lateral velocity at the antenna; infinite for a vehicle that may slide."""
     forward, right, _ = o.lever_arm_m
     in_corners = CORNER_RAD_S * math.hypot(forward, right)
     return math.hypot(o.sd_m_s, o.drift_sd_m_s, in_corners) if o.enabled else math.inf
@@ -133,12 +132,12 @@ class WithoutImu:
         return self.estimator is not None
 
     def _catch_up(self) -> None:
-        """Take in what has arrived."""
+        """Process what has arrived."""
         while self.arrived:
             self._receive(*self.arrived.popleft())
 
     def _receive(self, measurements: Sequence[AidingMeasurement], seen_ns: int) -> None:
-        """Measurements have come at `seen_ns`."""
+        """Receive measurements at `seen_ns`."""
         self._recent.extend(map(_Received, measurements))
         if self._first_ns is None and measurements:
             self._first_ns = seen_ns or measurements[0].t_ns
@@ -154,11 +153,13 @@ class WithoutImu:
                 self._insert(one)
 
     def takes_over(self, t_ns: int, imu: ImuBuffer) -> bool:
-        """True if no inertial unit navigates at `t_ns`, nor will with its next sample."""
+        """True if inertial navigation is not running at `t_ns` and cannot resume with the next
+        sample."""
         return not imu.end or (t_ns - imu.latest_ns) * 1e-9 > BEARABLE_GAP_S
 
     def take_position(self, fix: AidingMeasurement, t_ns: int) -> str | None:
-        """An operator's position, at `t_ns`: its outcome, or None where a start waits for it."""
+        """Apply an operator's position at `t_ns`; its outcome, or None if it will be used for a
+        start."""
         self._catch_up()
         if self.estimator is None:
             self._receive([fix], t_ns)
@@ -204,7 +205,7 @@ class WithoutImu:
     # ------------------------------------------------------------------ solution
 
     def solution(self, t_ns: int, why: str, bound: Bound) -> Solution:
-        """The solution at `t_ns`; `why` there is no inertial navigation."""
+        """Solution at `t_ns`; `why`: the reason for the absence of inertial navigation."""
         e = self.estimator
         assert e is not None
         mode, reason = self._mode(t_ns, e, why)
@@ -278,7 +279,7 @@ class WithoutImu:
         return self._timeline.insert(level)
 
     def _run(self, e: Estimator, t_ns: int) -> None:
-        """Samples until now, and all that has come."""
+        """Run samples until now, with all measurements received."""
         count = (t_ns - self._imu.latest_ns) // STEP_NS
         if count > 0:
             times = self._imu.latest_ns + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
@@ -303,9 +304,8 @@ class WithoutImu:
 def counted_together(
     inertial: Mapping[str, Counter[str]], without: Mapping[str, Counter[str]]
 ) -> dict[str, Counter[str]]:
-    """Outcomes by source of both. A measurement that was fused or left out without an inertial
-    unit, and came before the alignment or where no sample reaches, is not counted as lost as
-    well."""
+    """Outcomes by source of both navigations. A measurement that was fused or excluded without an
+    inertial unit is not also counted as lost by the inertial navigation."""
     found = {name: Counter(counts) for name, counts in inertial.items()}
     for name, counts in without.items():
         both = found.setdefault(name, Counter())

@@ -1,8 +1,8 @@
-r"""Compiled kernels: a bank of error estimates with covariances, fused and shared out again.
+r"""Compiled kernels: fusion of a bank of error estimates, and redistribution.
 
     Y = sum w_k P_k^-1,   P_g = Y^-1,   x_g = P_g sum w_k P_k^-1 x_k
 
-w_k is the part of its information that estimate k puts in (0: left out). States differ by many
+w_k is the part of its information that estimate k contributes (0: excluded). States differ by many
 powers of ten and so do the estimates' covariances: each P_k is scaled to a unit diagonal before its
 Cholesky decomposition, and the sum to the least sigma of each state. A scaled P_k that is not
 positive definite by rounding gets the least growing addition to its diagonal that makes it so: more

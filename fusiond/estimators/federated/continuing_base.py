@@ -40,7 +40,7 @@ class CarriedFilter(FederatedFilter):
         raise NotImplementedError
 
     def _fuse(self) -> bool:
-        """Fuse the local filters; False where the result is no covariance."""
+        """Fuse the local filters; False if the result is no covariance."""
         raise NotImplementedError
 
     def _difference(self, k: int) -> float:

@@ -1,8 +1,7 @@
 r"""Federated filter with cross-covariances of its local filters: correlated fusion.
 
-Each local filter is one of its own source, with all of the initial uncertainty and all of the
-process noise: no sharing factors, no bound. What the estimates share is carried beside them, for
-each pair i, j:
+Each local filter uses its own source, with the whole initial uncertainty and the whole process
+noise: no sharing factors, no bound. Cross-covariances are propagated for each pair i, j:
 
     P_ij <- Phi P_ij Phi^T + Q                                   in between
     P_ij <- (I - K_i H) P_ij                                     a measurement of i alone
@@ -14,10 +13,10 @@ and the master is the best linear combination of them, for any number of filters
     x_g = x_0 - C S^+ d,   P_g = P_00 - C S^+ C^T
 
 which for two is the paper's P_g = P_11 - (P_11 - P_12) (P_11 - P_12 - P_21 + P_22)^-1 (P_11 -
-P_12)^T. Where two estimates are the same, as at the start and in states that neither source tells
-anything of, S is singular: there is nothing to choose there, and S^+ leaves it out.
+P_12)^T. If two estimates are equal, as at the start and in states that neither source observes, S
+is singular; S^+ omits these directions, where any combination is the same.
 
-Its P_g is a covariance and no bound, but it is not the centralised filter's: each local filter has
+P_g is a covariance and no bound, but larger than the centralised filter's: each local filter has
 chosen its gain without the others (Bar-Shalom and Campo: 7 % in the worst case of two alike).
 
 Source: paper 004, section 3; Bar-Shalom and Campo, IEEE Trans. AES 22 (1986), 803; for more than
@@ -136,7 +135,7 @@ class CorrelatedFilter(CarriedFilter):
                     self._joint[i, j, :, offsets] = 0.0
 
     def _fold(self, local: int | None, i: Innovation) -> str:
-        """Take an innovation into one filter, or into all."""
+        """Update one filter, or all, by an innovation."""
         members = self._believed() if local is None else [local]
         n = self.model.size
         gains, lefts = {}, {}
@@ -205,7 +204,7 @@ class CorrelatedFilter(CarriedFilter):
     # ------------------------------------------------------------------ faults, feedback, snapshots
 
     def _share_out(self, parts: Array) -> None:
-        """Each believed filter has all of the noise."""
+        """Give each trusted filter the whole noise."""
         self._factors[:] = 0.0
         self._factors[self._believed()] = 1.0
 

@@ -1,18 +1,18 @@
 r"""Federated filter: a local filter for each source of measurements, a master, fault isolation.
 
 Every local filter estimates the whole error state of the one common navigation state from its own
-source's measurements; the master fuses the estimates and feeds the result back. What all share, the
-initial estimate, the process noise and measurements of no source of its own (standstill, an
-operator), is split by the sharing factors beta_i, sum beta_i = 1:
+source's measurements; the master fuses the estimates and feeds the result back. Sharing factors
+beta_i, sum beta_i = 1, divide the common information: the initial estimate, the process noise, and
+measurements of no source (standstill, an operator):
 
     P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common measurement
 
-so that the sum of the information is that of one filter. P_i is then an upper bound that makes the
-estimates as good as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1 one of the
-fused estimate: its very covariance where the parts are put together at once, more where local
-filters go on alone, as (sum (P_i + Q / beta_i)^-1)^-1 >= (sum P_i^-1)^-1 + Q.
+so that the sum of the information is that of one filter. P_i is then an upper bound that allows
+treating the estimates as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1
+bounds the fused estimate: its covariance if the parts are fused at once, more if local filters
+continue, as (sum (P_i + Q / beta_i)^-1)^-1 >= (sum P_i^-1)^-1 + Q.
 
-What becomes of the local filters after a fusion, which is after every update:
+Local filters after a fusion, which is after every update:
 
 `no_reset`      nothing; x_i <- x_i - x_g as the navigation state is corrected. Nothing comes from
                 one local filter into another.
@@ -135,10 +135,10 @@ class FederatedFilter(Estimator):
     # ------------------------------------------------------------------ update
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not.
+        """Update by one measurement, or return the reason for its rejection.
 
-        NIS and whitened innovation of the outcome are those of what is published; those of a
-        screened measurement are of the filter that judges its rows.
+        NIS and whitened innovation of the outcome are those of the published estimate; for a
+        screened measurement those of the filter that judges its rows.
         """
         i = self._linearise(measurement)
         if isinstance(i, NotApplicable):
@@ -178,8 +178,8 @@ class FederatedFilter(Estimator):
     ) -> Outcome:
         """Update a local filter by all rows, or by none.
 
-        For the innovation test an epoch counts with the rows that pass, or as failed where most do
-        not: single bad satellites are the screening's business.
+        For the innovation test an epoch counts with the rows that pass, or as failed if most do
+        not: screening removes single bad satellites.
         """
         trial = cov.copy()
         s = self._screen(measurement, rows, trial, dx)
@@ -199,7 +199,7 @@ class FederatedFilter(Estimator):
         return Outcome(name, s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
 
     def _believes(self, local: int | None, nis: float, degrees: int, threshold: float) -> bool:
-        """Take an innovation into the tests; whether its filter is believed after it."""
+        """Test an innovation; True if its filter is trusted afterwards."""
         if local is None:
             return True
         if self._faults.is_isolated(local):
@@ -235,7 +235,7 @@ class FederatedFilter(Estimator):
         raise NotImplementedError
 
     def _take_back(self, local: int) -> None:
-        """Start a local filter that is believed again from the master."""
+        """Start a readmitted local filter from the master."""
         raise NotImplementedError
 
     def _leave_out(self, local: int) -> None:
@@ -277,7 +277,7 @@ class FederatedFilter(Estimator):
         return [i for i in range(len(self.names)) if not self._faults.is_isolated(i)]
 
     def _share_out(self, parts: Array) -> None:
-        """Set the factors from `parts` (N,): those of the believed filters sum to 1."""
+        """Set the factors from `parts` (N,): those of the trusted filters sum to 1."""
         believed = self._believed()
         self._factors[:] = parts
         self._factors[believed] /= parts[believed].sum()
@@ -313,7 +313,7 @@ class FederatedFilter(Estimator):
         self._dxs[0] = 0.0
 
     def _shift(self, x: Array) -> None:
-        """The navigation state has been corrected by `x` (n,): so are estimates of its error."""
+        """Correct the error estimates for a correction `x` (n,) of the navigation state."""
 
     def hold(self) -> None:
         """Estimate without feedback from now on; errors propagate beside the state."""

@@ -13,11 +13,11 @@ Difference test   d^T (P_i + P_o)^-1 d, local filter against all others on posit
 
 p is the probability of a false alarm of one test. Both tests are conservative: capped innovations
 are less than chi-square, and local filters that each carry Q / beta of the common process noise
-state more than their errors' true covariance.
+have a covariance above the true one.
 
-An isolated filter is a copy of the master each time its sensor speaks; the sensor's innovation in
-it is judged. After `readmit_after` innovations in a row inside the gate, whose sum is below the
-quantile `READMISSION`, it is taken back.
+An isolated filter is reset to the master before each measurement of its sensor, whose innovation is
+then judged. After `readmit_after` innovations in a row inside the gate, whose sum is below the
+quantile `READMISSION`, it is readmitted.
 
 Source: Brumback and Srinath, IEEE Trans. AC 32 (1987), 1133 (chi-square tests on states); Carlson
 and Berarducci, NAVIGATION 41 (1994), 297 (isolation in federated filters); Baarda's data snooping
@@ -46,8 +46,8 @@ INNOVATION, DIFFERENCE = "innovation test", "difference test"
 class Record(NamedTuple):
     """State of one local filter; never changed, so that a snapshot may hold it.
 
-    `window`: (NIS, degrees) of the last innovations; `reason`: why it is isolated; `passes`: how
-    many innovations in a row have passed since; `received_ns`: its last fused measurement.
+    `window`: (NIS, degrees) of the last innovations; `reason`: of its isolation; `passes`:
+    innovations in a row that have passed since; `received_ns`: its last fused measurement.
     """
 
     window: tuple[tuple[float, int], ...] = ()
@@ -75,11 +75,11 @@ class FaultDetection:
         return bool(self.records[local].reason)
 
     def received(self, local: int, t_ns: int) -> None:
-        """A measurement of a local filter has been fused at `t_ns`."""
+        """Record a measurement of a local filter fused at `t_ns`."""
         self.records[local] = self.records[local]._replace(received_ns=t_ns)
 
     def innovation(self, local: int, nis: float, degrees: int, threshold: float) -> bool:
-        """Take an innovation of a believed filter in; whether its window still passes."""
+        """Add an innovation of a trusted filter; True if its window still passes."""
         record = self.records[local]
         window = (*record.window, (min(nis, threshold), degrees))[-self._window :]
         self.records[local] = record._replace(window=window)
@@ -100,11 +100,11 @@ class FaultDetection:
         )
 
     def isolate(self, local: int, reason: str) -> None:
-        """Believe a filter no longer."""
+        """Isolate a filter."""
         self.records[local] = self.records[local]._replace(window=(), reason=reason, passes=0)
 
     def behaves(self, local: int, nis: float, degrees: int, threshold: float) -> bool:
-        """Take an innovation of an isolated filter in; True when it is taken back."""
+        """Add an innovation of an isolated filter; True if it is readmitted."""
         record = self.records[local]
         if not nis <= threshold:
             self.records[local] = record._replace(window=(), passes=0)

@@ -1,19 +1,20 @@
 r"""Federated filter whose local filters continue after a fusion: `no_reset` and `rescale`.
 
-Only the published covariance B and the transition matrix Phi are propagated through the samples; at
-an update the local filters, common to which is all the process noise but its share, follow:
+Only the published covariance B and the transition matrix Phi are propagated through the samples.
+Local filters follow at an update, with the process noise of B divided by their factors:
 
     P_i <- Phi (P_i - B / beta_i) Phi^T + B' / beta_i,   x_i <- Phi x_i
 
-Gate and innovation test are the local filter's own in `no_reset`; in `rescale`, where it has given
-most of what it knows away, the master's.
+Gate and innovation test are the local filter's own in `no_reset`, the master's in `rescale`, where
+the local filter keeps little information.
 
 A local filter whose measurements do not observe some states grows without bound in them. Beyond
-`MOST` times the best variance it gets `LITTLE` of what all others know, and all others give it up:
-the sum stays. `no_reset` keeps local filters apart but for this part in a million.
+`MOST` times the best variance it receives the part `LITTLE` of the others' information, which they
+lose: the sum is unchanged. Apart from this part in a million, `no_reset` keeps local filters
+separate.
 
-A local filter that is taken back gets x_g and P_g / beta_i, and the others give that share up: P_j
-<- P_j / (1 - beta_i).
+A readmitted local filter gets x_g and P_g / beta_i, and the others lose that share: P_j <- P_j / (1
+- beta_i).
 
 Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 """
@@ -86,7 +87,7 @@ class NoResetFilter(CarriedFilter):
         self._mark()
 
     def _members(self) -> list[int]:
-        """Filters of the bank that put their information in."""
+        """Filters of the bank that contribute information."""
         return self._believed() + ([len(self.names)] if self._rescales else [])
 
     # ------------------------------------------------------------------ update

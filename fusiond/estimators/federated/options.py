@@ -14,11 +14,11 @@ Fusion = Literal["uncorrelated", "correlated"]
 class FederatedOptions:
     """Options for sharing, reset and isolation of a federated filter.
 
-    `fusion`: by bounds that make estimates as good as uncorrelated, or by what they share
-    (fusiond.estimators.federated.correlated), which is for `no_reset` and has no `shares`.
-    `shares`: relative factors by local filter, equal where there is none. `master_share` is the
-    part of process noise and initial information of the master's own estimate in `rescale`,
-    `retained` what an updated local filter keeps there.
+    `fusion`: by bounds that allow treating estimates as uncorrelated, or by cross-covariances
+    (fusiond.estimators.federated.correlated), for `no_reset` without `shares`. `shares`: relative
+    factors by local filter, by default equal. In `rescale` `master_share` is the part of process
+    noise and initial information of the master's own estimate, `retained` the part that an updated
+    local filter keeps.
     """
 
     mode: Mode = "no_reset"

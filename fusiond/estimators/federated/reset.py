@@ -1,18 +1,18 @@
 r"""Federated filter with a reset after each fusion: `fusion_reset` and `zero_reset`.
 
-After a fusion, and as all are propagated alike, until the next,
+After a fusion, and until the next one, as all are propagated alike,
 
     x_i = x_g,   P_i = P_g / beta_i
 
-so a local filter need not be kept: it is made from the master when its measurement comes, updated,
-and fused with what the others know together, (1 - beta_i) P_g^-1. A measurement that is common to
-all adds R / beta_i to each, which is R to the master. The result is the centralised filter's but
-for rounding, whatever the factors are. In `zero_reset` the master has all: beta_i = 0. A local
-filter that begins with no information holds, after its measurement, that of the measurement, H^T
-R^-1 H, and the master that adds it makes a measurement update: so that is what is done.
+so a local filter need not be stored: it is made from the master when its measurement comes,
+updated, and fused with the information of all others, (1 - beta_i) P_g^-1. A common measurement is
+applied with R / beta_i to each, which is R to the master. The result is that of the centralised
+filter, to rounding, for any factors. In `zero_reset` the master has all information: beta_i = 0. A
+local filter that starts without information holds H^T R^-1 H after its measurement; adding it to
+the master is a measurement update, which is what this filter does.
 
-The difference of a local filter and the others is its last innovation again, so that the difference
-test has nothing to say here, and what a fault has done before it was noticed is in the master.
+The difference of a local filter from the others is its last innovation again, so the difference
+test gives nothing here, and the effect of a fault before its detection is in the master.
 
 Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 """

@@ -1,4 +1,4 @@
-r"""Blocks of M successive states: how one follows from the last, and what was measured in it.
+r"""Blocks of M successive states: prediction from block to block, and update.
 
     x_(j+1) = Phi_j x_j + w_j,  var w_j = Q_j;      X = (x_1 ... x_M) the last block,
                                                     x_(M+1) ... x_(2M) the next
@@ -13,10 +13,9 @@ is an identity (w_j enters from the elements 1 ... j). All rows pass through one
     m = G X,   G = 1/M [Phi(1 -> M) ... Phi(M-1 -> M)  I],
     C = G P G^T + sum_(j<M) (j/M)^2 Phi(j+1 -> M) Q_j Phi(j+1 -> M)^T
 
-and from there on each element follows from the one before. C takes the w_j inside the last block
-for independent of the errors of X. They are not: the estimate of x_(j+1) errs by the very w_j that
-has not been measured yet. That is the paper's approximation, kept here as it stands: C is too
-small.
+and from there on each element follows from the one before. C treats the w_j inside the last block
+as independent of the errors of X. They are not: the error of x_(j+1) contains w_j as far as it has
+not been measured. This is the paper's approximation, kept here: C is too small.
 
 Mean and covariance are kept in the wavelet domain, W X and W P W^T (W for W kron I_n); a row h on
 element l becomes [W_1l h ... W_Ml h].
@@ -40,10 +39,10 @@ Indices = NDArray[np.int64]
 
 class Window(NamedTuple):
     """Successive epochs (k): transition `phi` and noise `q` (k, n, n) from the epoch before, and
-    `u` (k, n), what feedback has taken out of the state until here, carried along.
+    `u` (k, n), the propagated sum of all feedback so far.
 
-    What was measured at all of them: z = h x + v (m,), (m, n), variances r (m,); those of epoch i
-    are the rows up to ends[i]. The arrays are never written to.
+    Measurements of all epochs: z = h x + v (m,), (m, n), variances r (m,); those of epoch i are the
+    rows up to ends[i]. The arrays are never changed.
     """
 
     phi: Array
@@ -281,9 +280,9 @@ def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> N
 def rebase(w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array) -> None:
     """Subtract the oldest epoch's `u` from `u`, `z` and the blocks' `means` (M, M n), in place.
 
-    t_(j+1) = Phi_j t_j solves the states' own equation, so t may be taken off all alike; from u of
-    the oldest epoch it leaves only the window's own corrections, and no number grows with time.
-    means[i] begins at epoch i.
+    t_(j+1) = Phi_j t_j solves the states' own equation, so t may be subtracted from all. With t
+    from u of the oldest epoch only the window's own corrections are left, and no number grows with
+    time. means[i] begins at epoch i.
     """
     m, n = len(w), u.shape[1]
     t = np.zeros(u.shape)

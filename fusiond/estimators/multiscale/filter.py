@@ -1,12 +1,11 @@
 r"""Multi-scale filter: M = 2^(N-1) successive states estimated together, in the wavelet domain.
 
 An epoch is an instant at which a measurement was fused. With epoch k the block (k-M+1 ... k) is
-predicted
-from the block (k-2M+1 ... k-M), updated with what was measured at its M epochs, and its last
-element is the solution. So M chains of blocks run interleaved; each sees every measurement once.
-What follows from what is said in `fusiond.estimators.multiscale.block`.
+predicted from the block (k-2M+1 ... k-M), updated with what was measured at its M epochs, and its
+last element is the solution. So M chains of blocks run interleaved; each sees every measurement
+once. The recursion is in `fusiond.estimators.multiscale.block`.
 
-Feedback: u is all that was ever fed back, carried along by the transitions,
+Feedback: u is the sum of all feedback, propagated by the transitions,
 
     u_(j+1) = Phi_j u_j + d_(j+1),   y = x + u:   y_(j+1) = Phi_j y_j + w_j,   z + H u = H y + v
 
@@ -67,10 +66,10 @@ class _Open(NamedTuple):
 class MultiscaleEstimator(Estimator):
     """Block filter of paper 001 (`fusiond.estimators.base.Estimator`).
 
-    `scales` N is 1 to 4; `wavelet` a PyWavelets name, orthonormal (ValueError if not).
-    The covariance that is propagated is the noise Q since the last epoch, with the transition Phi;
-    P = Phi P_k Phi^T + Q is worked out when it is asked for. Error estimate 0 is what `hold`
-    carries, 1 what was fed back since the last epoch apart from a measurement.
+    `scales` N is 1 to 4; `wavelet` a PyWavelets name, orthonormal (ValueError if not). The
+    propagated covariance is the noise Q since the last epoch, with the transition Phi; P = Phi P_k
+    Phi^T + Q is computed on demand. Error estimate 0 is that of `hold`, 1 the feedback since the
+    last epoch other than by a measurement.
     """
 
     carries_transition = True
@@ -137,7 +136,7 @@ class MultiscaleEstimator(Estimator):
         self._memory.head[USED] = 1
 
     def _restart(self, p: Array) -> None:
-        """No epoch yet: what follows starts from P (n, n)."""
+        """Restart without epochs, from P (n, n)."""
         self._posterior = p
         self._window, self._blocks, self._starts = None, [], []
         self._since_epoch()
@@ -148,7 +147,7 @@ class MultiscaleEstimator(Estimator):
         self._phi[:] = np.eye(len(self._phi))
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         innovation = self._linearise(measurement)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
@@ -164,7 +163,7 @@ class MultiscaleEstimator(Estimator):
         return Outcome("gated", nis, degrees)
 
     def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
-        """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
+        """Update; NIS and whitened innovation (m,). Beyond `threshold` nothing changes."""
         z, h, r = rows
         o = self._open()
         total, (y, g) = z + h @ o.u, work(len(z), o.block.cov.shape[1])
@@ -178,8 +177,8 @@ class MultiscaleEstimator(Estimator):
     def _update_by_rows(self, measurement: Linearised, rows: Innovation) -> Outcome:
         """Update by all rows, or by none.
 
-        They are judged on the newest element alone, which is all that they look at. Where the
-        receiver has set its clock, blocks that reach back before it are given up.
+        Rows are judged on the newest element alone, to which they refer. If the receiver has reset
+        its clock, blocks that reach back before it are dropped.
         """
         z, h, r = rows
         o = self._open()
@@ -200,7 +199,7 @@ class MultiscaleEstimator(Estimator):
         return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
 
     def _open(self) -> _Open:
-        """The block that ends now, with all that was measured before. Nothing changes."""
+        """Block that ends now, with all earlier measurements; changes nothing."""
         w, last = self._w, self._window
         again = last is not None and self.t_ns == self._epoch_ns
         starting = not self._blocks and self.epochs + (not again) < 2 * len(w)

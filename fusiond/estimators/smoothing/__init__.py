@@ -1,1 +1,1 @@
-"""Fixed-interval smoothing: what a filter did, on a tape, and the way back over it."""
+"""Fixed-interval smoothing: a tape of the filter's updates, and the backward pass."""

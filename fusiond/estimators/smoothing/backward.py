@@ -14,20 +14,21 @@ covariance are
     dx_s = dx + P lambda,   P_s = P - P Lambda P
 
 It is the smoother of Rauch, Tung and Striebel in another form (a test holds them against each
-other). The form needs no inverse of P, so states that are held or known exactly do no harm; it does
-not ask why P grew, so a gap of the IMU or a doubt needs no word; and it takes the filter's
-innovations for what they were. So feedback needs none either: lambda says how far the truth is from
-whatever navigation state the filter had then, and where that state jumps because an estimate f was
-fed back, dx_s jumps by f with it.
+other). The form needs no inverse of P, so states that are held or known exactly cause no problem.
+It does not depend on the reason why P grew, so a gap of the IMU or a doubt needs no special case.
+It uses the filter's own innovations, so feedback needs none, either: lambda gives the error
+relative to the filter's navigation state at that time, and if that state jumps by a fed back
+estimate f, dx_s jumps by f, too.
 
-What is published is by the receiver's clock (fusiond.estimators.published_state): with d = dx_s,
+The published state is by the receiver's clock (fusiond.estimators.published_state): with d = dx_s,
 the navigation state v, C, acceleration a and rate w, and tau the offset,
 
     D_p = d_r + tau d_v - v d_tau + d_v d_tau,   D_v = d_v - a d_tau,   D_phi = d_phi + C w d_tau
 
-Between nodes D and the variances are taken for linear (fusiond.estimators.smoothing.node_recorder).
-As an update lowers every variance and process noise is never negative, a smoothed sigma is at most
-the filter's, but for that line: the smaller of the two is stated.
+Between nodes D and the variances are interpolated linearly
+(fusiond.estimators.smoothing.node_recorder). As an update lowers every variance and process noise
+is never negative, a smoothed sigma is at most the filter's, apart from the interpolation: the
+smaller of the two is used.
 
 Source: Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 18 (1973), 65;
 Bryson, Frazier, Smoothing for linear and nonlinear dynamic systems, ASD-TDR-63-119 (1963);
@@ -257,7 +258,7 @@ def _back(
 class Smoother:
     """Smoother that runs backward over the nodes of one start, block by block.
 
-    What is smoothed is by the clock and the axes that the start was `published` by.
+    Clock and axes are those by which the start was `published`.
     """
 
     def __init__(self, model: Model, published: Published) -> None:

@@ -1,6 +1,6 @@
 r"""Node: a filter's state at an instant, for the smoother.
 
-A node is an instant t_j at which measurements were fused, or one between them where they are far
+A node is an instant t_j at which measurements were fused, or one between them if they are far
 apart:
 
     Phi_j   transition of the error state from node j - 1 to node j
@@ -11,9 +11,9 @@ apart:
     dx_j    the error estimate that is kept (zero unless feedback is held back)
     f_j     what was fed back into the navigation state at t_j
 
-and the navigation state, offset and last step, by which it is published. Process noise, and what
-widens P for whatever other reason, are in P alone. Of Phi the nine rows of the navigation errors
-are kept, the diagonal of the parameters' rows, and `links`; the rest is zero, exactly.
+and the navigation state, offset and last step, for publication. Process noise and any other growth
+of P are in P alone. Of Phi the nine rows of the navigation errors, the diagonal of the parameters'
+rows, and `links` are stored; the rest is exactly zero.
 
 All lies in one row of doubles, `body`; the measurements in rows of 2 n + 2, `ops`.
 """

@@ -2,9 +2,9 @@
 (fusiond.estimators.multi_sample_covariance): its sigmas equal the other filter's within 1e-4 of
 them.
 
-Nodes hang on each other, the newest in front. A snapshot holds the newest of its instant, so a
-rewind takes the tape back with the state, and what was written since is forgotten with it: the tape
-is always that of the last pass. A new start begins a new tape.
+Nodes form a linked list, the newest first. A snapshot holds the newest node of its instant, so a
+rewind restores the tape with the state and drops later nodes: the tape is always that of the last
+pass. A new start begins a new tape.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class _Kept(NamedTuple):
 class TapedKalman(TiltAxesFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`), with a tape.
 
-    `newest` is the newest node of the present start; `on_ended` is given the last one of a start
-    that has ended.
+    `newest` is the newest node of the present start; `on_ended` receives the last node of an ended
+    start.
     """
 
     carries_transition = True
@@ -101,12 +101,13 @@ class TapedKalman(TiltAxesFilter):
         self._close()
 
     def publish_by(self, published: Published) -> None:
-        """Publish so from the next start on: a tape has one clock and one unit."""
+        """Set axes and clock of publication from the next start on: a tape has one clock and one
+        unit."""
         self.end()
         super().publish_by(published)
 
     def end(self) -> None:
-        """The tape is complete: no more of this start will come."""
+        """End the tape of this start."""
         if self.newest is None:
             return
         if self.t_ns > self._closed_ns or self._ops:
@@ -172,7 +173,7 @@ class TapedKalman(TiltAxesFilter):
         self._keep(self._phi, before)
 
     def _renew(self, renewal: Renewal) -> None:
-        """Errors that measurements share become others: what they were has a part in it."""
+        """Renew shared errors of measurements, with the correlation to their earlier values."""
         self._close()  # with P as it was
         renew(renewal, self.model, (), (self._phi,))
         super()._renew(renewal)
@@ -183,7 +184,7 @@ class TapedKalman(TiltAxesFilter):
         return self._rows
 
     def _screen(self, measurement: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
-        """Update by rows of a screened measurement. A receiver's clock that starts anew has no
+        """Update by rows of a screened measurement. A receiver's clock that restarts has no
         past."""
         before = cov.copy()
         screened = super()._screen(measurement, rows, cov, dx)
@@ -199,7 +200,8 @@ class TapedKalman(TiltAxesFilter):
         return screened
 
     def adopt(self, mean: Array, spread: Array) -> None:
-        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
+        """Subtract a fault's effect of mean (n,) from the state and add its `spread` (n, n) to
+        P."""
         self._close()  # with P as it was: what was before does not jump
         self._fed_back += mean
         super().adopt(mean, spread)
@@ -228,7 +230,7 @@ class TapedKalman(TiltAxesFilter):
         self.undoubted = extra.undoubted
 
     def restore(self, s: Snapshot) -> None:
-        """Back to a snapshot, bit for bit."""
+        """Restore a snapshot, bit for bit."""
         self.rewound = min(self.rewound, s.sample)
         super().restore(s)
 

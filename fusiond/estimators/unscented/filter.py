@@ -2,15 +2,14 @@ r"""Unscented Kalman filter on the error state, closed loop: sigma points instea
 
 Measurements: the transform is taken over the states that the measurement depends on (the columns of
 its H that are not zero), each point through the measurement's own innovation at the true state that
-its error would mean. What comes of it is linear in the error state again
+its error would mean. The result is linear in the error state again
 (fusiond.estimators.unscented.sigma_points), so gate, update and feedback are those of the extended
 filter. All other states follow through their correlation, as in a full transform. A measurement
-that `remembers` goes by its Jacobian.
+that `remembers` uses its Jacobian.
 
 Propagation: the extended filter's covariance, or with `propagation` sigma points through the
 strapdown equations and a covariance that turns with a large correction of the attitude
-(fusiond.estimators.unscented.propagation). That is dearer and pays where errors of the attitude are
-large.
+(fusiond.estimators.unscented.propagation). That costs more and helps with large attitude errors.
 
 Source: Julier, Uhlmann, Unscented Filtering and Nonlinear Estimation, Proc. IEEE 92 (2004).
 """
@@ -54,7 +53,7 @@ class UnscentedEstimator(KalmanEstimator):
         self.propagation = propagation
 
     def update(self, measurement: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one measurement in, or name why not."""
+        """Update by one measurement, or return the reason for its rejection."""
         before = self.nav.copy()
         outcome = super().update(measurement, noise)
         if self.propagation and outcome.name == "fused" and not self._holding:
@@ -71,7 +70,7 @@ class UnscentedEstimator(KalmanEstimator):
     def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
         """The measurement's innovation over the sigma points, linear in the error state.
 
-        Where the measurement does not hold at a point, its pair goes by the Jacobian at the centre.
+        If the measurement is undefined at a point, its pair uses the Jacobian at the centre.
         """
         if measurement.remembers:
             return super()._linearise(measurement)

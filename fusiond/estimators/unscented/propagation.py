@@ -1,20 +1,20 @@
 r"""Compiled kernel: the error's mean and covariance through the strapdown equations themselves.
 
 The error is written as P = sum_k L_k L_k^T + P', L_k the first three columns of the Cholesky
-factor: an error of the attitude and all that hangs together with it. Along these the sigma points
-(fusiond.estimators.unscented.sigma_points) are drawn, anew for each IMU interval. Each is a true
-state that the computed one may stand for: it has its own sensor errors taken out of the sample and
-runs through `strapdown_step` beside the computed state. P' is what velocity, position and
-parameters have of their own. In them one interval is linear: the largest second-order terms, g (dr
-/ R)^2 and dv^2 / R, are 2e-5 m/s^2 for 10 km and 2e-5 m/s^2 for 10 m/s. So P' takes the transition
-F of fusiond.estimators.covariance_propagation, with the noise Q:
+factor: attitude errors with all states correlated with them. Along these the sigma points
+(fusiond.estimators.unscented.sigma_points) are drawn for each IMU interval. Each is a possible true
+state: its own sensor errors are subtracted from the sample, and it runs through `strapdown_step`
+beside the computed state. P' is the rest of velocity, position and parameters. In them one interval
+is linear: the largest second-order terms, g (dr / R)^2 and dv^2 / R, are 2e-5 m/s^2 for 10 km and
+2e-5 m/s^2 for 10 m/s. So P' takes the transition F of fusiond.estimators.covariance_propagation,
+with the noise Q:
 
     P <- sum o_k o_k^T + sum e_k e_k^T + F P' F^T + Q        mean <- f(dx) + sum e_k / s
 
-The mean is taken out of the navigation state at once or, where estimates are carried, kept in dx.
+The mean is subtracted from the navigation state at once or, while feedback is held, kept in dx.
 
-Large attitude errors need one thing more (`turn_attitude`): an estimate d that is taken out of the
-attitude turns the axes in which the rest is written. From exp(d + e) = exp(J e) exp(d):
+Large attitude errors need one more transform (`turn_attitude`): the feedback d of the attitude
+turns the axes of the remaining error. From exp(d + e) = exp(J e) exp(d):
 
     e' = J(d) e,   J = I + (1 - cos a) / a [n x] + (1 - sin a / a) [n x]^2,   d = a n
 

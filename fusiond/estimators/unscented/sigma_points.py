@@ -20,8 +20,8 @@ A measurement z_0 = g(dx) + v is taken as z = H dx + v', which is exact for mean
 
 Then H P H^T + cov(v') = cov(g) + R, the innovation's covariance, and P H^T = cov(x, g). U is unit
 lower triangular; rows U^-1 z, U^-1 H with variances D are uncorrelated. Where g is linear, e = 0
-and U = 1. Rows that are to be judged one by one stay what they are: each gets, for its variance,
-the sum of its row of |cov(v')|, a diagonal matrix that is nowhere below cov(v') (Gershgorin).
+and U = 1. Rows that are judged one by one stay separate: each gets the sum of its row of |cov(v')|
+as variance, a diagonal matrix that is never below cov(v') (Gershgorin).
 
 Source: Julier, Uhlmann, Unscented Filtering and Nonlinear Estimation, Proc. IEEE 92 (2004),
 sections III and VI; odd and even parts: Norgaard, Poulsen, Ravn, Automatica 36 (2000), section 3;
@@ -142,9 +142,9 @@ def linear_form(
 ) -> None:
     """Write z (rows,), h (rows, n) and variances d (rows,) of uncorrelated rows.
 
-    `points` (2m + 1, rows): innovations at the states of `spread_states`; a pair with a NaN goes by
-    `central` (rows, n), the Jacobian at the centre. `r` (rows,) variances of the noise. Rows that
-    will be judged `one_by_one` stay apart.
+    `points` (2m + 1, rows): innovations at the states of `spread_states`; a pair with a NaN uses
+    `central` (rows, n), the Jacobian at the centre. `r` (rows,) variances of the noise. Rows judged
+    `one_by_one` stay separate.
     """
     m, rows = slots.shape[0], r.shape[0]
     odd, even = np.zeros((m, rows)), np.zeros((m, rows))

@@ -7,13 +7,11 @@ instant. Each kind of measurement has a module of its own, listed in `KINDS`.
 
 Plausibility, by the limits of the vehicle's class (fusiond.configuration.plausibility):
 
-    not_finite              a number that is none
-    position_implausible    no place on the Earth, too near a pole for north and east to mean
-                            anything, or exactly 0 N 0 E
-    height_implausible      outside what the vehicle's class can do
+    not_finite              NaN or infinity
+    position_implausible    not on the Earth, too near a pole for north and east, or exactly 0 N 0 E
+    height_implausible      outside the limits of the vehicle's class
     speed_implausible       likewise
-    sigma_implausible       larger than anything that still says something, negative, or smaller
-                            than the best device's
+    sigma_implausible       negative, too large to be of use, or smaller than the best device's
 
 A value that is not stated (None; for a sigma also 0) is no fault: the section has one, or the
 outcome is `no_sigma`. A fix with a sigma too small to be true is kept;
