@@ -37,14 +37,17 @@ def times(second: int, rate_hz: int = 1) -> list[str]:
     return [f"0733{second:02d}.{100 * k // rate_hz:02d}" for k in range(rate_hz)]
 
 
+def at(second: int) -> str:
+    return times(second)[0]
+
+
 def log(epoch: Epoch) -> bytes:
     bodies = [body for second in range(2, 2 + SECONDS) for body in epoch(second)]
     return b"".join(f"${b}*{reduce(xor, b.encode(), 0):02X}\r\n".encode() for b in bodies)
 
 
 def usual(second: int) -> list[str]:
-    (at,) = times(second)
-    return [gga(at), rmc(at)]
+    return [gga(at(second)), rmc(at(second))]
 
 
 def of(*bodies: Callable[[str], str]) -> Epoch:
@@ -161,8 +164,8 @@ def test_a_height_in_feet_is_none(tmp_path: Path) -> None:
     "epoch",
     [
         # Of one instant, one after the other, and by turns; half a second apart.
-        lambda s: [*usual(s), gga(*times(s), "GP", ELSEWHERE), rmc(*times(s), "GP")],
-        lambda s: [gga(*times(s), "GP", ELSEWHERE), *usual(s), rmc(*times(s), "GP")],
+        lambda s: [*usual(s), gga(at(s), "GP", ELSEWHERE), rmc(at(s), "GP")],
+        lambda s: [gga(at(s), "GP", ELSEWHERE), *usual(s), rmc(at(s), "GP")],
         lambda s: [*usual(s), gga(f"0733{s:02d}.50", "GP", ELSEWHERE), rmc(f"0733{s:02d}.50")],
     ],
 )
