@@ -59,6 +59,7 @@ KNOT_M_S = 1852.0 / 3600.0
 KM_H_M_S = 1.0 / 3.6
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
 _ESTIMATED = frozenset("EMS")
+_METRES = ("M", "")
 _NOT_VALID = frozenset(("V", "N", ""))
 NOVATEL_SBAS = 9
 """GGA quality of NovAtel for a fix with satellite corrections (WAAS)."""
@@ -99,6 +100,8 @@ class Epoch:
     by_plain: str = ""
     """Sentence with position and mode where neither GGA nor GNS exists: RMC or GLL."""
     place: PrintedPosition | None = None
+    talker: str = ""
+    """Talker of the sentence with the place."""
     altitude_m: float | None = None
     height_step_m: float = 0.0
     separation_m: float | None = None
@@ -131,6 +134,8 @@ class Epoch:
         self.t_seen_ns = t_seen_ns
         if formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
             self.t_day_seen_ns = t_seen_ns
+        if formatter in ("GGA", "GNS"):
+            self.talker = self.talker or sentence.talker
         self.cycle.append(formatter)
         self.addresses.add(sentence.address)
         self.raws.add(sentence.raw)
@@ -211,6 +216,8 @@ def time_of_day_ns(sentence: Sentence) -> int | None:
 
 def _take_height(epoch: Epoch, fields: Fields) -> None:
     epoch.altitude_m, epoch.separation_m = number(fields, "alt"), number(fields, "sep")
+    if letter(fields, "altUnit").upper() not in _METRES:  # feet, by some simulators
+        epoch.altitude_m = None
     if epoch.altitude_m is not None:
         epoch.height_step_m = step(fields["printed"][8])
 

@@ -58,6 +58,8 @@ class EpochConverter:
         self._velocity = VelocityReader(counters)
         self._without_gga = 0
         """Consecutive epochs with RMC or GLL but neither GGA nor GNS."""
+        self._talker = ""
+        """Talker of the last position."""
 
     def in_two_parts(self) -> None:
         """The last epoch was no whole one: it has what one of them lacked."""
@@ -66,6 +68,9 @@ class EpochConverter:
     def epoch(self, epoch: Epoch, found: list[Measurement]) -> None:
         """Judge one that is closed; what it comes to is `found`."""
         self.counters["epochs"] += 1
+        if epoch.place is not None and epoch.talker != self._talker:
+            self.counters["two_receivers"] += bool(self._talker)
+            self._talker = epoch.talker
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
             count_name(self._received.statuses, epoch.unknown_status)
