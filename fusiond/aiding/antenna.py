@@ -6,7 +6,7 @@ l is the lever arm from the IMU, w the rate of the body against the Earth, whose
 lever is under 1 mm/s per 10 m. e is the error of the rate (computed minus true), dl that of the
 lever arm's rest, an estimate (true minus estimated).
 
-The slope by dl takes what of w is no noise (fusiond.aiding.preintegrated_measurement).
+The slope by dl uses the part of w that is not noise (fusiond.aiding.preintegrated_measurement).
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -45,8 +45,8 @@ def antenna_velocity(
 ) -> None:
     """Write v_a (m,) and d v_a (m, n), zero before: the first m of north, east, down.
 
-    `c` C_nb by rows, l0 to l2 the lever arm with the estimate of its rest, `rest` (0 or 3,) the
-    slots of that; `rate` where in `step` the rate of v_a stands.
+    `c`: C_nb by rows; l0 to l2: lever arm with the estimate of its rest; `rest` (0 or 3,): its
+    slots; `rate`: index of the rate of v_a in `step`.
     """
     w0, w1, w2 = step[rate], step[rate + 1], step[rate + 2]
     u0, u1, u2 = w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0

@@ -7,17 +7,16 @@ Attitude: the rotation from measured to computed attitude is -phi, in navigation
 J's columns are the axes about which roll, pitch and yaw turn: C e_x, [-sin yaw, cos yaw, 0], e_z.
 Its noise is whitened, so that the rows are uncorrelated.
 
-A star tracker is bolted on a little askew: its axes are the body's turned by the small rotation
-vector m (rad, body axes), so it measures the attitude C exp[m x]. With m^ the estimate and
-d = m - m^ what is left of it,
+A star tracker has a misalignment: its axes are the body's turned by the small rotation vector m
+(rad, body axes), so it measures the attitude C exp[m x]. With m^ the estimate and d = m - m^,
 
     z = rotation vector of C^ exp[m^ x] C_y^T = -phi - C d + v
 
-m is a block of the model where there is one, else nothing. Attitude and misalignment add in z:
-other measurements must tell them apart (position and velocity over accelerations, a bearing). A
-star tracker really measures against the stars; its attitude against north-east-down, which papers
-001 and others take ("SST attitude minus INS"), needs time and position. What a position error dr
-does to it, dr / R, is 0.03 arcsec a metre and is left out.
+m is a block of the model, if it has one, else zero. Attitude and misalignment add in z: other
+measurements must distinguish them (position and velocity over accelerations, a bearing). A star
+tracker really measures against the stars; its attitude against north-east-down, which papers 001
+and others take ("SST attitude minus INS"), needs time and position. The effect of a position error,
+dr / R, is 0.03 arcsec a metre and is neglected.
 
 A timing error of sigma s_t turns the body by w s_t, w the rate against north-east-down, which adds
 the squares of its roll, pitch and yaw to the variances. Heading alone:
@@ -74,7 +73,7 @@ class AttitudeMeasurement(AidingMeasurement):
 
     @property
     def orientation(self) -> Oriented | None:
-        """All three angles; None where it measures fewer, or the pitch is steep."""
+        """All three angles; None if it measures fewer, or at a steep pitch."""
         known = all(math.isfinite(x) for x in (*self.rpy, *self.sd))
         if not known or abs(self.rpy[1]) > STEEPEST_PITCH_RAD:
             return None

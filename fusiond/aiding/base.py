@@ -2,8 +2,9 @@ r"""Interface of an aiding measurement: an innovation that is linear in the erro
 
     z = h(x^) - y = H dx + v,   v ~ N(0, diag(r))
 
-x^ the computed state, y what was measured, dx computed minus true (fusiond.navigation.error_model).
-So a position row of z is "INS minus fix", as in the papers. H is dense, (m, n).
+x^ the computed state, y the measured value, dx computed minus true
+(fusiond.navigation.error_model). So a position row of z is "INS minus fix", as in the papers. H is
+dense, (m, n).
 """
 
 from __future__ import annotations
@@ -60,9 +61,9 @@ class Innovation(NamedTuple):
 
 class State(NamedTuple):
     """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
-    (28,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
-    point, the truth). `lent` is what a filter lends measurements to write their innovations to, by
-    the number of rows: it holds until the next innovation is asked for."""
+    (28,), model, and the filter's own P (n, n), None if the state is not a filter's (a sigma point,
+    the truth). `lent`: arrays of the filter for innovations, by number of rows, valid until the
+    next innovation."""
 
     nav: Array
     xi: Array
@@ -126,9 +127,8 @@ class NotApplicable(NamedTuple):
 class AidingMeasurement:
     """Aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
-    `gate` is the probability with which a consistent innovation passes. What a measurement is, it
-    says itself: timeline, navigator, verdicts and alignment ask it and know no kind of measurement
-    by name.
+    `gate` is the probability with which a consistent innovation passes. Timeline, navigator,
+    verdicts and alignment use this interface alone and know no kind of measurement by name.
     """
 
     screened: ClassVar[bool] = False
@@ -289,7 +289,7 @@ def misaligned_axes(state: State, block: str) -> tuple[Array, list[int]]:
     """Rotation C exp[m x] (3, 3) from a sensor's axes to navigation axes, and the slots of m.
 
     m (rad, body axes) turns the body's axes into the sensor's; it is the estimate of the block of
-    that name. C and no slots where the model has no such block.
+    that name. C and no slots if the model has no such block.
     """
     slots = state.model.slots_of(block) if block else []
     if not slots:

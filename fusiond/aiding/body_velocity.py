@@ -1,4 +1,4 @@
-r"""Velocity in the vehicle's axes: no side slip and wheel speed, and what is not known about them.
+r"""Velocity in the vehicle's axes: no-slip constraint and wheel speed, with their parameters.
 
 At a point l of the vehicle (rear axle, wheel), with the body's rate w, body axes turned into the
 vehicle's by the mounting m:
@@ -9,19 +9,19 @@ vehicle's by the mounting m:
     wheel speed:  y = (1 + k) (u_forward - a_forward tau) + c s_w - q sign(y) p
 
 m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
-seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the share p of a
-step q that its rounding takes off are estimated where the model has their blocks
-(fusiond.models.vehicle_parameter_blocks). c is what share of a typed drift counts, as the vehicle
-has shown (fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors
-computed minus true, parameters true minus estimated, and e_i the axis's unit vector:
+seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the rounding p, as
+a share of a step q, are estimated if the model has their blocks
+(fusiond.models.vehicle_parameter_blocks). c is the learned factor of a configured drift
+(fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors computed minus
+true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
         - tau e_i exp[m x] (e - C^T [g x] phi)) - c ds_w + q sign(y) dp + v               (wheel)
 
-a_forward = f + C^T g is smoothed, e what its force is wrong by
-(fusiond.aiding.preintegrated_measurement): one sample of a shaken sensor would make the latency
-look smaller than it is.
+a_forward = f + C^T g is smoothed, e is the error of its force
+(fusiond.aiding.preintegrated_measurement): single samples of a vibrating sensor would bias the
+latency towards zero.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
 T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
@@ -328,13 +328,13 @@ class NonHolonomicConstraint(AidingMeasurement):
 @immutable()
 class WheelSpeedMeasurement(AidingMeasurement):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
-    `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says
-    of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not. `drifts`: sigma (m/s)
-    and correlation time (s) of what the block `drift` estimates, for tests without a filter; that
-    counts `drift_counts` times.
+    `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; without a block for
+    rounding, that of steps of `shared_step_m_s` is included in `sd_m_s`. `drifts`: sigma (m/s) and
+    correlation time (s) of the block `drift`, for tests without a filter, with the factor
+    `drift_counts`.
 
-    Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
-    is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
+    If not `signed`, it is an amount: its sign is that of the filter's forward velocity, if that
+    exceeds `SIGN_SIGMAS` of its sigma; otherwise unknown (`direction_unknown`).
     """
 
     rolls: ClassVar[bool] = True

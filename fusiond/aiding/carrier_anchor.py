@@ -1,15 +1,15 @@
 r"""Reference epoch of carrier phases, with a clone of the antenna's position.
 
-A carrier L, with the satellite's clock and the atmosphere taken off, is a range but for a constant
-as long as it is followed. Against an anchor epoch a, with s the satellite (ECEF, m), p the antenna,
-c the receiver's clock and n the noise of a phase (m),
+A carrier L, corrected for the satellite's clock and the atmosphere, is a range plus a constant
+while it is tracked. Against an anchor epoch a, with s the satellite (ECEF, m), p the antenna, c the
+receiver's clock and n the noise of a phase (m),
 
     L(t) - L(a) = |s(t) - p(t)| - |s(a) - p(a)| + c(t) - c(a) + n(t) - n(a)
 
-The noise of each epoch is in it once, and n(a) is the same for all: the way since the anchor is
-known to the phases' own noise, however many epochs lie between. As rates from epoch to epoch, of
-noise 2 s^2 / dt^2 each, which have n(t) with both signs (a moving average with its root on the unit
-circle), they would be a random walk.
+The noise of each epoch enters once, and n(a) is common to all: the path since the anchor is known
+to the phases' own noise over any number of epochs. As rates from epoch to epoch, of noise 2 s^2 /
+dt^2 each, it would be a random walk, as n(t) enters with both signs (a moving average with its root
+on the unit circle).
 
 p(a) is a state of its own (block `carrier_anchor`, ECEF, m), C = c(t) - c(a) another one (block
 `carrier_clock`, whose rate is the clock's drift). At the anchor C = 0, and the error of the clone
@@ -22,46 +22,44 @@ true minus estimated. With u the unit vector to the satellite,
 
     z = (|s - p^| - |s_a - p^_a|) + C^ - (L - L_a) = -u . dr + (a x u) . phi - u . B - C + noise
 
-which is of the way alone. That B has the u of the anchor, a milliradian off in 10 s, would tell the
-place by millimetres, as an ambiguity that floats does; but those are what is not known of each
-satellite's constant (on a walk sigma fell from 0.54 to 0.31 m, and the place went by 0.5 m).
+which depends on the path alone. With the u of the anchor for B, which changes by a milliradian in
+10 s, millimetres would show the position, as a float ambiguity does; but each satellite's constant
+is uncertain by as much (on a walk sigma fell from 0.54 to 0.31 m, and the position moved by 0.5 m).
 
-n(a) acts on all later epochs alike: what of the n_i(a) looks like a displacement and a clock is
-added to B and C once, when they are cloned,
+n(a) is common to all later epochs: the part of the n_i(a) that acts as a displacement and a clock
+is added to B and C once, at the cloning,
 
     (B, C) += G n(a),   G = (H^T W H + I)^-1 H^T W,   H = [-u_a, -1],   W = diag(1 / s_i^2)
 
-(I, (1 m)^-2, lets a direction that too few satellites measure have none.) Beside it B and C walk by
-what of the satellites' own drift looks like one, G cov(d) G^T a second, d of `DRIFT_M_SQRT_S` each
+(I, (1 m)^-2, bounds directions that too few satellites measure.) B and C also walk by the
+corresponding part of the satellites' drift, G cov(d) G^T a second, d of `DRIFT_M_SQRT_S` each
 (fusiond.aiding.carrier_anchor_noise): orbits and clocks drift for minutes, three or four satellites
-make many times as much of a place, and what is added at the anchor alone the inertial unit bridges.
-What is left of n(a) is a constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its
-leverage, which least squares do not see. It shows in their residuals v of z, and is taken off,
+amplify that in the position, and the inertial unit bridges noise that is added at the anchor alone.
+The rest of n(a) is a constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its leverage.
+It shows in the residuals v of z, and is subtracted,
 
     z <- z - b,   V <- V + (q thin)^2 dt,   K = V / (f V + s^2),   b <- b + K v,   V <- (1 - K f) V
 
-with f = 1 - h, and of b again what least squares see is left out: the gains differ, and what they
-made of a displacement would be followed by the place, unseen, for ever. So the noise of a row is
-that of its own epoch and V. q is what atmosphere, orbit and clock do beside their models, as a
-walk, thin 1 at the zenith; B walks by it, too. Residuals d of what z has changed by since the epoch
-before show how noisy this receiver's phases are,
+with f = 1 - h; the part of b that least squares would see is removed: as gains differ, it would
+displace the position for ever, unseen. So the noise of a row is that of its own epoch and V. q is
+the walk of atmosphere, orbit and clock beside their models, thin 1 at the zenith; B walks by it,
+too. Residuals d of the change of z since the epoch before show the noise of this receiver's phases,
 
     scale = (20 + sum d^2 / 2 s^2) / (20 + sum (n - 4)),       s^2 <- scale s^2
 
-A satellite is anchored while it is there at each epoch, followed, with the same ephemeris, and its
-row fits. Another one waits: there is a new anchor when the last is `LONGEST_S` old, `WAITS_S` if a
-satellite waits, or at once if fewer than `ENOUGH` are left. The epoch's rows go by the old anchor,
-the clone is taken after them: so carriers always tell the whole way, and each anchor adds a phase's
-noise.
+A satellite is anchored while it is tracked at each epoch with the same ephemeris and its row fits.
+Others wait for a new anchor: when the last is `LONGEST_S` old, `WAITS_S` if a satellite waits, or
+at once if fewer than `ENOUGH` are left. The epoch's rows use the old anchor, the clone is made
+after them: so carriers cover the whole path, and each anchor adds a phase's noise.
 
-Epochs are as far apart as the receiver's clock says. Where the instants t' that they are taken for
-are not, e = t' - t, the filter's own way is longer by v e - v(a) e(a). What is known is the change
-of e, most of all where a report has come sooner than any before: e(a) was too late, and e is not,
+The receiver's clock gives the true spacing of epochs. If the assumed instants t' differ, e = t' -
+t, the filter's path is longer by v e - v(a) e(a). The change of e is known, mainly when a report
+has come with less delay than any before: e(a) was too late, and e is not,
 
     z <- z + u . v(a) (e - e(a))
 
-All that is the filter's own, p^(a) and C^, is in its parameters, so that a rewind or another filter
-finds its own; what an epoch leaves to the next, (SLOTS, 9), are the receiver's facts.
+The filter's own values, p^(a) and C^, are among its parameters, so that a rewind or another filter
+has its own; the output of an epoch for the next one, (SLOTS, 9), holds the receiver's facts.
 
 Source: Roumeliotis and Burdick, Stochastic cloning, ICRA 2002; van Graas and Soloviev, Navigation
 51 (2004), 277-292; Groves, 2nd edition, 9.2.7.
@@ -312,8 +310,8 @@ def go_on(
     """Write the output of an epoch at `t_s` after one with output `before`; True if it is an
     anchor, for a filter that has `cloned` the last one or not. `ahead_s` of the receiver's clock.
 
-    `codes` (m,) of its rows, 0 of what was used, or none; the `first` of rates and carriers;
-    `place` (3,) of the antenna, and as it is estimated at the `anchor`.
+    `codes` (m,) of its rows, 0 if used, or none; `first`: that of rates and carriers; `place` (3,)
+    of the antenna, and its estimate at the `anchor`.
     """
     left[:] = 0.0
     left[0] = before[0]

@@ -1,15 +1,15 @@
-r"""Noise of a carriers' anchor: what its phases add to the clone, and how the clone walks.
+r"""Noise of a carriers' anchor: phase noise at the cloning, and walk of the clone.
 
 With H of the satellites (fusiond.aiding.carrier_anchor), W = diag(1 / s_i^2) of their phases,
 
     G = (H^T W H + I)^-1 H^T W        cov = G diag(v_i) G^T
 
-v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is a
-satellite's orbit, clock and atmosphere beside what is broadcast: smooth over minutes, so that what
-it does to a place in 200 s is as from a walk, and in a second far less. If it were added
-to the clone at the anchor only, the inertial unit, which knows the position across that instant to
-millimetres, would accept the carriers' velocity as true: with four satellites of a DOP of 40,
-orbits that drift by 0.7 mm/s move the position by 30 mm/s.
+v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is
+the deviation of a satellite's orbit, clock and atmosphere from the broadcast: smooth over minutes,
+so that its effect on a position in 200 s is that of a walk, and in a second far less. If it were
+added to the clone at the anchor only, the inertial unit, which knows the position across that
+instant to millimetres, would accept the carriers' velocity as true: with four satellites of a DOP
+of 40, orbits that drift by 0.7 mm/s move the position by 30 mm/s.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def phase_noise(values: Array, place: Array, left: Array, noise: Array) -> None:
 
 @compiled("b1(f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[:, ::1])", allocates=True)
 def walk_noise(values: Array, place: Array, t_s: float, left: Array, noise: Array) -> bool:
-    """Write the covariance (4, 4) of what B and C have walked by until `t_s` since they last did;
-    False where that is not long ago."""
+    """Write the covariance (4, 4) of the walk of B and C until `t_s` since the last one; False if
+    too little time has passed."""
     age = t_s - left[0, _WALKED]
     if not age >= WALKS_S:
         return False

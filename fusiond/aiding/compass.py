@@ -1,18 +1,18 @@
-r"""Heading of a compass: magnetic, and bent by the vehicle it is in.
+r"""Heading of a compass: magnetic, with the deviation of the vehicle.
 
     psi_m = psi - D + a + b sin psi + c cos psi + d + v
 
-D is the declination where the vehicle is. a (mounting, and what the field's model is wrong by) and
-b, c (the vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d is
-what lasts for some seconds (bridges, vehicles beside, currents of the own), a first-order
-Gauss-Markov process, of which as much counts as the compass has shown
-(fusiond.navigator.sensor_drift_magnitudes); v is white. The measurement is psi_m + D:
+D is the declination at the vehicle. a (mounting, and the error of the field's model) and b, c (the
+vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d lasts for
+some seconds (bridges, vehicles beside, own currents), a first-order Gauss-Markov process with a
+learned factor (fusiond.navigator.sensor_drift_magnitudes); v is white. The measurement is psi_m +
+D:
 
     z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev
 
-with d dev what the states of the deviation are short of. Soft iron (sin 2 psi) is mostly a tenth of
-it and goes into d. Source: Groves, 2nd ed., section 6.1.1; Bowditch, The American Practical
-Navigator (2019), chapter 8 (coefficients A to E).
+with d dev the error of the deviation by its states, true minus estimated. Soft iron (sin 2 psi) is
+mostly a tenth of it and goes into d. Source: Groves, 2nd ed., section 6.1.1; Bowditch, The American
+Practical Navigator (2019), chapter 8 (coefficients A to E).
 """
 
 from __future__ import annotations

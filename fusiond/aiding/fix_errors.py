@@ -1,10 +1,9 @@
 r"""Division of a receiver's error into a white part, one of seconds, and a longer one.
 
-A receiver states one sigma, s, of all that is wrong with a fix. One that errs anew with each fix is
-averaged out; one that fixes share for half a minute (multipath, satellites that come and go) or
-for half an hour (orbits, ionosphere) is not, and no receiver says how its sigma is divided. But the
-way between two fixes is measured twice. With delta by how much later than a velocity's a fix's
-stamp lies before its instant:
+A receiver states one sigma, s, of all errors of a fix. White errors average out; errors shared for
+half a minute (multipath, changing satellites) or for half an hour (orbits, ionosphere) do not, and
+no receiver states the division. But the path between two fixes is measured twice. With delta the
+delay of a fix relative to a velocity:
 
     u(t) = p_fix - int v dt = e(t) + delta v(t) + constant + what the velocities' noise walks
     d    = u(t) - u(t - h) - delta (v(t) - v(t - h))
@@ -17,18 +16,18 @@ the shares of s^2 that are white, of `LASTS_S`, and of what lasts longer:
     D(LAG_S) = 2 W / k + 2 w (1 - exp(-LAG_S / LASTS_S))
     L        = 1 - W - w
 
-averaged over both axes and the last minutes. Nothing of it depends on the filter, which follows its
-fixes and so hides what they do. delta is a least squares slope, with what the offsets in time may
-be for a prior. How long errors last is not asked: those of other lengths get the w that is right
-over a lag, and L for the rest.
+averaged over both axes and the last minutes. None of this depends on the filter, which follows its
+fixes and so hides their errors. delta is a least-squares slope with the prior of the time offsets.
+Correlation times are not estimated: errors of other lengths get the w that is right over a lag, and
+L for the rest.
 
-An estimate x of a share, of scatter sigma, is weighed by its likelihood: there is none of it (with
-probability `NONE`), or any from 0 to 1. Its mean is what counts,
+An estimate x of a share, of scatter sigma, is weighted by its likelihood; the prior is none (with
+probability `NONE`), or uniform from 0 to 1. The posterior mean is used,
 
     E = (1 - NONE) int_0^1 y N(x; y, sigma) dy / (NONE N(x; 0, sigma) + (1 - NONE) int_0^1 N dy)
 
-after a minute of white errors about nothing. So is weighed what is not white, 1 - W, and of that
-what is over in seconds, w / (1 - W); L is the rest.
+which is nearly 0 after a minute of white errors. This applies to the part that is not white, 1 - W,
+and to the share of seconds in it, w / (1 - W); L is the rest.
 
 Source: Allan, Statistics of atomic frequency standards, Proc. IEEE 54 (1966); Gelb, Applied
 Optimal Estimation (1974), section 4.5 (Markov processes of a shaping filter); Mitchell, Beauchamp,

@@ -69,7 +69,7 @@ class HeadingHistory:
         return math.isfinite(self.slips_m_s)
 
     def add(self, heading: KnownHeading) -> None:
-        """A heading has come, in whatever order."""
+        """Add a heading, in any order."""
         insort(self._headings, heading)
         oldest = KnownHeading(self._headings[-1].t_ns - KEPT_NS, -math.inf, 0.0)
         del self._headings[: bisect_left(self._headings, oldest)]
@@ -83,7 +83,7 @@ class HeadingHistory:
         return last if t_ns - last.t_ns <= HOLDS_NS else None
 
     def orient(self, attitude: Oriented) -> None:
-        """An attitude has come, in whatever order."""
+        """Add an attitude, in any order."""
         kept = self._attitudes
         insort(kept, attitude, key=_instant)
         del kept[: bisect_left(kept, kept[-1].t_ns - KEPT_NS, key=_instant)]

@@ -3,9 +3,9 @@ r"""Height of the body origin above the ellipsoid, or by air pressure.
     ellipsoidal:    z = -(h^ - h) = dr_D + v
     barometric:     y = (1 + k) h + b + c (v_N^2 + v_E^2) / (2 g) + v
 
-b the weather's offset (m), k how much too many its metres are, c the share of the dynamic pressure
-that the place of the sensor lacks (fusiond.models.vehicle_parameter_blocks). With z = y - h(x^),
-navigation errors computed minus true and parameters true minus estimated:
+b the weather's offset (m), k the scale error, c the share of the dynamic pressure that the sensor's
+place lacks (fusiond.models.vehicle_parameter_blocks). With z = y - h(x^), navigation errors
+computed minus true and parameters true minus estimated:
 
     z = (1 + k) dr_D - c (v_N dv_N + v_E dv_E) / g + db + h dk + (v_N^2 + v_E^2) / (2 g) dc + v
 

@@ -1,10 +1,9 @@
 """Initialisation candidates of measurements: position, velocity, speed, heading, height.
 
-Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
-from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
-of errors that all measurements of the device share; row i of `bias_share`
-has what a unit of each state of `bias` displaces along axis i, `markov_m` is how many metres of
-`markov` there are north and east.
+Input of the alignment (fusiond.navigator.alignment). `sd`: one sigma; `lever` (3,): from the IMU to
+the measured point, body axes, m. `bias`, `time` and `rest` name the blocks of errors that all
+measurements of the device share; row i of `bias_share`: displacement along axis i by each state of
+`bias`; `markov_m`: metres of `markov` north and east.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ r"""Bearing of a known point: azimuth and elevation, as from a radar (SAR) on th
     A = atan2(u_y, u_x),   E = atan2(-u_z, sqrt(u_x^2 + u_y^2))
 
 p and r point and vehicle, Earth-fixed (m); l the lever arm to the antenna, body axes; m the
-misalignment (rad, body axes) that turns the body's axes into the sensor's, a block of the model
-where there is one. Azimuth runs from the sensor's x to its y, elevation is positive upwards.
+misalignment (rad, body axes) that turns the body's axes into the sensor's, a block of the model, if
+it has one. Azimuth runs from the sensor's x to its y, elevation is positive upwards.
 
 With C^ = (I - [phi x]) C, position error dr and what is left of m, e = m - m^, computed minus true:
 
@@ -23,15 +23,15 @@ The angles are taken as linear in the errors. A displacement s across a distance
 (s / rho)^2, so a point nearer than `least_range_m` is `too_close`; beyond `STEEPEST_ELEVATION_RAD`
 azimuth loses its meaning: `too_steep`.
 
-Without an inertial unit nothing estimates C. One bearing has two angles and an attitude three, and
-each later point meets another attitude: bearings alone say nothing of the position, however many.
-With an attitude that another sensor has measured at about that instant they do,
+Without an inertial unit nothing estimates C. A bearing has two angles and an attitude three,
+different at each later point, so any number of bearings alone gives no position. With the attitude
+of another sensor at about that instant,
 
     C^ = C_y exp[s^ x]^T,   phi = theta - C (s - s^),   cov(theta) = J diag(sd^2) J^T
 
 C_y measured, J as in fusiond.aiding.attitude, s the misalignment of its sensor, a block of the
 model. theta is noise beside the angles' own, cov = dA/dphi cov(theta) dA/dphi^T, and both rows are
-whitened. Of a vehicle on a road a heading will do (fusiond.aiding.headings_without_imu).
+whitened. For a vehicle on a road a heading is enough (fusiond.aiding.headings_without_imu).
 
 Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checked numerically.
 """

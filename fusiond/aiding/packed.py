@@ -63,7 +63,7 @@ def packed_rows(
     """Write z (m,), H (m, n) and r (m,) of the row `x` (SIZE,); returns `APPLIES` or a refusal.
 
     `state`: a filter's state (10,), parameters (n,) and last step, with P (n, n); `model`: columns
-    and sigmas at the start of its parameters (n,), and whether it holds the height.
+    and initial sigmas of its parameters (n,), and whether it holds the height.
     """
     nav, xi, step = state
     column_of, initial, hold_height = model

@@ -6,28 +6,28 @@ r"""Position of an antenna: a GNSS fix, with or without height.
         + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
-ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
-as many more as the fix's own sigma is larger there (fusiond.aiding.fix_errors), tau how much later
-than its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the
-acceleration, smoothed (fusiond.aiding.preintegrated_measurement); where the model has states for
-them they are estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is
-not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis. An error
-that lasts for seconds and has no state is noise.
+ionosphere), s its share in this fix, c an error of seconds, of w metres, down larger by the ratio
+of the fix's sigmas (fusiond.aiding.fix_errors), tau the time from the fix's stamp to its validity,
+v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
+(fusiond.aiding.preintegrated_measurement); with states in the model they are estimated; dl, db,
+dtau are true minus estimated. A timing error of sigma s_t that is not shared moves the antenna by v
+s_t, which adds (v_i s_t)^2 to the variance of each axis. An error that lasts for seconds and has no
+state is noise.
 
-An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
-and of dtau's square, is noise to it, where P is the filter's own:
+A time offset multiplies v_a. The second-order terms, the product of the two errors and dtau's
+square, are noise, if P is the filter's own:
 
     z_2 = dv_a dtau - a dtau^2 / 2
     var(z_2) = P_va P_tau + P_va,tau^2 - 2 a P_tau P_va,tau + a^2 P_tau^2 / 2
 
 for Gaussian errors (Isserlis); its mean is under a millimetre for sigmas of 0.01 s and 0.1 m/s, and
-stays out. So with a lever arm that nobody has measured, which an attitude turns: 3 deg and a metre
-are 5 cm, with u = C dl
+is neglected. The same applies to an unmeasured lever arm, which an attitude error turns: 3 deg and
+a metre are 5 cm, with u = C dl
 
     z_2 = phi x u,   var(phi_j u_k - phi_k u_j) = P_jj U_kk + X_kj^2 + P_kk U_jj + X_jk^2
                                                   - 2 (P_jk U_jk + X_jj X_kk)
 
-P, U and X = cov(u, phi) those of the two. (96 cars of tests/estimators/test_unknown_lever_arm.py,
+with P, U and X = cov(u, phi) of the two. (96 cars of tests/estimators/test_unknown_lever_arm.py,
 NEES a degree of lever arm and place: 1.5 without it, 1.1 with it.)
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3; Bar-Shalom, Li, Kirubarajan (2001),
@@ -83,8 +83,8 @@ _BODY = Struct("<14d14q")
 
 
 def markov_sd_of(axis: int, markov_m: float, sd: Vector3) -> float:
-    """Metres of an error that lasts for seconds along an axis: down as many more as the fix's own
-    sigmas (m) say that its errors are larger there."""
+    """Metres of an error of seconds along an axis, down larger by the ratio of the fix's sigmas
+    (m)."""
     return markov_m if axis < 2 else 2.0 * markov_m * sd[2] / (sd[0] + sd[1])
 
 
@@ -219,7 +219,7 @@ def position_rows(
 
 @immutable()
 class PositionMeasurement(AidingMeasurement):
-    """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
+    """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; None for an unknown height.
 
     Blocks of the model: `bias` has the error that fixes share (north, east, down), of which
     `bias_share` enters each axis; `time` the fixes' offset in time; `rest` the residual of the

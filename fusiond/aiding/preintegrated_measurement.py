@@ -2,22 +2,21 @@ r"""Preintegrated IMU data of a measurement: acceleration, with accelerometer er
 
     a = C f + g,   d a = [f x] phi + C e,   e = db + ds f       (computed minus true, body axes)
 
-An offset in time multiplies a. Tilt and force bias are known by their sum long before they are each
-(fusiond.estimators.tilt_frame_after_heading_update): a measurement that has the first term alone
-would tell them apart, a little with each measurement, whatever the truth.
+A time offset multiplies a. The sum of tilt and force bias is known long before each of them
+(fusiond.estimators.tilt_frame_after_heading_update): a measurement with the first term alone would
+separate them, a little each time, without any evidence.
 
-A rate multiplies what is not known of a lever arm. In the slope by that its noise n passes for a
-turn: each velocity of variance r brings the information E[n^2] / r, whatever the vehicle does, and
-takes the estimate to where it began, or to where the attitude that the same noise has turned has it
-(errors in both variables). So the slope has the rate w_s smoothed by one pole, and nothing of it
-that noise may be,
+A rate multiplies the error of a lever arm. In that slope the rate's noise n counts as a turn: each
+velocity of variance r brings the false information E[n^2] / r under any motion, and pulls the
+estimate to its start or to the attitude that the same noise has turned (errors in both variables).
+So the slope uses the rate w_s smoothed by one pole, reduced by its noise,
 
-    w_s (1 - k^2 s^2 / w_s^2),  0 where that is below 0
+    w_s (1 - k^2 s^2 / w_s^2),  0 if that is negative
 
-with s^2 the variance that its noise has left and k = CLEAR (James and Stein's estimator, with the
-share of noise that passes at one in 370). Though w_s lags behind w, the lever stays unbiased:
-E[w_s w] = E[w_s^2], for the real part of 1 / (1 + i f) is its square. The velocity itself has the
-rate of the sample, so that a lever arm that is known makes no transients.
+with s^2 the remaining variance of its noise and k = CLEAR (James and Stein's estimator, with the
+share of noise that passes at one in 370). Though w_s lags behind w, the lever stays unbiased: E[w_s
+w] = E[w_s^2], for the real part of 1 / (1 + i f) is its square. The velocity itself uses the rate
+of the sample, so that a known lever arm makes no transients.
 
 Source: Fuller, Measurement Error Models (1987), section 1.1; James and Stein, Estimation with
 quadratic loss, Proc. 4th Berkeley Symp. 1 (1961), positive part.

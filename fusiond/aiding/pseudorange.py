@@ -11,28 +11,28 @@ and drift as a range:
     g = -(I - u u^T)(s' - v - b) / |s - p - a|
 
 An error that all ranges share for many minutes may be a state of the model (blocks of
-`RANGE_BIAS`): a displacement t of the antenna that stands for orbit errors, multipath and,
-downwards, the ionosphere that is left:
+`RANGE_BIAS`): a displacement t of the antenna for orbit errors, multipath and, downwards, the
+residual ionosphere:
 
     rho^ = |s - p^ - a - K t^| + c_k^,    z_rho += u . K dt    (dt true minus estimated)
 
-with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.range_error_displacement); where the sky
-has changed, t is in part another one (`renewal`).
+with K (3, 3), `shape`, by the sky's geometry (fusiond.gnss.range_error_displacement); if the sky
+has changed, t is renewed in part (`renewal`).
 
-Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: what the
-models of ionosphere and troposphere leave, BeiDou-2's offset), with what one sigma of each adds to
-each range, S:
+Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: residual
+ionosphere and troposphere, BeiDou-2's offset), with S the effect of one sigma of each on each
+range:
 
     rho^ += S n^,    z_rho -= S dn;    without these blocks S S^T goes to the noise, by row
 
-The carrier of a satellite that has been followed since an anchor epoch takes the Doppler's place:
-it tells the way since then (fusiond.aiding.carrier_anchor), of which a clone of the antenna's place
-at the anchor and the carriers' clock are states. At the anchor the Dopplers serve.
+A carrier tracked since an anchor epoch replaces the Doppler: it measures the path since then
+(fusiond.aiding.carrier_anchor), with states for a clone of the antenna's position at the anchor and
+for the carriers' clock. At the anchor itself Dopplers are used.
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
-term in the rate either, for u . (w_ie x u) = 0. All else (satellite clock, group delay, atmosphere)
-has been taken off. Left out: the change of the flight time in the rate, under 3 mm/s, and the
+term in the rate either, for u . (w_ie x u) = 0. Satellite clock, group delay and atmosphere have
+been subtracted. Neglected are the change of the flight time in the rate, under 3 mm/s, and the
 Earth's own rate times the lever. dc_k and dd are true minus estimated, as all parameters.
 
 A double-star system's two path lengths L1 = 2 rho_1, L2 = rho_1 + rho_2 (fusiond.aiding.
@@ -131,22 +131,20 @@ class PseudorangeMeasurement(AidingMeasurement):
 
     `values` (19, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
     turned to the axes at reception, m, m/s), `ranges` (m), `rates` (m/s; positive: going away) and
-    their variances (m^2, (m/s)^2), what one sigma of each of three shared errors adds (m), and of
-    the carrier: seconds for which it has been followed since the epoch before (0: not), its range
-    but for a constant (m), its variance (m^2), how it walks beside the models (m/sqrt(s)), the
-    satellite's slot and its ephemeris' number; NaN is not measured. `before` and `left`
-    (SLOTS, 9) are what the last epoch left and this one leaves, whatever filter has been there
-    last (fusiond.aiding.carrier_anchor). `clock` (n,): which
-    of the states of the model's block `clock_offset` each range has, or NO_CLOCK; a rate of a
-    satellite with NO_CLOCK has no drift either. `lever` (m, body axes) of the antenna.
-    `clock_reset`: the receiver has set its clock, of which `t_ns` is `ahead_s` (s; any constant in
-    it says nothing). `shape` (3, 3): K; `kept`: R and cov(w) (3, 3) by
-    which t is another than that of the epoch before, None for none; `seen`, an empty list, gets z
-    and u P u^T of the ranges as the filter first looks at them.
-    Rows: the finite ranges in order, then the finite rates (`labels`).
+    their variances (m^2, (m/s)^2), the effect of one sigma of each of three shared errors (m), and
+    of the carrier: seconds of tracking since the epoch before (0: none), its range up to a constant
+    (m), its variance (m^2), its walk beside the models (m/sqrt(s)), the satellite's slot and its
+    ephemeris' number; NaN is not measured. `before` and `left` (SLOTS, 9): output of the last epoch
+    and of this one (fusiond.aiding.carrier_anchor). `clock` (n,): index of each range's state in
+    the model's block `clock_offset`, or NO_CLOCK; a rate of a satellite with NO_CLOCK has no drift
+    either. `lever` (m, body axes) of the antenna. `clock_reset`: the receiver has set its clock, of
+    which `t_ns` is `ahead_s` (s; any constant in it says nothing). `shape` (3, 3): K; `kept`: R and
+    cov(w) (3, 3) of the renewal of t since the epoch before, None without; `seen`, an empty list,
+    receives z and u P u^T of the ranges before the update. Rows: the finite ranges in order, then
+    the finite rates (`labels`).
 
-    ValueError for shapes that do not fit, a variance that is not positive where there is a value,
-    or a satellite with a clock beside one without where rates are given.
+    ValueError for shapes that do not fit, a value without a positive variance, or, with rates,
+    satellites with and without a clock.
     """
 
     screened: ClassVar[bool] = True
@@ -219,7 +217,7 @@ class PseudorangeMeasurement(AidingMeasurement):
 
     @property
     def total_variance(self) -> Array:
-        """(n,), m^2: of ranges with what they share."""
+        """Variances (n,) of ranges with shared errors, m^2."""
         found: Array = self.range_variance + (self.values[SHARED:SPAN] ** 2).sum(axis=0)
         return found
 
@@ -265,7 +263,7 @@ class PseudorangeMeasurement(AidingMeasurement):
         )
 
     def without_attitude(self, way: HeadingHistory) -> PseudorangeMeasurement:
-        """Rates are the Dopplers': no place is cloned where no attitude is known."""
+        """Copy with Doppler rates only, as without an attitude no position is cloned."""
         values, arm = self.values.copy(), level_arm_m(self.lever)
         values[RANGE_VARIANCE] += arm**2
         values[RATE_VARIANCE] += (CORNER_RAD_S * arm) ** 2

@@ -79,10 +79,10 @@ def range_rows(
     carriers, of which `rate_row` is the first.
 
     Slots of the clocks' offsets, of their drift, of the displacement, of other shared errors, of
-    the carriers' anchor and of their clock; none where the model has no such state. `before`
-    (SLOTS, 9): what the last epoch left to this one; `ahead_s` of the receiver's clock its instant
-    is (fusiond.aiding.carrier_anchor). `shape` (3, 3) is what a unit of each
-    of the displacement's states displaces.
+    the carriers' anchor and of their clock; empty if the model has no such state. `before` (SLOTS,
+    9): output of the last epoch; `ahead_s`: lead of the epoch's assumed instant on the receiver's
+    clock (fusiond.aiding.carrier_anchor). `shape` (3, 3): displacement by a unit of each of its
+    states.
     """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
     a0 = c00 * l0 + c01 * l1 + c02 * l2
@@ -217,7 +217,7 @@ WRONG = {
 def measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, int]:
     """Write the variances r (2 n,) of the finite ranges, then of the finite rates.
 
-    Returns the numbers of ranges and rates, the number of clocks, and what is wrong with them."""
+    Returns the numbers of ranges, rates and clocks, and an error code."""
     n = clock.shape[0]
     row = finite = timed = clocks = 0
     wrong = SOUND

@@ -73,7 +73,7 @@ class RdssGeometry:
     ) -> Sensitivity | NotApplicable:
         """Sensitivities G and g at a geodetic position (rad, rad, m above the ellipsoid).
 
-        `satellite_below_horizon`: one of the two stands below `ELEVATION_MASK_RAD`.
+        `satellite_below_horizon`: one of the two satellites is below `ELEVATION_MASK_RAD`.
         `no_geometry`: G exceeds `MAX_AMPLIFICATION`; at the equator both sight lines lie in the
         equatorial plane and nothing measures north.
         """

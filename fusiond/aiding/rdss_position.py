@@ -1,14 +1,14 @@
-r"""Horizontal position of a BeiDou RDSS terminal's antenna: late, with correlated errors.
+r"""Horizontal position of a BeiDou RDSS terminal's antenna: delayed, with correlated errors.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi ] + C l - b
       = dr + (C l) x phi - b + v,   cov(v) = R (2, 2)
 
-b is an error that successive fixes share (height model, delays): a first-order Gauss-Markov pair
-of the error state where the model has the block `BIAS_BLOCK`, else nothing. R has a correlation
-between north and east, so the rows are whitened by its Cholesky factor. A timing error s_t adds v
-v^T s_t^2 to R.
+b is an error that successive fixes share (height model, delays): a first-order Gauss-Markov pair of
+the error state if the model has the block `BIAS_BLOCK`, else zero. R has a correlation between
+north and east, so the rows are whitened by its Cholesky factor. A timing error s_t adds v v^T s_t^2
+to R.
 
-How a fix that is late is used is its strategy:
+Strategies for a delayed fix:
 
 `rewind`                 at its own instant; everything after it runs again.
 `optimal_prediction`     at its own instant, but not fed back there: the error estimate x(k|k) and P

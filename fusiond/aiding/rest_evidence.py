@@ -46,10 +46,9 @@ SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
 
 
 class Measured(NamedTuple):
-    """Result of the measured speeds of a span: whether they contradict rest, and the sigma (m/s) of
-    the best of their means (infinite: none was measured); whether `surely`, beyond what they may
-    drift by. What is claimed of rest asks for the first, what is asked of the gyros for the last: a
-    wheel that has drifted is no reason to believe a gyro."""
+    """Result of the measured speeds of a span: contradiction of rest, sigma (m/s) of the best mean
+    (infinite without one), and `surely`: contradiction beyond their drift. A claim of rest uses the
+    first, a test of the gyros the last: a drift of a wheel is no reason to trust a gyro."""
 
     contradicts: bool
     sd: float
@@ -115,8 +114,8 @@ class RestEvidence:
         """Sums by source and start of a span; a standstill of minutes is tested with each speed."""
 
     def receive(self, measurements: Sequence[AidingMeasurement]) -> None:
-        """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
-        alone is an effort, and it has the rates of all satellites."""
+        """Receive a measurement. Raw epochs are left to the filter, which uses the rates of all
+        satellites: their own velocity would be costly."""
         for measurement in measurements:
             if measurement.screened or measurement.locates:
                 continue
@@ -208,8 +207,8 @@ class RestEvidence:
         return north, east, max(row.sd for row in found)
 
     def quiet_at_speed(self, t_ns: int, at_speed: bool) -> None:
-        """True if the quiet window that ended at `t_ns` was at speed; a rewind may say otherwise
-        than before."""
+        """True if the quiet window that ended at `t_ns` was at speed; a rewind may change the
+        result."""
         row = bisect_left(self._at_speed, t_ns)
         known = row < len(self._at_speed) and self._at_speed[row] == t_ns
         if at_speed and not known:

@@ -3,15 +3,15 @@ r"""Zero-velocity and zero-rate updates, once the vehicle is confirmed at rest.
     z = v^ - 0 = dv + v
     z = mean of w^ over the window - C^T w_ie = e + C^T (w_ie x phi) + v
 
-e is what the gyros are wrong by, and what turns a vehicle at rest in the navigation equations is
-phi' = -(C e + w_ie x phi) = -C z: no heading is in it. A row of e alone takes what the Earth puts
-on level gyros for theirs, and then the level, which turns with it, tells the heading of any gyro,
-5 deg to 4.4 in 200 s. With its column only what is known of e by itself tells a heading, as a
-gyrocompass does: sigma_e / (w_ie cos lat), 6 deg for 1 deg/h.
+e is the error of the gyros. At rest the navigation equations have phi' = -(C e + w_ie x phi) = -C
+z, without the heading. A row with e alone would take the Earth's rate on level gyros for their
+error; the level, which turns with it, would then show a false heading for any gyro, 5 deg to 4.4 in
+200 s. With the column of phi only independent information on e shows a heading, as in
+gyrocompassing: sigma_e / (w_ie cos lat), 6 deg for 1 deg/h.
 
-The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill).
-Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a hypothesis, which
-all that is known may refute (`Rest.doubt`):
+The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill). A
+quiet window alone is no rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a hypothesis
+that each of these may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
     the mean of measured speeds is not zero, whatever
@@ -22,23 +22,22 @@ all that is known may refute (`Rest.doubt`):
     the ride is smooth, and neither sqrt(P_vv) nor the
     sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
 
-The tests are in this order: a wheel that may have drifted leaves no rest to claim, and keeps nobody
-from asking the gyros. v_max is the largest speed of a vehicle that creeps, s_v the sigma of the
-zero velocity, s_r of the rate of a vehicle at rest, all configured; s_n the gyro's noise in a
-window, k the number of windows in a row (one, and up to ten). The bias's P is at the start that of
-the data sheet: a turn within it cannot be told from a bias. The last test asks for evidence as good
-as what the measurement will claim, once quiet windows at speed have shown that quiet is none.
+The tests are in this order: a wheel that may have drifted prevents a claim of rest, but not the
+test of the gyros. v_max is the largest speed of a vehicle that creeps, s_v the sigma of the zero
+velocity, s_r of the rate of a vehicle at rest, all configured; s_n the gyro's noise in a window, k
+the number of windows in a row (one, and up to ten). The bias's P is at the start that of the data
+sheet: a turn within it cannot be distinguished from a bias. Once quiet windows have occurred at
+speed, the last test requires evidence as good as the measurement's claim.
 
-What has stood the tests may creep still, at a speed of sigma s_v, and around a bend: it turns about
-its down axis with the sigma s_v / R at the most, R the least radius of a car. A creep is not even:
-as a rate of first order that lasts for T it scatters over k windows of a second by
+A vehicle that passes the tests may still creep, at a speed of sigma s_v, and in a bend: its rate
+about the down axis has sigma s_v / R at most, R the least radius of a car. A creep is not uniform:
+as a first-order process of correlation time T it scatters over k windows of a second by
 
     E S^2 = sigma^2 (1 - c),   c = 2 / (k (k - 1)) sum_d (k - d) exp(-d / T)
 
-so that a run that scatters by S turns with no more than sigma^2 = S^2 / (1 - c) (k - 1) / q, with q
-the twentieth part of chi-square of k - 1. The lesser of the two adds to the variance of the zero
-rate: of a first window it is nearly all of it where the speed is not known, after five seconds at
-rest nothing.
+so that a run with scatter S turns with sigma^2 = S^2 / (1 - c) (k - 1) / q at most, q the 5 %
+quantile of chi-square of k - 1. The lesser of the two adds to the variance of the zero rate: with
+unknown speed it dominates in the first window, and vanishes after five seconds at rest.
 
 Source: Groves, 2nd ed., section 15.3.
 """
@@ -98,7 +97,7 @@ def _rate_error(state: State, mean_rate: Array) -> Array:
 
 def _normalised(v: list[float], p: list[list[float]], least: float) -> float:
     """v^T (P + least I)^-1 v of a few axes, by elimination; a tenth of the time of numpy's solver.
-    What is given is used up."""
+    Overwrites its input."""
     square = 0.0
     for k, row in enumerate(p):
         pivot = row[k] + least
@@ -223,7 +222,7 @@ class ZeroVelocityUpdate(AidingMeasurement):
 
 @immutable()
 class ZeroAngularRateUpdate(AidingMeasurement):
-    """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may
+    """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s`: sigma of the vehicle's own
     turn."""
 
     constraint: ClassVar[bool] = True

@@ -3,17 +3,17 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
     z = v^ + C^ (w x l^) + a^ tau^ - v_fix
       = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ da + noise
 
-w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is how much later than its
-stamp the velocity is valid, a the acceleration (its error da:
-fusiond.aiding.preintegrated_measurement), smoothed: with the noise of single samples in its
-Jacobian an offset would come out too small, and too sure. What is left of the product of the two
-errors is not taken for noise: on drive_0708 that cost a tenth of the accuracy in outages, and gave
-no more honest a sigma. A timing error of sigma s_t that is not shared changes the velocity by a
-s_t, which adds (a_i s_t)^2 to the variance of each axis.
+w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is the time from the
+velocity's stamp to its validity, a the acceleration (its error da:
+fusiond.aiding.preintegrated_measurement), smoothed: with the noise of single samples in the
+Jacobian an offset would be biased and too certain. The product of the two errors is not treated as
+noise: on drive_0708 that cost a tenth of the accuracy in outages without a more honest sigma. A
+timing error of sigma s_t that is not shared changes the velocity by a s_t, which adds (a_i s_t)^2
+to the variance of each axis.
 
 A velocity that lags behind the position of the same stamp, by tau_p - tau, has been averaged or
-filtered for about twice as long. Of a vehicle that speeds up evenly that is a delay; of one that
-begins or ends to, or shakes, within that time it is not:
+filtered for about twice as long. Under constant acceleration that is a delay; if the acceleration
+changes within that time, it is not:
 
     var = (AVERAGED (tau_p - tau) a_i)^2    no velocity is ahead of its position: else 0
 

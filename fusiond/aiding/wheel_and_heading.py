@@ -1,18 +1,18 @@
 r"""Wheel speed and heading for a vehicle of unknown attitude.
 
-A vehicle that does not slide goes the way it faces, psi, or backwards. With f = (cos psi, sin psi,
-0), s the side slip, and what a wheel errs by as in fusiond.aiding.body_velocity
+A vehicle that does not slide moves along its heading psi, or backwards. With f = (cos psi, sin psi,
+0), s the side slip, and the wheel's errors as in fusiond.aiding.body_velocity
 
     heading:  z = v_e^ cos psi - v_n^ sin psi - s                     psi = y - dev^
               dz = (-sin psi, cos psi) dv - (f . v) d dev + noise     (f . v)^2 sd^2 + sd_slip^2
     wheel:    z = (1 + k^) f . v^ + s_w^ - q sign(y) p^ - y
               dz = (1 + k) f dv - (f . v) dk - ds_w + q sign(y) dp + noise
 
-f of a wheel is that of the last heading; without one it is the direction of v^ itself, where v^ is
-beyond `SIGN_SIGMAS` of its sigma (f . v is then the ground speed, and a wheel that turns backwards
-has -f). A wheel speed within its noise means that the vehicle stands, whichever way it
-faces: v_n = v_e = 0. What is left is `direction_unknown`. A heading that is off by d makes a speed
-too small by d^2 / 2. Nothing tells an acceleration, so that a latency is noise, of `BRAKES_M_S2`.
+f of a wheel is that of the last heading; without one it is the direction of v^ itself, if v^
+exceeds `SIGN_SIGMAS` of its sigma (f . v is then the ground speed, and a wheel that turns backwards
+has -f). A wheel speed within its noise means rest at any heading: v_n = v_e = 0. Otherwise the
+outcome is `direction_unknown`. A heading error d makes a speed too small by d^2 / 2. The
+acceleration is unknown, so a latency is noise, of `BRAKES_M_S2`.
 
 dev is a compass's deviation (fusiond.aiding.compass). Source: as of those two modules.
 """
@@ -52,8 +52,8 @@ def _variance(p: Array | None, axis: Array) -> float:
 class CourseMeasurement(AidingMeasurement):
     """Zero velocity across a heading `yaw_rad` with `sd_rad`, with a slip of sigma `slips_m_s`.
 
-    `blocks` name the model's blocks of what the heading is off by, in the order of `shares` (k,):
-    what each of their states turns it by.
+    `blocks` name the model's blocks of the heading's errors, in the order of `shares` (k,): the
+    effect of each of their states on the heading.
     """
 
     yaw_rad: float

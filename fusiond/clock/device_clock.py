@@ -30,11 +30,10 @@ class OffsetFilter:
     """Lower envelope of arrival minus source time, forgetting with the allowed drift.
 
     `offset_ns` (host minus source) is None before the first sample. It falls at once, because
-    nothing is true after it has arrived, and rises smoothly, so that the spacing of mapped
-    samples follows the source. Old minima go when `window_s` of newer samples have come, not by
-    age alone: a source that is heard rarely keeps its best samples. When all of a window are later
-    by more than jitter and drift explain, they are late, and it rises by the drift alone, for two
-    minutes; then it snaps (`snaps`).
+    nothing is true after it has arrived, and rises smoothly, so that the spacing of mapped samples
+    follows the source. Old minima expire after `window_s` of newer samples, not by age alone: a
+    source with rare samples keeps its best ones. If all samples of a window are delayed beyond
+    jitter and drift, the offset rises by the drift alone for two minutes; then it jumps (`snaps`).
     """
 
     def __init__(self, drift_ppm: float, window_s: float) -> None:
@@ -83,11 +82,11 @@ class OffsetFilter:
 class DeviceClock:
     """A device's free-running counter on the host's monotonic clock.
 
-    Mapped instants never run backwards while the counter does not, not even over a restart. A
-    count that disagrees with its arrival is held back, and its sample stamped like its neighbours,
-    by arrival: three in turn that agree with each other are a clock that has been set. Counters:
+    Mapped instants never run backwards while the counter does not, not even over a restart. A count
+    that disagrees with its arrival is held back, and its sample stamped like its neighbours, by
+    arrival. Three in a row that agree with each other mean that the clock has been set. Counters:
     `device_tick_odd`, `device_clock_restarted`, `device_clock_relearned` (all samples had been
-    late for minutes).
+    delayed for minutes).
     """
 
     _WINDOW_S = 10.0

@@ -1,13 +1,13 @@
-"""The host's clocks: what steps and slews of the system clock and a suspended host do to them.
+"""The host's clocks: effects of steps, slews and suspend.
 
     CLOCK_MONOTONIC_RAW   the quartz alone: never steps or slews, stands still in suspend
     CLOCK_MONOTONIC       the same, slewed with realtime (adjtimex(2): 10 % at most)
     CLOCK_BOOTTIME        CLOCK_MONOTONIC, but goes on in suspend (clock_gettime(2))
-    CLOCK_REALTIME        follows UTC, is slewed and stepped by whoever sets it
+    CLOCK_REALTIME        follows UTC; slewed and stepped by any program that sets it
 
-Instants are those of the first, *monotonic* here. When realtime gains on it by more than a
-disciplined quartz does, what CLOCK_MONOTONIC has gained is a slew, what boottime has gained on that
-is sleep, and the rest is a step. Host time is injected.
+Instants are those of the first, *monotonic* here. If realtime gains on it by more than a
+disciplined quartz does, the gain of CLOCK_MONOTONIC is a slew, the gain of boottime on that is
+suspend, and the rest is a step. Host time is injected.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ class SystemTime:
 class Readings:
     """Lead of the host's other clocks over the monotonic one: `(t_ns, ahead_ns)` each.
 
-    `on_reading(clock, t_ns, ahead_ns)` is told every reading: with them, all that a `Clock` takes
-    from the host can be recorded.
+    `on_reading(clock, t_ns, ahead_ns)` receives every reading, so that all input of a `Clock` from
+    the host can be recorded.
     """
 
     def __init__(self, host: HostTime) -> None:
@@ -183,7 +183,7 @@ class SystemClock:
         return offset
 
     def _split(self, offset_ns: int) -> tuple[int, int]:
-        """Change of the offset since the last sample: what was slewed, and the rest (ns)."""
+        """Change of the offset since the last sample: slew, and the rest (ns)."""
         self._slewed_ns = self._readings.slewed()[1]
         before_ns, self._unslewed_ns = self._unslewed_ns, offset_ns - self._slewed_ns
         rest_ns = self._unslewed_ns - before_ns

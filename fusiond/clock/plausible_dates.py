@@ -1,4 +1,4 @@
-"""Dates that UTC can have: what is earlier or later is a mistake, or a week that has rolled over.
+"""Plausible dates of UTC: others are mistakes, or GPS weeks that have rolled over.
 
 Dates from before the last rollover of the ten-bit GPS week are moved by 1024 weeks (IS-GPS-200,
 20.3.3.3.1.1).

@@ -1,7 +1,7 @@
 """Monotonic time from a recorder's stamps, whose clock may be set while it records.
 
-A recorder stamps frames by a clock that somebody sets: NTP, a receiver, an operator, once the
-computer is up. Between two frames the stamps then advance by what passed and by what it was set:
+A recorder stamps frames by a clock that NTP, a receiver or an operator sets while it records.
+Between two frames the stamps advance by the elapsed time and by the step of the clock:
 
     s(k) - s(k-1) = passed + set,    d = s - utc advances by `set` alone
 
@@ -118,8 +118,8 @@ class RecorderClock:
     def take(self, stamp_ns: int, of: Of, following: Sequence[int], set_by_utc: SetOff) -> Verdict:
         """Monotonic instant of a frame, given the stamps that follow it (`FOLLOWING`).
 
-        `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
-        say nothing. It is asked where a step is possible.
+        `set_by_utc()`: step of the clock here by reports of UTC; None if unknown. Called if a step
+        is possible.
         """
         if not self._started:
             if 2 * sum(f < stamp_ns - AHEAD_NS for f in following) > len(following):
@@ -151,8 +151,8 @@ class RecorderClock:
         return "taken"
 
     def _little_back(self, stamp_ns: int, of: Of, set_by_utc: SetOff) -> Verdict:
-        """True for a small step back, within the disagreement of controllers: only UTC can prove
-        it."""
+        """True for a small step back, within the disagreement of controllers' clocks, which only
+        UTC can confirm."""
         change = stamp_ns - self.stamp_ns
         denied = self._denied_ns is not None and stamp_ns - self._denied_ns < ASKED_AGAIN_NS
         set_ns = None if denied or change > -LEAP_NS else set_by_utc()
@@ -188,8 +188,8 @@ class RecorderClock:
         return gained_ns
 
     def _step(self, stamp_ns: int, set_ns: int, of: Of) -> None:
-        """Reports of UTC come with jitter: where they say that no time passed, or as good as none,
-        so much did as passes between frames of this identifier."""
+        """Reports of UTC have jitter: if they show almost no elapsed time, the usual interval of
+        this identifier is used."""
         change = stamp_ns - self.stamp_ns
         passed = change - set_ns
         if passed < LEAP_NS:
@@ -208,8 +208,7 @@ class RecorderClock:
         return due_ns if 0 <= due_ns < LEAP_NS else spacing
 
     def _alone(self, stamp_ns: int, following: Sequence[int]) -> bool:
-        """True if a stamp that went back stands alone: most that follow go on from those before
-        it."""
+        """True if only this stamp went back: most stamps after it continue those before it."""
         on = [f for f in following if stamp_ns - AHEAD_NS <= f < self.stamp_ns]
         return 2 * len(on) <= len(following)
 
@@ -236,7 +235,7 @@ def own_share(total_ns: int, own_ns: int, others_ns: int) -> int | None:
 def set_by(before: Sequence[int], after: Sequence[int]) -> int | None:
     """Step of the clock, from stamp minus reported UTC before and after (ns).
 
-    None where there are too few reports, or where their scatter would hide it.
+    None with too few reports, or if their scatter would hide the step.
     """
     if not before or len(after) < ENOUGH_REPORTS:
         return None

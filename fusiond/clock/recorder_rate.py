@@ -2,17 +2,17 @@
 
     s(k) = o + (1 + r) u(k) + delay(k),     0 <= delay(k) < LEAP_NS
 
-s is the recorder's time without what it was set by, u what a receiver on the bus reports of UTC.
-Offset o and rate r are the clock's two states. A quartz keeps r within the configured drift;
-whoever disciplines a clock moves r at once, holds it and moves it back: adjtimex(2) to 500 ppm by
-its frequency and to 10 % by its tick, chrony to 8.3 % (`maxslewrate`), a bad oscillator to a
-percent for good. Hence r is constant between changes whose number is the least that explains the
-reports: as long as one line passes all reports of a stretch within their own scatter, nothing has
-changed (the bounds of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
+s is the recorder's time without steps, u the UTC that a receiver on the bus reports. Offset o and
+rate r are the clock's two states. A quartz keeps r within the configured drift; a program that
+disciplines a clock changes r at once, holds it and moves it back: adjtimex(2) to 500 ppm by its
+frequency and to 10 % by its tick, chrony to 8.3 % (`maxslewrate`), a bad oscillator to a percent
+for good. Hence r is constant between the smallest number of changes that explains the reports:
+while one line fits all reports of a stretch within their scatter, nothing has changed (the bounds
+of the slope close like doors; Bristol, "Swinging door trending", ISA 1990).
 
-A rate counts where it is beyond the drift, once what one of them comes to is beyond what a delay
-explains: the envelope of UTC (fusiond.clock.utc_from_arrivals) follows all else. That of the first
-and of the last reports is held before and behind them, for as long as it was seen.
+A rate is used if it exceeds the drift and its effect exceeds any delay; the envelope of UTC
+(fusiond.clock.utc_from_arrivals) follows the rest. The first and the last rate are extrapolated
+before and after their reports, for as long as they were observed.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _line(s: np.ndarray, lead: np.ndarray, first: int, last: int) -> _Line:
 
 
 def _joined(lines: list[_Line], s: np.ndarray, lead: np.ndarray, within: float) -> list[_Line]:
-    """Neighbours made one where one line passes both."""
+    """Stretches, neighbours merged if one line fits both."""
     found: list[_Line] = []
     for line in lines:
         found.append(line)

@@ -7,14 +7,14 @@ Three relations are kept, each on its own evidence:
     UTC            lower envelope of arrival minus reported UTC, less `serial_latency_s`;
                    the system clock until a receiver has reported
 
-A device's own stamps are mapped by what its own reports say, whatever its date: a receiver that
-lives in the year 2100 is late by as much as any. UTC itself is another matter: it changes only when
-a plausible date has lasted for minutes, and with an event.
+A device's own stamps are mapped by its own reports, at any date: a receiver in the year 2100 has
+the same delay as any other. UTC itself changes only after a plausible date has lasted for minutes,
+and with an event.
 
 It is the only place that knows leap seconds and weeks: UTC is POSIX nanoseconds, a leap second
-repeats the second before, and shows here as a jump of UTC that is learnt again and counted.
+repeats the second before; it appears here as a jump of UTC, which is learnt again and counted.
 
-Host time is injected; with the same host time and the same calls the answers are the same.
+Host time is injected; with the same host time and the same calls the results are the same.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ the largest error (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 class Clock:
     """Converter of stamps to instants. `counters` names every refusal, guess and learnt value.
 
-    `on_event(code, text)` receives what happens to UTC, to the system clock and to the host;
-    `on_time` has every report by which the system clock may be set.
+    `on_event(code, text)` receives events of UTC, system clock and host; `on_time` receives every
+    report by which the system clock may be set.
     """
 
     def __init__(
@@ -307,8 +307,9 @@ class Clock:
         """Resume with UTC from an earlier process, before the first report; monotonic time must
         have continued without a pause. Old values are ignored.
 
-        Its first reports tell a new process UTC to 50 ms and more, alike for all fixes of the next
-        seconds: on a road a metre or two along the way, which no filter takes for what it is.
+        A new process knows UTC from the first reports to 50 ms or worse, with the same error for
+        all fixes of the next seconds: on a road a metre or two along the path, which no filter can
+        distinguish.
         """
         now_ns = self.now_ns()
         for each in known:
@@ -371,8 +372,8 @@ class Clock:
 
     @property
     def sets_others(self) -> bool:
-        """True if others may set a clock by `utc_ns`: a receiver has told UTC and there is no doubt
-        about it, or the system clock is configured to be what keeps it."""
+        """True if others may set a clock by `utc_ns`: a receiver has reported UTC without doubt, or
+        the system clock is configured as its reference."""
         if self._options.utc == "system":
             return True
         return self._reference is not None and self._utc[self._reference].settled

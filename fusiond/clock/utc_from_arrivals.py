@@ -2,21 +2,20 @@
 
     d_i = t_seen_i - utc_i = offset + delay_i,    delay_i >= its least value
 
-Lateness is one-sided and monotonic time does not jump, so the offset is the lower envelope of d,
-which rises by the allowed drift alone, however late reports come:
+Delay is one-sided and monotonic time does not jump, so the offset is the lower envelope of d, which
+rises by the allowed drift alone for any delay of reports:
 
     offset_i = min(d_i, offset_{i-1} + drift * (t_seen_i - t_seen_{i-1}))
 
-What the envelope cannot explain is a change of the source's UTC. It is seen in two ways:
+Anything else is a change of the source's UTC, recognised in two ways:
 
 * certain: a report before it was possible (UTC ahead); UTC that runs backwards or stands still in
   the source's own sequence (a serial line keeps its order, so no lateness does that); or a second
-  that is missing where leap seconds are. Three
-  reports over a second that agree are followed at once, by whole seconds where that is what they
-  say: the device's stamps have changed, and its measurements with them.
+  that is missing where leap seconds are. Three agreeing reports over a second are followed at once,
+  by whole seconds if they say so: the device's stamps have changed, and its measurements with them.
 * possible: reports later than the envelope by whole seconds, after reports were missing (without
-  that, the sequence shows that UTC went on). They are stamped as late, with a sigma as large as the
-  doubt, until it has lasted for two minutes.
+  that, the sequence shows that UTC went on). They are treated as delayed, with a sigma as large as
+  the doubt, until it has lasted for two minutes.
 
 UTC itself changes only after two minutes (`believed_offset_ns`): a receiver's mistake is no leap
 second.
@@ -70,7 +69,7 @@ class UtcKnown:
     """State of a source's UTC, for a later process on the same monotonic clock.
 
     `offset_ns` and `t_seen_ns` as of `UtcEnvelope`, `utc_ns` the UTC of its last report, `reports`
-    how many have told it. Raises pydantic's `ValidationError` for what no source can have told.
+    their number. Raises pydantic's `ValidationError` for impossible values.
     """
 
     source: Annotated[str, Field(min_length=1, max_length=64)]
@@ -198,14 +197,16 @@ class UtcEnvelope:
         return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _DELAY_NS
 
     def untrusted(self, utc_ns: int, t_seen_ns: int) -> None:
-        """A report that the device does not trust: all it can say is that UTC turned back."""
+        """Process a report that the device does not trust: it can only show that UTC turned
+        back."""
         if self._offset_ns is not None and self._turns_back(utc_ns, t_seen_ns):
             self._turned_back = True
 
     def slept(self, slept_ns: int) -> None:
-        """The host was suspended: monotonic time stood still, UTC did not.
+        """Account for a suspend: monotonic time stopped, UTC did not.
 
-        A hardware clock counts sleep in whole seconds, so the next reports are learnt from anew.
+        A hardware clock counts suspend in whole seconds, so the offset is learnt again from the
+        next reports.
         """
         if self._offset_ns is None:
             return
@@ -217,9 +218,10 @@ class UtcEnvelope:
         self._woke = True
 
     def update(self, utc_ns: int, t_seen_ns: int, *, plausible: bool = True) -> int:
-        """Take one report in; by how much `believed_offset_ns` has jumped with it, in ns.
+        """Add a report; return the jump of `believed_offset_ns`, in ns.
 
-        UTC of an implausible date maps the source's own stamps and is never believed.
+        UTC with an implausible date maps the source's own stamps and never changes
+        `believed_offset_ns`.
         """
         d = t_seen_ns - utc_ns
         self.plausible = plausible
@@ -329,7 +331,7 @@ class _Unsupported:
         self.after_gap = False
 
     def take(self, excess_ns: int) -> bool:
-        """Take another one in; False if it does not fit, and a new run begins with it."""
+        """Add another report; False if it does not fit and starts a new run."""
         if not -_AGREE_NS <= excess_ns - self.least_ns <= _SCATTER_NS:
             return False
         self.least_ns = min(self.least_ns, excess_ns)

@@ -1,1 +1,1 @@
-"""Configuration: schema, reading, mistakes told by key, and what it means in SI units."""
+"""Configuration: schema, reading, mistakes by key, conversion to SI units."""

@@ -1,4 +1,4 @@
-"""Sections `[aiding.NAME]`: how the filter uses what a source sends, in data sheets' units."""
+"""Sections `[aiding.NAME]`: use of a source's measurements in the filter, in data sheets' units."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Section(BaseModel):
 
 
 class Aiding(Section):
-    """Common options of aiding sections: place, how it is gated."""
+    """Common options of aiding sections: lever arm and gate."""
 
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """Body axes (forward, right, down), from the IMU to the device's reference point."""
@@ -224,8 +224,7 @@ class HeightAiding(Aiding):
 
 
 class BarometerAiding(Aiding):
-    """Height by the pressure of the air, with what is wrong with it as states; see
-    `docs/can-height.md`."""
+    """Height by air pressure, with states for its errors; see `docs/can-height.md`."""
 
     kind: Literal["barometer"] = "barometer"
     sd_m: PositiveFloat = 5.0

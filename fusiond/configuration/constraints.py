@@ -1,4 +1,4 @@
-"""Sections `[constraints.*]`: what the motion of the vehicle itself tells, without a sensor."""
+"""Sections `[constraints.*]`: measurements from the vehicle's motion, without a sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A configuration as text that a person goes on with: what was found and answered, and comments."""
+"""Draft of a configuration as text with comments, for a person to complete."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class DraftSource:
-    """A `[sources.NAME]`: driver, its options, and in words where it was found."""
+    """A `[sources.NAME]`: driver, options, and text on the place where it was found."""
 
     name: str
     driver: str

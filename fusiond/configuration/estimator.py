@@ -1,4 +1,4 @@
-"""Section `[estimator]`: which filter, which error state, how much history."""
+"""Section `[estimator]`: filter, error state, length of the history."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Mistakes of a configuration, in words: dotted key, value as written, what would do.
+"""Mistakes of a configuration as text: dotted key, value as written, remedy.
 
-Works on pydantic models and the data that was read for them; reads no file. Besides what pydantic
-refuses it refuses what pydantic would convert (`"100"` or `true` for a number) and nan and inf.
+Works on pydantic models and the data that was read for them; reads no file. Beyond pydantic's own
+checks it rejects values that pydantic would convert (`"100"` or `true` for a number), nan and inf.
 """
 
 from __future__ import annotations

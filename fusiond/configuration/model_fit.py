@@ -1,15 +1,14 @@
 r"""Fit of the model to the inertial sensor's errors.
 
-What a model has no state for is noise to it, so that it stays honest, at the price of its sigma:
-an accelerometer's bias (`fusiond.models.unmodelled_bias_noise`), scale factors while the vehicle
-turns and speeds up (`fusiond.navigation.crosstalk_noise`). The measure is a minute without
-measurements, t = 60 s, one sigma of the displacement; of scale factors a quarter turn, one sigma of
-the heading:
+An error without a state is noise to the model, which keeps sigma honest but larger: an
+accelerometer's bias (`fusiond.models.unmodelled_bias_noise`), scale factors while the vehicle turns
+and speeds up (`fusiond.navigation.crosstalk_noise`). The measure is a minute without measurements,
+t = 60 s, one sigma of the displacement; of scale factors a quarter turn, one sigma of the heading:
 
     an accelerometer bias b       b t^2 / 2
-    what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
+    what the model assumes         sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
     a gyro's scale factor s       s pi / 2
-    what a minute makes of it     n sqrt(t)
+    what the model assumes         n sqrt(t)
 
 N and n are the densities of velocity and attitude in the model, which represent such a bias. Every
 shipped model has gyro states. Only a ratio above `MATTERS` is reported.

@@ -39,7 +39,7 @@ class Gpsd(Served):
 
 
 class NmeaServed(Served):
-    """NMEA 0183 over TCP; what a receiver's sentences come in by is `[sources.NAME]`."""
+    """NMEA 0183 over TCP; a receiver's own sentences are configured in `[sources.NAME]`."""
 
     port: Port = 10110
     """Registered port of NMEA 0183."""

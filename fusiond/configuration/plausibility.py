@@ -16,9 +16,9 @@ VehicleClass = Literal["road", "rail", "marine", "aircraft"]
 class Plausibility(NamedTuple):
     """Ellipsoidal height (m), lowest and highest, and speed (m/s, horizontal as vertical).
 
-    `manoeuvre`: how it drives as a rule, which is no limit: one sigma (m/s^2) of its horizontal and
-    vertical acceleration, and for how long (s) one lasts. `hardest_m_s2`: the hardest that it
-    brakes or turns, horizontally: five sigma of what nobody watches.
+    `manoeuvre`: usual motion, which is no limit: one sigma (m/s^2) of its horizontal and vertical
+    acceleration, and the duration (s) of one. `hardest_m_s2`: the largest horizontal acceleration:
+    five sigma of an unobserved motion.
     """
 
     height_m: tuple[float, float]

@@ -206,7 +206,7 @@ class Source(BaseModel):
 
 
 class Config(Section):
-    """A vehicle. `sources` are devices, `aiding` says how the filter uses what they send."""
+    """A vehicle. `sources` are devices, `aiding` their use in the filter."""
 
     vehicle: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")] = "vehicle"
     vehicle_class: VehicleClass = "road"
@@ -238,7 +238,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _kind_from_name(cls, data: Any) -> Any:
-        """`[aiding.gnss]` needs no `kind`: the name says it."""
+        """Derive `kind` from the name: `[aiding.gnss]` needs none."""
         if isinstance(data, dict) and isinstance(data.get("aiding"), dict):
             aiding = {
                 name: {"kind": name, **value}

@@ -1,8 +1,8 @@
 """Noise and bias of a sensor class, as defaults until the data sheet is entered.
 
 Switch-on bias and scale are one sigma without a calibration by the owner, instability that of some
-minutes in a vehicle that warms up. Noise is the chip's: what the vehicle shakes into it is seen in
-the samples (fusiond.navigation.vibration).
+minutes in a vehicle that warms up. Noise is the chip's: vibration shows in the samples
+(fusiond.navigation.vibration).
 
 `consumer`: phones, OBD dongles, navigation modules (Bosch BMI160, ST LSM6DS3: zero-rate level 3 to
 10 deg/s, zero-g level 40 mg, cross-axis sensitivity 1 %). `mems`: industrial units, calibrated at

@@ -41,7 +41,7 @@ def imu_noise(imu: Imu) -> ImuNoise:
 
 
 def imu_range(imu: Imu) -> tuple[float, float]:
-    """Full scale of rate (rad/s) and force (m/s^2); infinite where none is configured."""
+    """Full scale of rate (rad/s) and force (m/s^2); infinite if none is configured."""
     rate, force = imu.gyro_range_deg_s, imu.accel_range_g
     return (
         math.inf if rate is None else rate * DEG,

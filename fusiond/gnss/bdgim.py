@@ -6,10 +6,10 @@ r"""Ionospheric delay by BDGIM, with BeiDou-3's nine coefficients from B-CNAV.
     N_nm  = sqrt((n - m)! (2 n + 1) (2 - [m = 0]) / (n + m)!)
     beta  = a_0 + sum_k (a_k cos w_k t + b_k sin w_k t),    w_k = 2 pi / T_k
 
-E elevation; H = 400 km, Re = 6378 km; phi', lambda' of the point where the ray pierces the layer,
-geomagnetic, the longitude from the sun's meridian; n, m are 0 to 2 for alpha, 3 to 5 for beta. t is
-the middle of the two hours that it is (MJD of BDT). VTEC is at least a part of alpha_1, as in the
-program of the model's authors: harmonics of degree 5 go below zero at night.
+E elevation; H = 400 km, Re = 6378 km; phi', lambda' of the point where the ray crosses the layer,
+geomagnetic, longitude from the sun's meridian; n, m are 0 to 2 for alpha, 3 to 5 for beta. t is the
+middle of the current two hours (MJD of BDT). VTEC is at least a part of alpha_1, as in the program
+of the model's authors: harmonics of degree 5 go below zero at night.
 
 Source: BDS-SIS-ICD-B1C-1.0 section 7.8, tables 7-10 to 7-12; floor of VTEC: Z. Li, N. Wang, program
 to the model, 2021; accuracy: Yuan, Wang, Li, Huo, Navigation 66 (2019), 55-69: three quarters of

@@ -6,44 +6,42 @@ gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
     P_b - P_a = (gamma - 1) I + code noise            L_a - L_b = (gamma - 1) I + constant
     I_code    = (P_b - P_a) / (gamma - 1),            A = (s_a^2 + s_b^2) / (gamma - 1)^2
 
-so the carriers say to millimetres how I changes, the codes what it is: a filter of one state,
+so the carriers give the change of I to millimetres, the codes its value: a filter of one state,
 
     I <- I + d(L_a - L_b) / (gamma - 1),     K = V / (V + R),  R = A max(1, 2 tau / dt)
     I <- I + K (I_code - I),   V <- (1 - K) V
 
-with tau for how long multipath lasts: codes closer together are not worth more. The first epoch has
-V = A: the ionosphere-free pair. I errs with the code of the epoch, by which it is then subtracted
-from P_a: V / A of what it knows is of this epoch, so twice (V / A) s_a^2 / (gamma - 1) is added
-(exact for the pair: s_a^2 + 2 s_a^2 / (gamma - 1) + A = (gamma^2 s_a^2 + s_b^2) / (gamma - 1)^2).
-The codes also show the receiver's noise, as they part from the delay that the carriers keep: with
-nu = I_code - I, each worth w = min(dt / 2 tau, 1) of an independent one,
+with tau the correlation time of multipath, within which codes are not independent. The first epoch
+has V = A: the ionosphere-free pair. The error of I is correlated with the epoch's code, from which
+it is subtracted: V / A of its information comes from this epoch, so twice (V / A) s_a^2 / (gamma -
+1) is added (exact for the pair: s_a^2 + 2 s_a^2 / (gamma - 1) + A = (gamma^2 s_a^2 + s_b^2) /
+(gamma - 1)^2). The codes also show the receiver's noise by their difference from the carriers'
+delay: with nu = I_code - I, each counting w = min(dt / 2 tau, 1) of an independent one,
 
     scale^2 = (20 + sum w nu^2 / (A + V)) / (20 + sum w)
 
 multiplies the model's variances of multipath and thermal noise, here and in the ranges.
 
-Neither depends on where the receiver is; what it delays between bands is left in I.
+Neither depends on the receiver's position; its delay between bands remains in I.
 
-What an epoch has of a carrier that is followed is L_a, its variance s_L^2, and for how long it has
-been followed since the satellite's epoch before: ways from an anchor epoch are made of that
-(fusiond.aiding.carrier_anchor). s_L by a model of C/N0 and a scale, learned in the same way from
+Of a tracked carrier an epoch has L_a, its variance s_L^2, and the tracking time since the
+satellite's epoch before; paths from an anchor epoch are made of these
+(fusiond.aiding.carrier_anchor). s_L is by a model of C/N0 and a scale, learned in the same way from
 d(L_a - L_b) of variance 2 (s_La^2 + s_Lb^2).
 
-The carrier tells of a reflection, too: what a code is longer than its carrier, d = P_a - L_a,
-changes by 2 dI in itself, millimetres a second. With D its mean over the last `MEANS_S` while the
-carrier is followed, m seconds long at first, and s^2 (1 + 1 / m) the variance of d - D, s^2 that of
-a code by the model and a scale that the receiver's own d show (over a slip, which changes D, too,
-by the Dopplers),
+The carrier shows reflections, too: code minus carrier, d = P_a - L_a, changes only by 2 dI,
+millimetres a second. With D its mean over the last `MEANS_S` of tracking, m seconds long at first,
+and s^2 (1 + 1 / m) the variance of d - D, s^2 that of a code by the model and a scale learned from
+d (over a slip, which changes D, too, by the Dopplers),
 
     d - D > 4 s    `multipath`, until d - D < 2 s, two minutes at most
     d - D < -4 s   D was too long
 
-A code that comes by a wall is longer, never shorter: what falls back shows that it was.
+A reflected code is longer, never shorter: a fall shows that it was reflected before.
 
-Refused, of each satellite: `multipath`, all of it; of its carrier alone: `lock_lost` (the receiver
-says so), `cycle_slip` (the carriers part by
-more than the ionosphere can, or the rate is not that of the Dopplers); of all at once:
-`clock_jump`.
+Rejections. Of a satellite: `multipath`; of its carrier alone: `lock_lost` (reported by the
+receiver), `cycle_slip` (the carriers diverge by more than the ionosphere can, or the rate differs
+from the Dopplers); of all carriers at once: `clock_jump`.
 
 Source: Hatch, Proc. 3rd Int. Geodetic Symposium on Satellite Doppler Positioning (1982); Groves,
 2nd edition, 9.2.7 and 9.3.3; van Graas and Soloviev, Navigation 51 (2004), 277-292.
@@ -201,9 +199,8 @@ def _has_multipath(
     scale: float,
     seen: Array,
 ) -> bool:
-    """True if the code has gone from its carrier of that `length` (m), which has `slipped` by so
-    much (m; NaN: nobody knows). Adds to the sums of what has been `seen` of codes beside their
-    carriers."""
+    """True if the code has diverged from its carrier of `length` (m), which has `slipped` (m; NaN:
+    unknown). Adds to the sums `seen` of code minus carrier."""
     beside, model = first[P_A] - length, _code_variance(first[CNO], first[SD_A], 1.0)
     state[_BESIDE] -= slipped
     if state[_MANY] == 0.0 or math.isnan(beside) or math.isnan(state[_BESIDE]):
@@ -265,7 +262,7 @@ def follow(
     out: Array,
     refused: npt.NDArray[np.int64],
 ) -> int:
-    """Take in an epoch at `now` (s); whether the clock jumped. `kept` (SLOTS, 12) is changed;
+    """Process an epoch at `now` (s); True if the clock jumped. `kept` (SLOTS, 12) is changed;
     `plan` (n, 8), `first` (n, 7), `second` (n, 5); writes `out` (n, 6) and `refused` (n,)."""
     n = plan.shape[0]
     scale, phases, codes = _shown(kept, _SUM), _shown(kept, _PHASES), _shown(kept, _CODES)

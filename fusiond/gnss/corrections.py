@@ -1,17 +1,17 @@
 r"""Corrections of a service to broadcast orbits and clocks: their validity and their sigma.
 
-A satellite is corrected when there are, of one solution and none too old,
+A satellite is corrected if one solution has, none of them too old,
 
-    its orbit, of an ephemeris that is held and healthy;  its clock;  a bias of the signal
+    its orbit, for a stored and healthy ephemeris;  its clock;  a bias of the signal
 
-as a clock is only one with the biases that it was made with: P + bias takes the place of the
-broadcast group delay. A correction serves for three of its intervals, and for 30 s at least, 180 s
-at most: one or two may be lost. (Biases change in days: an hour.)
+as a clock is only valid with its own biases: P + bias replaces the broadcast group delay. A
+correction is valid for three of its intervals, 30 s at least and 180 s at most, so one or two may
+be lost. (Biases, which change in days: an hour.)
 
     sigma^2 = max(0.15 m, what the service states)^2 + (1 mm/s age)^2
 
-Clocks of a service have their own zero, often metres from the broadcast one. So a system goes by
-corrections as a whole or not at all: where half of its satellites have them, the others are
+Clocks of a service have their own zero, often metres from the broadcast one. So a system uses
+corrections as a whole or not at all: if half of its satellites have them, the others are
 `no_correction`.
 
 Source: RTCM 10403.3, 3.5.12; quality of real-time orbits (5 cm) and clocks (0.3 ns): IGS Real-Time

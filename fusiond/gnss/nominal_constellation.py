@@ -1,6 +1,6 @@
 r"""Nominal BeiDou-3 and GPS constellations: broadcast ephemerides from orbit parameters.
 
-In axes that stand still and coincide with the Earth's at `EPOCH_S`, tau = t - EPOCH_S:
+In inertial axes that coincide with the Earth's at `EPOCH_S`, tau = t - EPOCH_S:
 
     node(tau) = node_0 + node' tau                  argument of latitude  u(tau) = u_0 + n tau
     n = sqrt(mu / a^3)        node' = -3/2 n J2 (R / a)^2 cos i / (1 - e^2)^2
@@ -15,8 +15,8 @@ Rx(-5 deg) from the axes of the broadcast elements, where the equatorial orbit i
 
 a (m) semi-major axis, e eccentricity, i inclination, omega argument of perigee, toe (s) reference
 time. Perigees do not turn. Harmonic corrections and clocks are fixed numbers of the usual size,
-other ones for each satellite. Two ephemerides of one satellite give the same orbit, to rounding.
-The orientation among the stars, and so the sky over a place at a date, is not the real one.
+different for each satellite. Two ephemerides of one satellite give the same orbit, to rounding. The
+orientation among the stars, and so the sky over a place at a date, is not the real one.
 
 Source: BDS-SIS-ICD-B1I-3.0 sections 3.1 and 5.2.4.12 (24 MEO on Walker 24/3/1 at 27906.1 km, 3 GEO
 at 80, 110.5 and 140 deg E); IGSO node 118 deg E: Yang et al., Satellite Navigation 1 (2020) 1; GPS

@@ -14,8 +14,8 @@ r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
 tk = t - toe, t the system time of transmission; R(x) are rotations of the axes. Velocity and clock
 drift are the derivatives of these lines by t; Edot = (n + n' tk) / (1 - e cos E) carries all.
 Angles rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS
-agree to centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv);
-the relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
+agree to centimetres). A transmission at t_sv by the satellite's clock was at t = t_sv - dt(t_sv);
+the relativistic term is neglected in this one step: 50 ns move a satellite 0.2 mm.
 
 A service's corrections (fusiond.gnss.corrections), dO of the orbit and dC of the clock, at the age
 a = t - t0 of each:
@@ -23,8 +23,8 @@ a = t - t0 of each:
     s <- s - [er ea ec] (dO + dO' a),     ea = v / |v|,  ec = s x v / |s x v|,  er = ea x ec
     dt <- dt + (C0 + C1 a + C2 a^2) / c
 
-BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
-time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.
+BeiDou's time is 14 s behind GPS time, which only this module handles: `Orbits` takes GPS time, and
+toe and toc are converted to GPS time on input; `we toe` keeps the system's own toe.
 
 Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4
 (ephemeris parameters, with the rotation for GEO); BDS-SIS-ICD-B1C-1.0 7.7 (Adot and n', which

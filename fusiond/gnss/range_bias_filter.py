@@ -1,19 +1,19 @@
 r"""Constant range bias of each satellite while it is tracked.
 
-Of the errors e_k of `Rows.lasting` variance L the mean over the sky is a displacement or the
-clock's (fusiond.gnss.range_error_displacement); what of e_k is not shows in the innovations nu, for
-the others bound the place. Of each satellite a filter of one state
+The mean over the sky of the errors e_k, of `Rows.lasting` variance L, is a displacement or a clock
+error (fusiond.gnss.range_error_displacement); the rest of e_k shows in the innovations nu, as the
+other satellites bound the position. For each satellite a filter of one state
 
     V <- min(V + max(L_before - L, 0) + 2 L dt / tau, L)             r, V = 0, L of a fresh one
     nu = mean of its system's z less z_k,   R = c (w + u P u^T),   c = max(1, 2 T / dt)
     K = f V / (f^2 V + R),   r <- r + K nu,   V <- (1 - K f) V,   f = 1 - its weight in the mean
 
-z_k is what the filter predicts less the range with r taken off, so that nu is what r lacks; w the
-variance of what does not last, u P u^T the place's; T for how long multipath lasts, tau orbit
-errors. r is taken off the range, and V in place of L is left of its variance. So a satellite that
-stays alone keeps the information that it had among others. L falls where its two carriers learn the
-delay, since that changes e_k. An innovation beyond three sigma is not used, and the mean is without
-it, the farthest first.
+z_k is the filter's prediction minus the range with r subtracted, so that nu is the error of r; w
+the variance of errors that do not last, u P u^T that of the position; T the correlation time of
+multipath, tau that of orbit errors. r is subtracted from the range, and V replaces L in its
+variance. So a satellite that remains alone keeps the information that it had among others. L falls
+as its two carriers determine the delay, since that changes e_k. Innovations beyond three sigma are
+excluded, also from the mean, the largest first.
 
 Source: Groves, 2nd edition, 3.2 and 9.4.4.
 """
@@ -125,8 +125,9 @@ _NONE = np.zeros(0)
 
 
 class RangeBiases(NamedTuple):
-    """An epoch at `t_s`: levels (SLOTS, 4) before it, r and V (n,) of its `rows`, and where it may
-    teach: what its measurement will have `seen` of the filter, z and the place's variances (n,)."""
+    """Epoch at `t_s`: levels (SLOTS, 4) before it, r and V (n,) of its `rows`, and the filter's
+    data `seen` by its measurement, z and the position's variances (n,), for the update of the
+    levels."""
 
     t_s: float
     before: Array

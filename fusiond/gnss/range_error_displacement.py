@@ -1,39 +1,38 @@
 r"""Displacement of the antenna's position by slowly varying range errors.
 
-Errors of orbits, clocks, group delays and of what is left of the ionosphere last for many minutes,
-each satellite's its own: e_k of variance v_k; others are one number for the whole sky, s_k n. A
-filter that takes e for white and n for another one at each epoch solves place and clock with the
-weights of an epoch, R + S S^T, and what it finds of them is off, for as long as they last, by
+Errors of orbits, clocks, group delays and the residual ionosphere last for many minutes, different
+for each satellite: e_k of variance v_k; others are common to the whole sky, s_k n. A filter that
+treats both as new at each epoch solves for position and clock with the weights of an epoch, R + S
+S^T, and its solution has the lasting error
 
     b = G (e + S n),     G = first three rows of (A^T R^-1 A + L)^-1 A^T R^-1,   A = [H  S]
     B = cov(b) = G V G^T + (G S)(G S)^T,      b = K t,  K = B^1/2 symmetric,  t ~ N(0, I)
 
 H = [-u 1_system], u unit vectors to the satellites north, east, down, R the variance of a range
-with what lasts, L what else knows of place (30 m), of the errors that all share (their unit
-variance), and of the clock: nothing does. Its offset is solved of the same ranges, so that delay of
-a whole sky goes into clock and height together. With a clock known to 1 m half of it cancels: low
-satellites, which are longer, lift the place that a later clock sinks (10 satellites with 1 m of
-ionosphere unknown at the zenith: 0.9 m downwards for 2.3). So u . K t is the part of the errors
-that looks like a displacement: all of it with four satellites, whose geometry makes much of little,
-and little with thirty.
+including lasting errors, L the prior information on position (30 m), on common errors (their unit
+variance), and none on the clock. Its offset is solved from the same ranges, so that a delay of the
+whole sky enters clock and height together. With a clock known to 1 m half of it would cancel: the
+longer ranges of low satellites raise the position, a later clock lowers it (10 satellites with 1 m
+of unknown ionosphere at the zenith: 0.9 m downwards instead of 2.3). So u . K t is the part of the
+errors that acts as a displacement: all of it with four satellites, whose geometry amplifies it, and
+little with thirty.
 
-Where the sky changes, a before and b after, the displacement is what it was, and more comes by what
-satellites' levels (fusiond.gnss.range_bias_filter) do not know of their errors, V_k,
+If the sky changes, a before and b after, the displacement stays and grows by the unknown part V_k
+of the satellites' levels (fusiond.gnss.range_bias_filter),
 
     K_b t_b = K_a t_a + sum_k (G_b,k - G_a,k) eps_k + (G_b S'_b - G_a S'_a) n,    var(eps_k) = V_k
 
-with the gains G by V_k + (0.2 m)^2, 0 of a satellite that is not there, and S' = S (V / v)^1/2:
-what levels know they know of what all share, too. Here the clock is known, for it is that of the
-sky before, from which it has gone a metre. That holds as far as levels know. A satellite that comes
-for the first time, or of which two carriers have learned the delay, has errors that nothing has
-told of yet, and its sky is off by others: with C = cov(b_b, b_a) of the gains of K,
+with the gains G by V_k + (0.2 m)^2, 0 for an absent satellite, and S' = S (V / v)^1/2: levels also
+contain the common errors. Here the clock is known, to a metre, from the sky before. This holds if
+levels are known. A new satellite, or one whose delay two carriers have just determined, has unknown
+errors, and its sky has another displacement: with C = cov(b_b, b_a) of the gains of K,
 
     C = G_b E G_a^T + (G_b S_b) (G_a S_a)^T,  E the lesser v_k of both,  b_b = C B_a^-1 b_a + w
 
-in the part of it that is the larger of the fresh satellites' share and of V / v in the mean. As
-long as b_b = b_a alone stood here, a place that four satellites began kept their sigma for half an
-hour, whatever came. A filter that lets K grow and adds nothing solves
-t of how the ranges part when satellites go, and is sure of a place that it does not know.
+weighted by the larger of the fresh satellites' share and the mean V / v. With b_b = b_a alone, a
+position started by four satellites kept their sigma for half an hour under any later sky. A filter
+that lets K grow without added noise estimates t from the changes of ranges when satellites
+disappear, and is too sure of its position.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
 """
@@ -210,8 +209,8 @@ class Displacement(NamedTuple):
     """Displacement by a sky at `t_s` (GPS time): `effect` (3, n + 2) of its satellites and of the
     two common errors, `variance` (n,) m^2 of unknown lasting errors, `root` (3, 3) K and `back` (3,
     3) its inverse, m, `shape` (3, 3) K by the sigmas of the filter's states; `gain` (3, n + 2) as
-    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors; by satellite what
-    lasting errors (m^2) and common one (m) its place was told with, and who is `fresh`."""
+    `effect`, with the weights of K, `lasting` (n,) m^2 of all lasting errors; by satellite the
+    lasting (m^2) and common (m) errors used for its position, and `fresh` ones."""
 
     t_s: float
     satellites: tuple[str, ...]

@@ -4,10 +4,9 @@ r"""Range and range rate equations of an epoch, for all satellites at once.
     P + c (dt - d) - T - I = rho + b_system + noise
     D (1 + l . v_i / c) + c ddt = l . (v - v_r) + d + noise,    v_i = v + we x s
 
-Of a satellite with two carriers I is what they measure (fusiond.gnss.carrier_phase), of variance V,
-up to an offset that its system's signals share (what the receiver delays one band more than the
-other). With I0 the model's delay, p the part of it that is not known, of satellite k, over
-those of its group
+For a satellite with two carriers I is measured by them (fusiond.gnss.carrier_phase), with variance
+V, up to an offset common to its system's signals (the receiver's delay between the bands). With I0
+the model's delay, p its unknown share, and sums over the satellites k of its group
 
     B   = sum w_k (I_k - I0_k) / sum w_k,       w_k = 1 / (V_k + p^2 I0_k^2)
     M   = sum w_k I0_k / sum w_k
@@ -15,10 +14,10 @@ those of its group
     s^2 = p^2 (I0 - M)^2 + (0.3 p I0)^2
     var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) p (I0 - M)
 
-for with B known a model that is too strong or too weak errs by p (I0 - M), and by 0.3 p I0 from
-place to place in the sky. A group are the signals of one carrier of GPS, Galileo, BeiDou-3 or
-BeiDou-2; one without pairs has B = 0. So a satellite with one carrier, or a fresh one, has its
-delay of the model, at the level that the others measure.
+as with known B a model that is too strong or too weak has the error p (I0 - M), and 0.3 p I0 from
+direction to direction. A group is the signals of one carrier of GPS, Galileo, BeiDou-3 or BeiDou-2;
+without pairs B = 0. So a satellite with one carrier, or a new one, has the model's delay at the
+level that the others measure.
 
 s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
 of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive while the
@@ -26,14 +25,14 @@ distance grows); dt, ddt the satellite's clock offset and drift, d the signal's 
 troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
 D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
 
-A carrier is a range but for a constant: its length less T, more I0 (a phase is early by what a code
-is late), with the satellite's clock, without group delay.
+A carrier is a range plus a constant: its length minus T, plus I0 (a phase is advanced as much as a
+code is delayed), with the satellite's clock, without group delay.
 
 r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
 
-Variances: see `fusiond.gnss.ranges`. `LASTING` is what of a range's lasts for many minutes and is
-this satellite's own: orbit, clock and group delay, what is left of the ionosphere from place to
-place, and what its two carriers know of it.
+Variances: see `fusiond.gnss.ranges`. `LASTING` is the variance of errors that last for many minutes
+and belong to one satellite: orbit, clock, group delay, the local residual of the ionosphere, and
+the error of its two carriers' delay.
 """
 
 from __future__ import annotations
@@ -185,11 +184,11 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (30, n) values of satellites as a receiver has them.
+    """Write (30, n) values of the satellites in the receiver's order.
 
     `SLOT` and `ISSUE` are the plan's and stay. `receiver` (3,) ECEF m, at GPS time `week`, `tow` of
-    its clock; returns how many satellites are lower than `least_elevation` (rad) or weaker than
-    `least_cno` (dB Hz).
+    its clock; returns the number of satellites below `least_elevation` (rad) or `least_cno` (dB
+    Hz).
 
     `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carrier_phase, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the

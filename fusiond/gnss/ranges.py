@@ -1,28 +1,28 @@
-r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how good each row is.
+r"""Corrected pseudoranges and rates of an epoch with their variances.
 
     sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2 + s_sis^2 + s_d^2
-                     + what carriers leave of the ionosphere + (0.3 s_I)^2
+                     + ionosphere left by carriers + (0.3 s_I)^2
     sigma^2(rate)  = (r m)^2 + s_rx^2
     common to all ranges: s_I n_1 + 0.12 m n_2 + s_2 n_3,   n ~ N(0, 1)
 
 m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zenith and b thermal
 noise at 45 dB-Hz (m), s_rx what the receiver states, s_sis orbit and clock, s_d the group delay
-left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
+left; r (m/s). If a receiver states none, C/N0 or s_rx is omitted.
 
-s_I is what is not known of the ionosphere: half the modelled delay, or 5 m m without a model, of a
-satellite with one carrier; of one with two what `fusiond.gnss.range_kernel` leaves of it. 0.12 m is
-the troposphere left, s_2 what a receiver delays BeiDou-2 more than BeiDou-3. These are not noise:
-a model is too strong or too weak for the whole sky and for hours. So each has a column of its own,
-to be used as one more unknown with unit variance (as `fusiond.gnss.single_point` does), or as a
-state of a filter; 0.3 of s_I stand for what differs from satellite to satellite.
+s_I is the unknown part of the ionosphere: with one carrier half the modelled delay, or 5 m m
+without a model; with two the residual of `fusiond.gnss.range_kernel`. 0.12 m is the residual
+troposphere, s_2 the receiver's delay of BeiDou-2 relative to BeiDou-3. These are not noise: a model
+is too strong or too weak for the whole sky and for hours. So each has a column of its own, an
+unknown with unit variance (as in `fusiond.gnss.single_point`) or a state of a filter; 0.3 s_I is
+the part that differs between satellites.
 
-a and b are those of `RangeNoise` until the codes of satellites with two carriers have shown what
-this receiver's are (`fusiond.gnss.carrier_phase`).
+a and b are those of `RangeNoise` until satellites with two carriers have shown this receiver's
+(`fusiond.gnss.carrier_phase`).
 
-Which signals of a satellite serve: `fusiond.gnss.signal_choice`.
+Choice of a satellite's signals: `fusiond.gnss.signal_choice`.
 
 Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`, `multipath` (the
-code has gone from its carrier); of carriers, which then wait for a new anchor, `lock_lost`,
+code has diverged from its carrier); of carriers, which then wait for a new anchor, `lock_lost`,
 `cycle_slip`, and of all at once `clock_jump`.
 """
 
@@ -91,17 +91,17 @@ class _Of:
 class Rows:
     """Usable data of an epoch, n rows; ECEF is the frame of the instant of reception.
 
-    `pseudorange_m` and `rate_m_s` (n,) corrected, so that range + clock offset of the receiver and
-    its rate are left (NaN where no rate was measured); `position` and `velocity` (n, 3) of the
-    satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
-    that was assumed; `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use;
-    `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
-    independent, `common` (n, 3) what a common error of one sigma adds (ionosphere, troposphere,
-    BeiDou-2), `total_variance` (n,) of both; `carrier_m` (n,) the carrier as a range but for a
-    constant, NaN where there is none, followed for `span_s` (n,); `troposphere_m` and
-    `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
-    `lasting` (n,) m^2 what of `variance` lasts for many minutes.
-    `values` (30, n) has all of them, as `range_kernel.range_rows` writes it.
+    `pseudorange_m` and `rate_m_s` (n,) corrected, to range + clock offset of the receiver and its
+    rate (NaN without a measured rate); `position` and `velocity` (n, 3) of the satellites;
+    `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the assumed receiver;
+    `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use; `measured_at` (n,)
+    into the epoch's signals; `variance` and `rate_variance` (n,) of independent errors, `common`
+    (n, 3) the effect of one sigma of each common error (ionosphere, troposphere, BeiDou-2),
+    `total_variance` (n,) of both; `carrier_m` (n,) the carrier as a range plus a constant, NaN
+    without one, tracked for `span_s` (n,); `troposphere_m` and `ionosphere_m` (n,) have been
+    subtracted; `refused` pairs of satellite and reason. `lasting` (n,) m^2 the part of `variance`
+    that lasts for many minutes. `values` (30, n) has all of them, as `range_kernel.range_rows`
+    writes it.
     """
 
     satellites: tuple[str, ...]

@@ -75,12 +75,12 @@ class RangeNoise:
     """One sigma of the terms above.
 
     `multipath_m`: RTCA DO-229D J.2.4 has 0.13 + 0.53 exp(-E / 10 deg) m on an aircraft; a vehicle
-    stands between walls. `thermal_m`: code tracking of a 1 Hz loop at 45 dB-Hz (Groves 9.3.3).
-    With both and the receiver's own sigma the residuals of a walk with a hand-held antenna in the
-    open have 0.19 of the expected mean square: conservative, as errors there last for minutes.
+    drives between walls. `thermal_m`: code tracking of a 1 Hz loop at 45 dB-Hz (Groves 9.3.3). With
+    both and the receiver's own sigma the residuals of a walk with a hand-held antenna in the open
+    have 0.19 of the expected mean square: conservative, as errors there last for minutes.
     `rate_m_s`: oscillator and walking antenna; 0.02 m/s are the signal's own at 45 dB-Hz.
     `ionosphere_share`: a Klobuchar model takes out at least half (IS-GPS-200N 20.3.3.5.2.5);
-    without one 5 m at the zenith, an afternoon of an active sun at middle latitudes.
+    without a model 5 m at the zenith, as on an afternoon of an active sun at middle latitudes.
     """
 
     multipath_m: float = 0.5
@@ -353,9 +353,9 @@ def _by_bias(applied: CorrectedEphemeris, signal: str) -> GroupDelay:
 
 
 def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:
-    """Rows of the plan with the numbers of their groups. What a receiver delays one carrier more
-    than another is in the clock where satellites with two carriers settle it: a satellite with
-    one, on another carrier than theirs, does not know it."""
+    """Rows of the plan with the numbers of their groups. The receiver's delay between carriers is
+    part of the clock, if satellites with two carriers determine it; a satellite with one other
+    carrier does not share it."""
     numbers: dict[tuple[System, bool, str], int] = {}
     paired: dict[tuple[System, bool], set[str]] = {}
     for s in chosen:

@@ -1,15 +1,15 @@
-r"""Least-squares position, velocity and clocks from one epoch: no filter, no past.
+r"""Least-squares position, velocity and clocks from a single epoch.
 
     y - rho(x) = H [dr, b, n] + noise,   H = [-l, clock columns, S],   n ~ N(0, I)
     dx = N^-1 H^T W (y - rho),   N = H^T W H + diag(0, .., 0, 1, 1, 1)
 
-l (n, 3) lines of sight, one clock offset per system that is there, W = 1 / sigma^2; S n is what the
-models of ionosphere and troposphere leave in the whole sky, and BeiDou-2's offset, known beforehand
-to their sigmas (`fusiond.gnss.ranges.Rows.common`). Iterated until the
-step is under 1 mm, from the earth's centre if nothing better is known. Velocity and drift the same
-way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and |n|^2,
-against chi^2 with as many degrees of freedom as there are rows more than positions and clocks;
-while it fails, the row with the largest normalised residual
+l (n, 3) lines of sight, one clock offset for each present system, W = 1 / sigma^2; S n is the
+residual of ionosphere and troposphere common to the whole sky, and BeiDou-2's offset, with priors
+of their sigmas (`fusiond.gnss.ranges.Rows.common`). Iterated until the step is under 1 mm, from the
+earth's centre if nothing better is known. Velocity and drift the same way from the rates, with one
+drift. Residual test: the sum of squares over sigma^2, and |n|^2, against chi^2 with as many degrees
+of freedom as there are rows more than positions and clocks; while it fails, the row with the
+largest normalised residual
 
     w_k = r_k / sqrt(S_kk),   S = W^-1 - H N^-1 H^T
 
@@ -119,9 +119,9 @@ class _Fit(NamedTuple):
 def single_point(
     model: RangeModel, epoch: RawGnssEpoch | TrackedSignals, guess: Array | None = None
 ) -> SinglePoint | str:
-    """Solve one epoch; `too_few`, `geometry` or `diverged` names why there is none.
+    """Solve one epoch; `too_few`, `geometry` or `diverged` if there is no solution.
 
-    `guess` (3,) ECEF m: where the receiver is about.
+    `guess` (3,) ECEF m: approximate position of the receiver.
     """
     followed = epoch if isinstance(epoch, TrackedSignals) else model.followed(epoch)
     position = np.zeros(3) if guess is None else np.array(guess, float)

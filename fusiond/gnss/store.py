@@ -1,11 +1,11 @@
-"""Broadcast ephemerides by satellite: which one holds now, or why none does.
+"""Broadcast ephemerides by satellite: choice of the valid one, or the reason for none.
 
     |t - toe| <= limit        t, toe in GPS time
 
-The closest toe is taken. A satellite keeps its last issues, so at a changeover a late measurement
-still meets the older one. A number that is given to another satellite shows in an orbit that no
-satellite can go over to: what the old one sent is forgotten then. Health is what the satellite said
-last, whatever issue is used.
+The closest toe is used. The last issues of a satellite are stored, so that a delayed measurement at
+a changeover still has the older one. A number given to another satellite shows by an impossible
+change of orbit: data of the old one are then dropped. Health is the satellite's last statement, for
+any issue.
 
 Outcomes: `no_ephemeris`, `unhealthy`, `stale_ephemeris`.
 """
@@ -127,7 +127,7 @@ class EphemerisStore:
     def corrected(
         self, system: System, prn: int, week: int, tow_s: float
     ) -> CorrectedEphemeris | None:
-        """The ephemeris with the correction that holds at a GPS time; None where there is none."""
+        """Ephemeris with the correction valid at a GPS time; None without one."""
         issue = self.corrections.issue(system, prn, week, tow_s)
         if issue is None:
             return None

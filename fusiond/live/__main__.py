@@ -22,7 +22,8 @@ none."""
 
 
 def main(path: Path, record: Path | None = None) -> None:
-    """Serve until SIGTERM. A mistake in the configuration is told on standard error; exits 78."""
+    """Serve until SIGTERM. A mistake in the configuration goes to standard error, with exit status
+    78."""
     gc.set_threshold(COLLECT_AFTER_IMPORTS)
     from fusiond.configuration.load import EXIT_CONFIG, ConfigError, load_config  # noqa: PLC0415
 

@@ -118,10 +118,11 @@ class Chain:
             self._on_outcome(entry)
 
     def may_wait(self, t_ns: int) -> bool:
-        """True if a tick at `t_ns`, whose solution nobody reads, may leave its samples to the next.
+        """True if a tick at `t_ns` without a reader of its solution may leave its samples to the
+        next.
 
-        The filter's state does not depend on how many samples come at once. What is decided in a
-        tick does: so nothing but samples has come, and the vehicle navigates.
+        The filter's state does not depend on the number of samples at once, but decisions of a tick
+        do: so a tick may wait only if nothing but samples has arrived and the vehicle navigates.
         """
         sources = self.sources
         return (

@@ -142,7 +142,8 @@ class Daemon:
             output.publish(EVENT, message)
 
     async def reload_when(self, again: asyncio.Event, read: Callable[[], Config]) -> None:
-        """`reload` whenever `again` is set, until cancelled; what is set meanwhile counts once."""
+        """Call `reload` whenever `again` is set, until cancelled; several settings during a reload
+        count once."""
 
         async def wait() -> None:
             while True:
@@ -153,8 +154,8 @@ class Daemon:
         await supervise("reload", wait, partial(self._events.report, "daemon", "reload_fault"))
 
     async def reload(self, read: Callable[[], Config]) -> None:
-        """Take outputs, gates and log level from the configuration that `read` gives; a mistake in
-        it changes nothing. What came of it is told as events."""
+        """Apply outputs, gates and log level of the configuration from `read`; a mistake in it
+        changes nothing. Events report the result."""
         self.service.reloading()
         try:
             await self._reload(await asyncio.to_thread(read))
@@ -295,9 +296,9 @@ def run_daemon(
     read: Callable[[], Config],
     missing: Sequence[Callable[[], None]] = (),
 ) -> None:
-    """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
-    gives then. The `missing` kernels are compiled first. Exits 78 if the configuration leaves
-    nothing to run."""
+    """Run until SIGTERM or SIGINT; SIGHUP applies the reloadable part of the configuration from
+    `read`. The `missing` kernels are compiled first. Exits 78 if the configuration leaves nothing
+    to run."""
     written = handler()
     logging.basicConfig(level=logging.INFO, handlers=[written])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open

@@ -107,7 +107,7 @@ class Front:
         log.info("compiled %d of %d kernels in %.0f s", compiling.done, compiling.total, spent_s)
 
     async def close(self) -> None:
-        """Say farewell: nobody is to follow."""
+        """Close the services; no successor follows."""
         self.service.stopping()
         await self.output_tasks.stop()
         self.service.close()

@@ -1,9 +1,9 @@
 """Schedule of the cyclic garbage collector, which runs in the slack after a tick.
 
-A collection costs what its generation holds: some 0.1 us an object. CPython begins one by how many
-more objects were made than went; a daemon whose queues are full makes as many as go, so that count
-stands still while the youngest generation grows, to 50,000 objects and 0.1 s where it was measured.
-Here they go by time: what one tick has made is looked through after it, while it is little.
+A collection takes some 0.1 us for each object of its generation. CPython starts one when many more
+objects were made than freed; a daemon with full queues makes as many as it frees, so the count
+stays while the youngest generation grows, to 50,000 objects and 0.1 s when measured. Here
+collections are timed: the few objects of a tick are examined after it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Faults put in on purpose: `cmd/inject` falsifies what a source sends, and says so.
+"""Injected faults: `cmd/inject` falsifies a source's data and reports it.
 
 It stands between drivers and clock, so that all later parts treat the fault like a real one. Its
 effect depends only on command and input: a recording of both reproduces it.

@@ -1,7 +1,7 @@
-"""A limit of the log's lines: of one cause a few a minute, then how many there were.
+"""Rate limit of the log: a few lines a minute for one cause, then their number.
 
-A cause is the event's source and code, or else the place in the code that logs: what the line says
-beside that may change with every line. Errors are no exception: a storm of tracebacks fills a disk.
+A cause is the event's source and code, or the place in the code that logs; the rest of the line may
+vary. Errors are no exception: a storm of tracebacks fills a disk.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class LogLimit(logging.Filter):
         self.left_out = 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """True if the record is to be written; one that is written after others were left out says
-        so. Whoever asks for less than `info` wants all of it."""
+        """True if the record is to be written; one after omitted records states their number. Below
+        level `info` nothing is omitted."""
         if record.levelno < logging.INFO:
             return True
         now_s = self._now()

@@ -1,4 +1,4 @@
-"""Short messages on disk: those that wait and those that nobody was told outlive the process.
+"""Short messages on disk: waiting and unreported ones outlive the process.
 
 Written after each change, in a thread and atomically; later changes are written next. The sender of
 a message gets the reply when it is on disk.

@@ -1,4 +1,4 @@
-"""Short messages of the RDSS terminals: posted, reported, told to whoever listens.
+"""Short messages of the RDSS terminals: queues, position reports and published results.
 
 The queues belong to the drivers (drivers.rdss.outbox). This part fills them, by an operator's
 command and by `[position_reports]`, and builds `message` and `fleet` from the results. It depends
@@ -79,7 +79,8 @@ class Messaging:
     # ------------------------------------------------------------------ out
 
     def send(self, command: SendMessage, t_ns: int) -> str:
-        """Queue an operator's message; what was done. Raises `CommandRefusedError`."""
+        """Queue an operator's message; return a text on the result. Raises
+        `CommandRefusedError`."""
         name = self._terminal(command.source)
         try:
             self._terminals[name].post_text(

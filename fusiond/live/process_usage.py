@@ -18,7 +18,7 @@ STATM, SMAPS = Path("/proc/self/statm"), Path("/proc/self/smaps")
 
 class ProcessUsage:
     """CPU and memory of this process: `sample()` gives percent of one core since the last call and
-    resident memory in MB (10^6 bytes), None where the kernel does not show it."""
+    resident memory in MB (10^6 bytes), None if the kernel does not show it."""
 
     def __init__(self) -> None:
         self._page_bytes = os.sysconf("SC_PAGESIZE")
@@ -70,8 +70,8 @@ def release_start_memory() -> None:
     unused once the kernels are loaded, and 13 MB of others; bitcode, 7 MB; objects in cycles; freed
     memory, 1 MB.
 
-    madvise(2), MADV_DONTNEED: pages of a mapping that nobody wrote to are clean copies of the
-    file, and those that are used are read again. malloc_trim(3) is glibc's.
+    madvise(2), MADV_DONTNEED: unmodified pages of a mapping are clean copies of the file and are
+    read again when used. malloc_trim(3) is glibc's.
     """
     libc = ctypes.CDLL(None)
     for start, end in _clean_mappings():

@@ -1,8 +1,8 @@
 """Reload of a configuration; what needs a restart.
 
-Taken are the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every measurement) and
-`log_level`: what can change without the solution losing what it knows. All else goes into the
-model, the buffers or the drivers when they are made.
+A reload applies the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every
+measurement) and `log_level`, which can change without a loss of the solution. All other keys are
+used when the model, the buffers and the drivers are made.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MQTT = "mqtt"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Result of a reload: `config` is valid from now on. Dotted keys: those `taken`, and those that
+    """Result of a reload: `config` is valid from now on. Dotted keys: `taken` ones, and ones that
     need a `restart`."""
 
     config: Config

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 
 class ServiceManager:
-    """State notifications to systemd over NOTIFY_SOCKET; does nothing where there is none.
+    """State notifications to systemd over NOTIFY_SOCKET; does nothing without one.
 
     Nothing here raises or blocks: a service manager that does not listen is counted in `failed`.
     """

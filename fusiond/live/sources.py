@@ -1,6 +1,6 @@
-"""The daemon's devices: one supervised task a driver, and what `health` says of each.
+"""The daemon's devices: one supervised task for each driver, and their `health`.
 
-A driver's exception restarts that driver, never the daemon. What a driver emits is settled here: a
+A driver's exception restarts that driver, never the daemon. A driver's output is processed here: a
 stamp becomes an instant, an IMU sample waits for the next tick, a time report goes to the clock.
 """
 
@@ -155,15 +155,15 @@ class Sources:
         self._navigator.add(item, instant.t_valid_ns, instant.sd_s, item.t_seen_ns)
 
     def take_imu(self, t_ns: int) -> tuple[NDArray[np.int64], Array] | None:
-        """The samples since the last call, (m,) ns and (m, 6); None if there are none. Where the
-        spare takes over, the navigator has been told before."""
+        """Samples since the last call, (m,) ns and (m, 6); None without any. If the spare takes
+        over, the navigator is informed first."""
         navigator = self._navigator
         if self.imu.changes(t_ns, navigator.imu.latest_ns if navigator.imu.end else None):
             navigator.change_imu()
         return self.imu.samples()
 
     def catch_up(self) -> None:
-        """Hand over the samples that ticks have left: what comes next finds them there."""
+        """Hand over the samples that ticks have left, before the next input."""
         if self.behind:
             self.behind = False
             if (left := self.imu.samples()) is not None:
@@ -203,7 +203,7 @@ class Sources:
                 hint(standard_pressure_pa(barometer.height_m), barometer.t_seen_ns)
 
     def request_fix(self, t_ns: int) -> list[str]:
-        """Ask every terminal for a fix; what each said. Empty if there is no terminal."""
+        """Request a fix of every terminal; return their answers. Empty without a terminal."""
         asks = (getattr(s.driver, "request_now", None) for s in self.all.values())
         return [ask(t_ns) for ask in asks if ask is not None]
 
@@ -233,8 +233,8 @@ class Sources:
         return of
 
     def health(self, now_ns: int) -> dict[str, SourceHealth]:
-        """`health` by source; what the filter makes by itself (`zero_velocity`) has its own
-        line."""
+        """`health` by source; the filter's own measurements (`zero_velocity`) have a line of their
+        own."""
         navigator = self._navigator
         outcomes = navigator.outcomes()
         diagnosed = self._diagnosed(now_ns)

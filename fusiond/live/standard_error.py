@@ -1,7 +1,7 @@
-"""Standard error as a log, written by a thread: a pipe that nobody empties holds up no tick.
+"""Standard error as a log, written by a thread: a full pipe delays no tick.
 
-A write to a pipe waits for its reader, for ever if need be, one to a file for a disk that is slow.
-The queue is bounded; what it does not take is lost and counted.
+A write to a pipe waits for its reader, possibly for ever, one to a file for a slow disk. The queue
+is bounded; lines beyond it are lost and counted.
 """
 
 from __future__ import annotations

@@ -159,8 +159,7 @@ class WarmKeeper:
 
 
 def _boot_id() -> str:
-    """Identifier of this boot and of the clock whose instants are kept; empty where the kernel
-    hides it."""
+    """Identifier of this boot and of its monotonic clock; empty if the kernel hides it."""
     try:
         return f"{BOOT_ID.read_text().strip()} raw"
     except OSError:

@@ -1,6 +1,6 @@
-"""The state on disk: kept while the vehicle stands, forgotten once it drives.
+"""State on disk: stored while the vehicle is at rest, removed once it drives.
 
-Only a solution at rest is worth keeping, for only then its heading lasts until the next start.
+Only the heading of a vehicle at rest lasts until the next start.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class StateKeeper:
 
     def keep(self, t_ns: int, solution: Solution, *, confirmed: bool) -> None:
         """Renew the file while the vehicle stands; remove it once the vehicle drives. `confirmed`:
-        whether anything has shown the heading."""
+        true if the heading has been confirmed."""
         if self._path is None or (self._working is not None and not self._working.done()):
             return
         if self._save.due(t_ns):
@@ -123,7 +123,7 @@ def _speed_m_s(solution: Solution) -> float:
 
 
 def state_file(config: Config, environ: Mapping[str, str]) -> Path | None:
-    """Path of a vehicle's saved state; None where it is not."""
+    """Path of a vehicle's saved state; None if none is configured."""
     if config.state_file is not None:
         return config.state_file
     directory = environ.get("STATE_DIRECTORY")

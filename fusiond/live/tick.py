@@ -2,9 +2,9 @@
 
     deadline_k = t_0 + k * period
 
-A tick that could not start within its own period is skipped and counted as an overrun; those that
-follow keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick is up to
-1 ms late on an idle machine; the tick is told its deadline, not the time it woke.
+A tick that could not start within its own period is skipped and counted as an overrun; the
+following ones keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick is up
+to 1 ms late on an idle machine; it receives its deadline, not the time of waking.
 """
 
 from __future__ import annotations

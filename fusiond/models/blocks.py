@@ -1,12 +1,12 @@
-r"""Blocks of the error state: named groups of states, and how their errors behave.
+r"""Blocks of the error state: named groups of states with their dynamics.
 
 A block is the errors of the navigation solution, or parameters that the filter estimates beside it.
 A parameter block is a first-order Gauss-Markov process
 
     x' = -x / tau + w,   steady sigma s,   variance over h: s^2 (1 - exp(-2 h / tau))
 
-or, with tau infinite, a random constant, or, where a block names its rate, the integral of another
-state. What a block does to the navigation errors is said by its `columns`
+or, with tau infinite, a random constant, or, if a block names its rate, the integral of another
+state. `columns` define the effect of a block on the navigation errors
 (fusiond.navigation.error_model). Source: Groves, 2nd ed., section 14.2.
 """
 
@@ -85,9 +85,9 @@ class Block:
 
     `columns`: 0 to 8 are the navigation errors, 9 to 20 the ways in which a parameter acts on them,
     -1 a parameter that acts on measurements only. `white` is the noise density of each state
-    (unit^2 / s), `tau_s` and `steady` (one sigma) those of a Markov process, `initial` one sigma at
-    the start where nothing else sets it. `rate` names the block of one state that is the rate of
-    each of these; zero where the model has no such block.
+    (unit^2 / s), `tau_s` and `steady` (one sigma) those of a Markov process, `initial` the default
+    one sigma at the start. `rate` names the block of one state that is the rate of each state here;
+    zero if the model has no such block.
     """
 
     name: str

@@ -2,10 +2,10 @@ r"""Constant-velocity model with white acceleration noise, for a vehicle without
 
     dr' = dv,   dv' = w,   w white with the density q = 2 s^2 tau
 
-which is what accelerations of sigma s that last for tau, as a first-order Markov process, do over
-times that are long against tau. Six states, north-east-down, and what the measurements need beside
-them; no attitude. It runs in the kernels of inertial navigation, on samples of a vehicle that is
-level, faces north and is pulled by gravity alone (fusiond.navigator.without_imu).
+the limit, over times long against tau, of accelerations of sigma s as a first-order Markov process.
+Six states, north-east-down, and the blocks of the measurements; no attitude. It runs in the kernels
+of inertial navigation, on samples of a level vehicle that faces north under gravity alone
+(fusiond.navigator.without_imu).
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), section 6.2.2 (white noise acceleration model); paper
 004, experiments 3 and 4.

@@ -142,8 +142,7 @@ class Model:
         return self.listed[names]
 
     def slots_of_each(self, *lists: tuple[str, ...]) -> tuple[Indices, ...]:
-        """`slots_of_all` of several lists of blocks: what a measurement asks at each of its
-        instants."""
+        """`slots_of_all` of several lists of blocks, needed at each measurement."""
         found = self._each.get(lists)
         if found is None:
             found = self._each[lists] = tuple(self.slots_of_all(blocks) for blocks in lists)

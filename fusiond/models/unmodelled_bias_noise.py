@@ -1,27 +1,27 @@
 r"""Process noise that replaces biases without states in the model.
 
-A bias left out is a force error in body axes, b = b_0 + b_m: a constant of sigma s_0 and a
+A bias without a state is a force error in body axes, b = b_0 + b_m: a constant of sigma s_0 and a
 first-order Gauss-Markov process of sigma s and correlation time tau. White noise that adds the same
 variance to a velocity over an interval T has the density
 
     q(T) = var(integral of b over T) / T
          = s_0^2 T + 2 s^2 tau (1 - (tau / T) (1 - exp(-T / tau)))
 
-which is (s_0^2 + s^2) T while T << tau, and 2 s^2 tau of the Markov part once T >> tau. It follows
-that no density is right for every T; T is for how long the filter still uses a velocity to find the
-tilt. A level bias is a tilt b / g to it, and for no longer than the gyro keeps the tilt does an old
-velocity say anything of the tilt of now:
+which is (s_0^2 + s^2) T while T << tau, and 2 s^2 tau of the Markov part once T >> tau. So no
+density is right for every T. T is the time for which the filter uses a velocity to estimate the
+tilt. A level bias appears as a tilt b / g, and an old velocity is evidence on the present tilt only
+while the gyro maintains the tilt:
 
     n^2 T + 2 s_g^2 / (3 tau) T^3 = (s_0^2 + s^2) / g^2
 
-n^2 density of the gyro's noise, s_g sigma of its drift, which is a state and wanders by
-2 s_g^2 t / tau in a time t << tau. With that T the steady sigma of the tilt is what the bias makes
-of it: the filter of one tilt with noise q / g^2 on what is felt and n^2 on the tilt states
+n^2 density of the gyro's noise, s_g sigma of its drift, which is a state and changes by the
+variance 2 s_g^2 t / tau in a time t << tau. With that T the steady sigma of the tilt equals the
+effect of the bias: the filter of one tilt with measurement noise q / g^2 and n^2 on the tilt states
 sqrt(n^2 q) / g, and (b / g)^2 = n^2 T, q = b^2 T give just b / g. A drift that outweighs the noise
 makes it up to 1.33 b / g (Riccati equation of both, in the tests).
 
-A shorter T takes one bias for many independent ones and states a tilt far below it (with T = 1 s in
-the flight of paper 002 a quarter); a longer one throws away what the accelerometer knows.
+A shorter T treats one bias as many independent ones and states a tilt sigma far too small (with T =
+1 s in the flight of paper 002 a quarter); a longer one discards information of the accelerometer.
 
 Source: paper 002 leaves the accelerometer's biases out "as white noise" and prints no density;
 derived here, held by covariance analysis and live flights (docs/observability.md).

@@ -1,8 +1,7 @@
 """Blocks of unmeasured parameters of a vehicle: placement and delays of sensors.
 
-Each is a constant, or nearly one, that driving shows; what a drive does not show stays at its
-prior. The measurements that hold them say how they act (fusiond.aiding.body_velocity, position,
-velocity).
+Each is a constant, or nearly one, that driving shows; an unobserved one keeps its prior. The
+measurements define their effect (fusiond.aiding.body_velocity, position, velocity).
 """
 
 from __future__ import annotations
@@ -57,8 +56,8 @@ def wheel_scale_block(name: str, sd: float) -> Block:
 
 
 def wheel_rounding_block(name: str, sd: float) -> Block:
-    """Share of a step by which a wheel's speed is low beside the assumed rounding: no standard
-    defines the rounding of km/h."""
+    """Rounding error of a wheel's speed relative to the assumed rounding, as a share of a step: no
+    standard defines the rounding of km/h."""
     return _constant(name, "1", ("share",), sd)
 
 
@@ -75,8 +74,8 @@ def clock_skew_block(name: str) -> Block:
 
 
 def fix_markov_block(name: str, lasts_s: float) -> Block:
-    """An error that fixes share for a while, of sigma one: a measurement says how many metres it
-    counts (fusiond.aiding.fix_errors)."""
+    """Error that fixes share for a while, of sigma one; each measurement scales it in metres
+    (fusiond.aiding.fix_errors)."""
     return Block(name, "1", ("n", "e", "d"), (-1,) * 3, initial=1.0, steady=1.0, tau_s=lasts_s)
 
 

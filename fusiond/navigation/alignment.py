@@ -5,7 +5,7 @@ At rest the specific force is -g along down and the rate is the Earth's:
     roll = atan2(-f_y, -f_z)      pitch = atan2(f_x, sqrt(f_y^2 + f_z^2))
     yaw:  C w = [W cos(lat), 0, -W sin(lat)]
 
-What the sensors get wrong becomes attitude error, fully correlated with it:
+Sensor errors become attitude errors, fully correlated with them:
 
     phi_N = (C a)_E / g     phi_E = -(C a)_N / g
     phi_D = ((C e)_E + phi_N w_D) / w_N                 after gyrocompassing

@@ -37,7 +37,7 @@ def quantile(degrees: int, tail: float) -> float:
     """Quantile of a chi-square variable of `degrees` degrees of freedom, exceeded with probability
     `tail`.
 
-    Infinite for none, which is what is left of one less 1e-17. Raises ValueError for degrees below
+    Infinite for a tail of 0, to which 1 - (1 - 1e-17) rounds. Raises ValueError for degrees below
     one or a tail that is no probability below 1.
     """
     if degrees < 1 or not 0.0 <= tail < 1.0:

@@ -4,28 +4,27 @@ Axes that are not square:
 
     e_i = sum m_ij w_j,   d_i = sum n_ij f_j,   j other than i,   m_ij, n_ij ~ N(0, m^2)
 
-of gyros and accelerometers. As long as the vehicle turns about one axis u of the body, the gyros
-tell the turn of a body that is turned by a constant, M u: attitude is as good as ever, of axes
-which sit otherwise than the housing by m (`fusiond.estimators.published_state` publishes it so),
-and against them gravity has an error that is constant in the body, which is a bias of the
-accelerometers. Nothing grows. u is the vertical of a vehicle on a road, here the direction of the
-mean force. What turns about another axis does not fit: a bend of angle Theta about it leaves an
-error of m Theta about the axes across, and the bend back takes it away again. A filter without
-states for m_ij takes it for white noise that adds as much in a bend of Theta:
+of gyros and accelerometers. While the vehicle turns about one body axis u, the gyros measure the
+turn of a body that is rotated by a constant, M u. The attitude is accurate for axes that deviate
+from the housing by m (`fusiond.estimators.published_state` publishes it so); relative to them
+gravity has a constant error in the body, a bias of the accelerometers. Nothing grows. u is the
+vertical of a vehicle on a road, here the direction of the mean force. Turns about another axis do
+not fit: a bend of angle Theta about it leaves an error of m Theta about the lateral axes, and the
+bend back removes it. A filter without states for m_ij treats this as white noise that adds as much
+in a bend of Theta:
 
     density of e_i = m^2 Theta |w_j, w_k|,   w less its mean and its part along u
 
-more in smaller bends, less in larger ones. So with forces beside gravity's, by n and by m of the
-gyros' axes in which they are resolved. Along u each change V of the vehicle's own velocity adds
-sqrt(2) m V. Across u what is a turn about u is a heading, which the filter follows; what is left of
-n (its symmetric part) turns with the vehicle, so that no more counts than what a filter that gets
-fixes takes together:
+more in smaller bends, less in larger ones. The same applies to forces beside gravity, by n and by m
+of the gyros' axes in which they are resolved. Along u each change V of the vehicle's own velocity
+adds sqrt(2) m V. Across u the turn about u is a heading, which the filter follows; the rest of n
+(its symmetric part) turns with the vehicle, so that only the part within a filter's memory with
+fixes counts:
 
     density of d = 2 m^2 V |f_2, f_3| along u,   m^2 / 2 V' |f_2, f_3| across,   f less its mean
 
-Rates and forces are smoothed: shaking turns and moves the vehicle nowhere. States would need a
-third parameter of each axis in the kernels; what is measured with this noise stands in
-docs/vehicle.md.
+Rates and forces are smoothed, as vibration does not move the vehicle. States would need a third
+parameter of each axis in the kernels; results with this noise are in docs/vehicle.md.
 
 Scale factors, of a model that has no states for them:
 
@@ -33,13 +32,13 @@ Scale factors, of a model that has no states for them:
 
 A bend of angle Theta about an axis leaves s Theta of attitude about it, a change V of the velocity
 along an axis k V; the bend back, or the stop, takes it away again. A filter without states for them
-takes it for white noise that adds as much in a bend, or in that part V' of a stop that a filter
-which gets fixes takes together:
+treats this as white noise that adds as much in a bend, or in the part V' of a stop within a
+filter's memory with fixes:
 
     density of e_i = s^2 Theta |w_i|,   of d_i = k^2 V' |f_i|
 
-w and f less their means, which are biases and gravity: what k makes of gravity is a bias. Bends the
-same way round add up to more than this says, and there and back to less.
+w and f are without their means, biases and gravity: k times gravity is a bias. Bends in one
+direction add up to more than this, bends to and fro to less.
 
 Source: Groves, 2nd ed., section 4.4.2 (cross-coupling and scale factor errors).
 """
@@ -82,7 +81,7 @@ def _follow(
     To `out` (m, 6) those by axes out of square, to `scaled` (m, 6) those by scale factors; `gains`
     are those of the smoothed samples and of their means, `factors` of rates, of forces along the
     vertical and across, and of both scale factors. `mean` (13,) goes on from call to call: smoothed
-    rates and forces, their means, and of how many samples they are."""
+    rates and forces, their means, and their number of samples."""
     gain, slow_gain = gains
     of_rates, along_up, across_up, rate_scale, force_scale = factors
     for i in range(samples.shape[0]):

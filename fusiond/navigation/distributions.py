@@ -6,15 +6,15 @@ Gamma law of shape a and scale 1, P(a, x) + Q(a, x) = 1, with delta = x/a - 1:
     P = D (1 + x/(a+1) + x^2/((a+1)(a+2)) + ...)                                      x < a + 1
     Q = a D / (x+1-a - 1(1-a)/(x+3-a - 2(2-a)/(x+5-a - ...)))                         else
 
-where S(a) = Gamma(a + 1) / (sqrt(2 pi a) a^a e^-a) is Stirling's series. D loses no digits so,
-however large a is. F law of d and n degrees of freedom: the tail beyond x is I_y(n/2, d/2) at
-y = n / (n + d x), I the incomplete beta function, here its continued fraction. Noncentral
-chi-square: chi-squares of m + 2j degrees, weighted by what Poisson's law of mean lambda/2 gives j.
+where S(a) = Gamma(a + 1) / (sqrt(2 pi a) a^a e^-a) is Stirling's series. So D loses no digits for
+any a. F law of d and n degrees of freedom: the tail beyond x is I_y(n/2, d/2) at y = n / (n + d x),
+I the incomplete beta function, here its continued fraction. Noncentral chi-square: chi-squares of m
++ 2j degrees, weighted by Poisson's law of mean lambda/2 for j.
 
-A quantile is where Newton's step on the logarithm of the smaller tail ends; bisection takes over
-where such a step leaves what is known to hold the quantile.
+A quantile is found by Newton's steps on the logarithm of the smaller tail; bisection replaces a
+step that leaves the bracket.
 
-scipy.special has all of these; to load it takes an eighth of the processor time of a start.
+scipy.special has all of these, but loading it takes an eighth of the processor time of a start.
 
 Source: NIST Digital Library of Mathematical Functions, 8.11.4 (series), 8.9.2 (fraction of Q),
 5.11.1 (Stirling), 8.17.22 (beta); Abramowitz and Stegun, 26.4.25 (noncentral). The Gaussian
@@ -74,7 +74,7 @@ def gamma_tails(shape: float, x: float) -> tuple[float, float]:
 
 
 def gamma_quantile(shape: float, p: float, upper: bool = False) -> float:
-    """Quantile where the gamma law has `p` below, or above if `upper`."""
+    """Quantile with probability `p` below it, or above it if `upper`."""
     if not 0.0 < p < 1.0:
         return 0.0 if upper == (p >= 1.0) else math.inf
 

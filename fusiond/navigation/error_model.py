@@ -4,14 +4,14 @@ Errors of the navigation state are *computed minus true*, in north-east-down axe
 
     C^ = (I - [phi x]) C,   v^ = v + dv,   position^ = position + dr (metres north, east, down)
 
-Sensor errors are what is left uncorrected in the sensor: w^ - w = e, f^ - f = a. Then
+Sensor errors are the uncorrected rest: w^ - w = e, f^ - f = a. Then
 
     phi' = -w_in x phi + dw_in(dv, dr) - C e
     dv'  = f_n x phi + F_vv dv + F_vr dr + C a
     dr'  = dv + F_rr dr
 
-An interval h is crossed in three steps that use each other's results, so that second-order terms
-(velocity from e, position from phi and a) come out right without being written:
+An interval h is crossed in three steps that use each other's results, which includes second-order
+terms (velocity from e, position from phi and a) implicitly:
 
     phi1 = phi + h (...)        dv1 = dv + h (f_n x (phi + phi1) / 2 + ...)
     dr1  = dr + h ((dv + dv1) / 2 + F_rr dr)
@@ -123,9 +123,9 @@ def apply_for(width: int) -> Callable[[Array, Array, Array, Array], None]:
     def apply(rows: Array, sensor: Array, c: Array, out: Array) -> None:
         """Write out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
 
-        All flat, `width` doubles a row. `sensor` holds rate error x y z, force error x y z. In
-        five loops, so that the coefficients of each stay in registers: in one loop most are spilled
-        and read back from where they have hardly arrived.
+        All flat, `width` doubles a row. `sensor` holds rate error x y z, force error x y z. In five
+        loops, so that the coefficients of each stay in registers: in one loop most would be spilled
+        and read back at once.
         """
         for j in range(width):
             p0, p1, p2 = rows[j], rows[width + j], rows[2 * width + j]

@@ -48,7 +48,8 @@ def sound(samples: Array) -> NDArray[np.bool_]:
 
 @compiled("b1(f8[:, :])")
 def all_sound(samples: Array) -> bool:
-    """True if `sound` holds for each of samples (m, 6): what a tick asks, of a sample or two."""
+    """True if `sound` holds for each of samples (m, 6); fast for the one or two samples of a
+    tick."""
     for i in range(samples.shape[0]):
         for j in range(6):
             most = MAX_RATE_RAD_S if j < 3 else MAX_FORCE_M_S2
@@ -116,7 +117,7 @@ class ImuBuffer:
 
     `times` (m,) ns, `samples` (m, 6) rate rad/s and force m/s^2 in body axes, `nav` (m, 10) and
     `sigmas` (m, 9) as the filter first passed each sample; rows 0 ... `end`-1 hold samples `start`
-    ... `start + end - 1`. `counters` name what was refused.
+    ... `start + end - 1`. `counters` name the rejections.
     """
 
     def __init__(
@@ -203,10 +204,10 @@ class ImuBuffer:
         return {name: count for name, count in names.items() if count}
 
     def append(self, times: Stamps, samples: Array) -> int:
-        """Append samples (m,) ns and (m, 6) in sensor axes; return how many were taken.
+        """Append samples (m,) ns and (m, 6) in sensor axes; return the number used.
 
-        Refused and counted: `not_finite`, `out_of_range`, `duplicate_stamp`, `backward_stamp`.
-        Counted and taken: `gap`.
+        Rejected and counted: `not_finite`, `out_of_range`, `duplicate_stamp`, `backward_stamp`.
+        Counted and used: `gap`.
         """
         if not all_sound(samples):
             good = sound(samples)

@@ -1,14 +1,15 @@
-r"""Screening of inertial samples: judged in order, each by those before it.
+r"""Screening of inertial samples: each judged by those before it.
 
-    |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a leap is a `spike`
+    |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a jump is a `spike`
     r >= ln(1e-9) / ln(p)                                      a value that comes too often
 
     |x_k - x_g| > 30 max(a_j, least_j) and back to a quarter of it with the next sample: a `spike`
 
-x_g is the last sample that was taken, n how many have come since (three at most), a_j the running
-mean of |dx| of axis j. p is the running probability that a sample repeats the one before it to the
-bit, r how often it has done so now: by chance that comes once in 1e9 samples, four months at
-100 Hz. p starts at 1, so that a sensor is condemned only for what it has shown not to do.
+x_g is the last accepted sample, n the number of samples since (three at most), a_j the running mean
+of |dx| of axis j. p is the running probability that a sample repeats the one before it bit for bit,
+r the present number of repetitions: the limit is exceeded by chance once in 1e9 samples, four
+months at 100 Hz. p starts at 1, so that a sensor is rejected only for behaviour that it had not
+shown before.
 
 Figures, of four recordings of cars and a walker (MEMS units of 100 to 167 Hz; one with steps of
 0.25 deg/s and 0.125 m/s^2; one that sends each third sample twice):
@@ -86,7 +87,7 @@ _NEVER_NS = -(2**62)
 
 @compiled("f8(f8, f8)", forceinline=True)
 def _most(p: float, longest: float) -> float:
-    """Repetitions in a row that a sensor may show."""
+    """Largest plausible number of repetitions in a row."""
     by_chance = math.log(CHANCE) / math.log(min(p, 1.0 - 1e-12))
     return max(float(FEWEST_REPEATS), by_chance, RUN_FACTOR * longest)
 
@@ -218,11 +219,11 @@ def _check(
     memory: Array,
     codes: Stamps,
 ) -> tuple[int, int, int]:
-    """Write `codes` (m,); return how many samples are judged, the rest waits for more, the stamp
-    that the next must be later than, and how many were refused.
+    """Write `codes` (m,); return the number of judged samples (the rest waits for more), the last
+    stamp, and the number of rejections.
 
-    `limits`: rate in Hz, full scale of rate and force. Samples whose stamps do not go forward are
-    left to whoever orders them.
+    `limits`: rate in Hz, full scale of rate and force. Samples with stamps that do not advance are
+    not judged here.
     """
     i, m, refused = 0, len(times), 0
     while i < m:
@@ -278,8 +279,8 @@ class ImuCheck:
     """Check of samples in sensor axes, in chunks of any size.
 
     `rate_hz` as configured; `rate_range` (rad/s) and `force_range` (m/s^2) are the sensor's full
-    scale, infinite where nobody knows. A sample after a pause, and one that leaps, wait for the one
-    after: until then nobody can say which stamp is wrong, or whether the leap lasts.
+    scale, infinite if unknown. A sample after a pause or a jump waits for the next one, which shows
+    the wrong stamp, or whether the jump lasts.
     """
 
     def __init__(self, rate_hz: float, rate_range: float, force_range: float) -> None:

@@ -1,24 +1,24 @@
 """Compiled kernels on disk: one checked file a kernel.
 
-A file holds the SHA-256 of what follows, then what numba makes of a compiled function. Native code
-is linked only after that digest has been found right: a file that is cut short, emptied or altered
-by a bit is removed, said so, and the kernel compiled anew. (numba's own cache checks nothing: it
-hands what it finds to the linker, which aborts the process.) The digest tells damage, not malice:
-whoever may write to the folder may run code here, as with any folder of Python modules.
+A file holds a SHA-256, then numba's form of a compiled function. Native code is linked only if that
+digest is right: a file that is cut, emptied or altered by a bit is removed, reported, and the
+kernel compiled again. (numba's own cache checks nothing: it passes any content to the linker, which
+aborts the process.) The digest detects damage, not malice: a user with write access to the folder
+may run code here, as with any folder of Python modules.
 
-Files are written under a name of their own and renamed, so that processes that compile side by side
-or die while they write leave whole files; a later start removes what a dead one left. Where nothing
-can be written, kernels are compiled at each start.
+Files are written under a temporary name and renamed, so that parallel or dying processes leave
+complete files; a later start removes the leftovers. If nothing can be written, kernels are compiled
+at each start.
 
-A package may bring kernels that were compiled where it was built, for a level of processors: they
-are checked and linked as those of the cache are, and never removed. What the cache has goes first.
+A package may include kernels compiled at its build, for a level of processors: they are checked and
+linked like those of the cache, and never removed. The cache has precedence.
 
-A start that finds all kernels compiles nothing, and so does without what numba needs to compile:
-its tables of implementations (a fifth of the processor time of a start) and the bitcode of the
-kernels, which others inline (another seventh). Both come when a kernel is missing. A kernel that is
-there is linked when it is first called, 0.3 ms each: of 170 that are imported a drive on files
-calls 36 (fusiond.navigation.compiled). The linker is given the native code as it is; by numba's own
-way it comes as what a module of LLVM was compiled to, which takes three times as long.
+A start that finds all kernels compiles nothing, and does not load what numba needs to compile: its
+tables of implementations (a fifth of the processor time of a start) and the bitcode of the kernels,
+which others inline (another seventh). Both come when a kernel is missing. A cached kernel is linked
+at its first call, 0.3 ms each: of 170 imported ones a drive on files calls 36
+(fusiond.navigation.compiled). The linker receives the native code directly; numba's own way through
+an LLVM module takes three times as long.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def shipped_in(folder: Path) -> Shipped | None:
 class KernelCache(NullCache):
     """Cache for numba's dispatcher with its one signature; `name` is the kernel's alone.
 
-    `shipped` is the file of the package's own that has it, None where none has.
+    `shipped`: the package's own file with it, or None.
     """
 
     def __init__(
@@ -318,10 +318,10 @@ def can_keep(folder: Path) -> bool:
 
 
 def kept_in(folder: Path) -> set[str]:
-    """Names of the files in `folder`, after removal of those that dead processes left unfinished.
+    """Names of the files in `folder`, after removal of unfinished files of dead processes.
 
-    Where the folder is shared with other hosts, one may lose a file that it writes just now: it
-    compiles that kernel again at its next start.
+    If the folder is shared with other hosts, a file being written by one may be removed: that host
+    compiles the kernel again at its next start.
     """
     try:
         names = set(os.listdir(folder))

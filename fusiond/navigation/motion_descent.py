@@ -3,9 +3,9 @@ defines the problem.
 
 A guess (19,) holds the attitude C_nb at the last fix by rows, biases of force and rate, the
 velocities' offset in time in its sigmas, the velocity at the first fix; a step (13,) moves it by a
-rotation vector and by the rest. What is `asked` (15,): one sigma of the priors of the first ten of
-those, heading (rad) at the last fix, gravity, one sigma (s) of the offset, variances of the white
-noise of a velocity gained, by t and by t^3.
+rotation vector and by the rest. `asked` (15,): one sigma of the priors of the first ten of these,
+heading (rad) at the last fix, gravity, one sigma (s) of the offset, variances of the white noise of
+a velocity gained, by t and by t^3.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def least_squares(rows: Array, z: Array, step: Array) -> bool:
 
 @compiled("b1(f8[::1], f8[::1], f8)")
 def _bent(biases: Array, sensed: Array, seconds: float) -> bool:
-    """True if integrals with biases (6,) of theirs must be computed again for others."""
+    """True if the integrals must be computed again for changed biases (6,)."""
     force, rate = 0.0, 0.0
     for j in range(3):
         force = max(force, abs(biases[j] - sensed[j]))

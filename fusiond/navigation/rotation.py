@@ -113,7 +113,7 @@ def dcm_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def rpy_from_dcm(dcm: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad; yaw in (-pi, pi]; at pitch +-90 deg roll is what is left."""
+    """Roll, pitch, yaw in rad; yaw in (-pi, pi]; at pitch +-90 deg roll takes the rest."""
     pitch = math.asin(max(-1.0, min(1.0, -float(dcm[2, 0]))))
     return (
         math.atan2(dcm[2, 1], dcm[2, 2]),

@@ -22,10 +22,9 @@ _UNKNOWN: Vector3 = (nan, nan, nan)
 class Mode(StrEnum):
     """Mode of the solution.
 
-    WAITING: no IMU data yet. ALIGNING: levelling, or heading or position not known yet.
-    NAVIGATING: aided within the last `coast_after_s`. COASTING: inertial alone for longer than
-    that, or aided by what nobody can check. INVALID: sigma beyond what the configuration allows, or
-    the IMU has stopped.
+    WAITING: no IMU data yet. ALIGNING: levelling, or heading or position not known yet. NAVIGATING:
+    aided within the last `coast_after_s`. COASTING: inertial alone for longer than that, or not
+    confirmed. INVALID: sigma beyond what the configuration allows, or the IMU has stopped.
     """
 
     WAITING = "waiting"
@@ -47,8 +46,8 @@ class BoundState(StrEnum):
 
 @immutable()
 class Bound:
-    """Protection levels of a solution: horizontal and vertical, NaN where none is computed,
-    infinite where nothing bounds the error (fusiond.integrity.protection)."""
+    """Protection levels of a solution: horizontal and vertical, NaN if not computed, infinite
+    without a bound (fusiond.integrity.protection)."""
 
     state: BoundState = BoundState.OFF
     hpl_m: float = nan
@@ -60,9 +59,9 @@ class Solution(NamedTuple):
 
     `t_ns` host monotonic. Position geodetic (rad, rad, m, WGS 84); velocity NED (m/s); attitude
     roll, pitch, yaw (rad, NED to body, 3-2-1). `sd_ned_m` metres north, east, down. Every figure is
-    NaN while it is not known: while `mode` is WAITING or ALIGNING, and for an instant before the
-    history that is kept; height and its sigma while nothing has told the height
-    (`HEIGHT_KNOWN_SD_M`); a sigma also where the model holds the figure.
+    NaN while unknown: while `mode` is WAITING or ALIGNING, and for an instant before the stored
+    history; height and its sigma before any measured height (`HEIGHT_KNOWN_SD_M`); a sigma also if
+    the model holds the figure.
     """
 
     t_ns: int

@@ -4,12 +4,11 @@ Over the samples of a window of the IMU (about 1 s), per axis,
 
     s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |u mean w| < c
 
-u the direction of the mean force, and if that force is what the rest's first window had, to within
-b: a smooth start is not rest, and what turns about a level axis takes gravity along, so that rates
-about those are biases, however large.
-An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
-vehicle and stand in its configuration. Windows lie on a fixed grid of time, so the verdict is a
-function of the samples alone, however they were handed over.
+u is the direction of the mean force, which must agree with that of the rest's first window to
+within b: a smooth start is no rest. A turn about a level axis would change it, so rates about level
+axes are biases of any size. An engine shakes the IMU and a passenger rocks the car, so the
+thresholds a, b, c belong to the vehicle and are in its configuration. Windows lie on a fixed time
+grid, so the verdict is a function of the samples alone, in chunks of any size.
 
 Source: Skog, Handel, Nilsson, Rantakokko, Zero-velocity detection: an algorithm evaluation, IEEE
 T-BME 57 (2010), the moving-variance and rate-energy detectors.
@@ -51,8 +50,8 @@ class QuietLimits:
 class Window:
     """A finished window: its end, means (3,) and whether the sensor was quiet in all of it.
 
-    `run_rate` (3,) is the mean rate of the last `run` quiet windows in a row, this one with them;
-    `scatter` (3,) the variance of one of them, as they differ (nothing where there is one).
+    `run_rate` (3,) is the mean rate of the last `run` quiet windows in a row, including this one;
+    `scatter` (3,) their variance (0 for one window).
     """
 
     end_ns: int
@@ -117,8 +116,7 @@ def _lengthen(rates: Array, run: int, rate: Array, found: Array) -> int:
 
 @compiled("i8(i8[::1], i8, i8, i8, i8)")
 def next_cell(times: NDArray[np.int64], first: int, end: int, width_ns: int, cell: int) -> int:
-    """The first of rows first ... end-1 that lies in another cell of the grid of time than `cell`;
-    -1 where none does."""
+    """First of the rows first ... end-1 outside the time grid's `cell`; -1 if there is none."""
     begin_ns = cell * width_ns
     for i in range(first, end):
         if not 0 <= times[i] - begin_ns < width_ns:

@@ -4,25 +4,26 @@ With means y_k of n samples, each over tau = n T, the Hadamard variance
 
     H(tau) = < (y_k - 2 y_{k-1} + y_{k-2})^2 > / 6
 
-is N^2 / tau for white noise of density N^2, whatever the bias and its drift. Motion, and vibration
+is N^2 / tau for white noise of density N^2, independent of bias and drift. Motion, and vibration
 that averages out, only add to tau H(tau) at one tau or another, so the smallest over several tau
-bounds the density that attitude and velocity integrate; which share of it they do is found by
-predictions (fusiond.navigator.imu_noise_share). The mean is over the last seconds and past
-samples alone: an engine that starts is in it at once, and a replay gives the same numbers.
+bounds the density that attitude and velocity integrate; the share that they do is estimated by
+predictions (fusiond.navigator.imu_noise_share). The mean is over past samples of the last seconds
+alone: an engine that starts shows at once, and a replay gives the same numbers.
 
-Ten seconds are too slow for a noise that rises tenfold at once: after one of them the attitude is
-off by four sigma. A faster mean takes each bump for noise, which is motion that the sensors
-measure. White noise is there all the time and at all tau: with T a sample's, it is new noise if
+Ten seconds are too slow for a noise that rises tenfold at once: after one second the attitude is
+off by four sigma. A faster mean would take each bump for noise, although it is motion that the
+sensors measure. White noise is present at all times and all tau: with T a sample's interval, it is
+new noise if
 
     of a second each fifth has T H(T), and all of it 4 T H(4 T), above RISEN times the density
     that was known before it
 
-A bump of less than half a second leaves a fifth as it was. White noise of the known density does
-that never: second differences are correlated by -2/3 and 1/6, so that n of them have n / 1.9
+A bump of less than half a second leaves one fifth unchanged. White noise of the known density never
+meets this: second differences are correlated by -2/3 and 1/6, so that n of them have n / 1.9
 degrees of freedom; five fifths of ten samples a second are all above ten times their mean once in
-10^14, and of fifty far less. Fifty minutes of four recorded vehicles did it twice, on an axis
-each and for a second. The means then begin anew, at all tau with T H(T) of that second, and what
-the noise has made of attitude and velocity meanwhile, N^2 of one second, is made up for at once.
+10^14, and of fifty far less. Fifty minutes of four recorded vehicles met it twice, on one axis for
+a second. The means then restart, at all tau with T H(T) of that second, and the effect of the noise
+on attitude and velocity in that second, N^2, is added at once.
 
 Source: Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), section 5.2.9.
 """
@@ -61,10 +62,10 @@ _FINE, _OF_FINE, _COARSE, _OF_COARSE, _KNOWN, _PART_SIZE = range(6)
 
 @compiled("f8(f8[:, ::1], f8[:, :])")
 def _risen(parts: Array, memory: Array) -> float:
-    """Noise density of an axis where it is new; else 0.
+    """New noise density of an axis; 0 if unchanged.
 
-    The one that all of its `parts` (PARTS + 1, 5) show, the first of which has just ended. The
-    axis's means, `memory` (LEVELS, 6), restart with a new one."""
+    The density that all of its `parts` (PARTS + 1, 5) show, the first of which has just ended. A
+    new density restarts the axis's means, `memory` (LEVELS, 6)."""
     least = RISEN * parts[PARTS, _KNOWN]
     fine = of_fine = coarse = of_coarse = 0.0
     for k in range(PARTS):
@@ -95,7 +96,7 @@ def _follow(
 ) -> None:
     """Write the smallest noise density so far beyond the data sheet's, `out` (m, 6).
 
-    After each of `samples` (m, 6), beyond that of `sheet` (6,); 0 where it is not above it by
+    After each of `samples` (m, 6), beyond that of `sheet` (6,); 0 if it does not exceed it by
     EXCESS.
 
     `memory` (LEVELS, 6, 6) and `lately` (6, PARTS + 1, 5) go on from call to call.

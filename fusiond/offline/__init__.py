@@ -1,1 +1,1 @@
-"""Recorded files through the daemon's navigator, and what came of it against truth."""
+"""Recorded files through the daemon's navigator; comparison with a truth."""

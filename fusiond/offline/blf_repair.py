@@ -1,11 +1,11 @@
 """Repair of a damaged Vector BLF file's containers, so that python-can reads the intact part.
 
 A BLF file is a header and containers of some 128 kB, mostly zipped, with objects in them that may
-go on in the next one. Here containers are taken apart into objects, a piece that cannot be read is
-passed over up to the next one that can, and whole objects are handed on in containers of our own.
+go on in the next one. Here containers are split into objects, an unreadable piece is skipped up to
+the next readable one, and complete objects are passed on in new containers.
 
-A stamp counts from the header's time, as 64 bits without a sign: what was recorded before the
-trigger shows as 2^64 - n. So all are moved by a day, and the reader's start by a day back.
+A stamp counts from the header's time, as 64 bits without a sign: frames before the trigger have
+2^64 - n. So all stamps are moved by a day, and the reader's start by a day back.
 
 Source: python-can, `can.io.blf`, after Toby Lorenz' Vector BLF library.
 """
@@ -52,7 +52,7 @@ class Containers:
     """BLF file in the form that python-can's reader expects: the header, then containers of whole
     objects.
 
-    `refused(text)` hears of each piece that is lost.
+    `refused(text)` receives each lost piece.
     """
 
     def __init__(self, stream: BinaryIO, refused: Callable[[str], None]) -> None:
@@ -161,7 +161,7 @@ class Containers:
     # ------------------------------------------------------------------ objects
 
     def _objects(self, data: bytearray) -> bytes:
-        """The whole objects of the content, their stamps moved; what is not whole is kept."""
+        """Complete objects of the content with moved stamps; an incomplete rest is kept."""
         good = bytearray()
         at = 0
         while True:

@@ -1,13 +1,13 @@
-"""`fusiond calibrate`: what one recorded drive shows of mounting, lever arms, offsets and scales.
+"""`fusiond calibrate`: mounting, lever arms, time offsets and scales from one recorded drive.
 
 The drive passes through the daemon's navigator twice, the second time with the first result as
 configured values and with the same configured sigmas: a mounting that is 10 deg off affects lever
 arms and the start, and the remainder in the second pass is small. The sigmas are those of the
 second pass alone, so that nothing counts twice.
 
-Roll of the mounting is felt by no wheel and no axle. It is taken from gravity: roads lean to either
-side by their crown, 2 to 2.5 % to the kerb, so the mean roll of driving straight on is that of the
-mounting, give or take a crown.
+Roll of the mounting has no effect on wheels or axle. It is estimated from gravity: roads lean to
+either side by their crown, 2 to 2.5 % to the kerb, so the mean roll of driving straight on is that
+of the mounting, within a crown.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ SHOWN_BY = {
 @dataclass(frozen=True, slots=True)
 class Finding:
     """Recommended configuration of a parameter: its value in published units under `key`, one
-    sigma, state and text. `key` is empty where the configuration has none."""
+    sigma, state and text. `key` is empty if the configuration has none."""
 
     key: str
     value: float
@@ -100,9 +100,9 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Result of a drive: findings by published name, seconds of what it was shown by, noise seen
-    (deg/sqrt(h), m/s/sqrt(h)) while driving and at rest, the configuration that comes of it, and
-    the TOML text. `result` is what `process` said of the last pass."""
+    """Result of a drive: findings by published name, seconds of the motion that showed them,
+    observed noise (deg/sqrt(h), m/s/sqrt(h)) while driving and at rest, the resulting
+    configuration, and the TOML text. `result` is that of `process` in the last pass."""
 
     findings: dict[str, Finding]
     shown_s: dict[str, float]
@@ -209,7 +209,7 @@ class _Drive:
         self.slots: list[str] = []
 
     def look(self, navigator: Navigator) -> None:
-        """The navigator has advanced."""
+        """Evaluate the navigator after an advance."""
         if self._last is not navigator:
             self._last = navigator
             self.slots = [s.name for s in calibration_slots(navigator.model)]
@@ -314,7 +314,7 @@ class _Drive:
 
     def noise(self, imu: Imu) -> dict[str, tuple[float, float]]:
         """Gyro (deg/sqrt(h)) and accelerometer (m/s/sqrt(h)) noise, median of the rms of the axes,
-        at rest and while driving, where there is enough data."""
+        at rest and while driving, if there is enough data."""
         speed, _, _, rows = self._table()
         sheet = imu_noise(imu)
         found = {}

@@ -1,7 +1,7 @@
 """Configuration of a calibration: which keys change, and the lines of TOML for them.
 
-With C_vb the matrix of `imu.mounting_deg`, m the rest of the mounting that was found, rho the roll,
-and tau by how much fixes are later valid than their stamps say:
+With C_vb the matrix of `imu.mounting_deg`, m the estimated rest of the mounting, rho the roll, and
+tau the time from the stamps of fixes to their validity:
 
     C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.si_units.sensor_to_body)
     lever arm of an antenna <- C(rho) exp[m x] (l + dl), where dl was observed
@@ -123,7 +123,7 @@ def fragment(
 ) -> str:
     """TOML of the keys in which `now` differs from `config`.
 
-    Observed parameters have smaller sigmas; `sentences` stand as comments."""
+    Observed parameters have smaller sigmas; `sentences` become comments."""
     seen = [p for p in found.values() if p.state is not CalibrationState.NOT_OBSERVED]
     lines = [f"# {text}" for text in sentences]
     lines += _table("imu", _changed(config.imu, now.imu, ("mounting_deg", "time_offset_s")))

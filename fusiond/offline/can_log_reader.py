@@ -95,8 +95,8 @@ def messages(
 ) -> Iterator[can.Message]:
     """Messages of a log in order. `on_zone(code, text)` receives the time zone of its dates.
 
-    Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
-    asammdf, OSError for a file that cannot be opened.
+    Raises `TableError` without a readable message, `MissingPackageError` for MF4 without asammdf,
+    OSError for a file that cannot be opened.
     """
     log, lost = _format(path), Refusals() if refusals is None else refusals
     read = {".blf": _binary, ".mf4": _mf4}.get(log.suffix, _text)
@@ -146,8 +146,8 @@ def _format(path: Path) -> _Log:
 
 
 def _channel_words(path: Path) -> Iterator[str | int]:
-    """Channels by the second word of the lines that `candump -L` wrote: to parse every frame for
-    that takes as long as to parse it for the drivers. None of a log of another form."""
+    """Channels by the second word of the lines of `candump -L`, as parsing every frame would take
+    as long as the drivers' own parsing. None for a log of another form."""
     log = _format(path)
     if log.suffix != ".log":
         return

@@ -1,8 +1,7 @@
 r"""Normalisation of text CAN logs for python-can's readers, which skips bad lines.
 
-A reader pulls line after line. Before it sees one, encoding and blocks of zeros (what a file system
-leaves where a logger lost its power) are dealt with here, and what the formats know beside what
-python-can reads is said in its words:
+A reader pulls line after line. Before that, encoding and blocks of zeros (left by a file system
+after a loss of power) are repaired here, and forms that python-can does not read are converted:
 
     candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
     stamps as differences      candump -t d, ASC "timestamps relative": summed
@@ -40,8 +39,8 @@ Plain = Callable[[str], str | None]
 class TextLines:
     """Lines of a log, as a file for a reader of python-can.
 
-    `plain(line)` says a line in words that the reader knows; None: it holds no frame.
-    `refused(line, text)` hears of what is lost, once a line.
+    `plain(line)` converts a line to a form that the reader knows; None: no frame. `refused(line,
+    text)` receives each lost line.
     """
 
     def __init__(self, stream: BinaryIO, plain: Plain, refused: Callable[[int, str], None]) -> None:
@@ -276,8 +275,8 @@ class Asc:
         return f"{stamp}{line[found.end() :]}" if found[1] or found[3] == "," else line
 
     def _of_header(self, line: str) -> str | None:
-        """A line before the first frame. The reader ends the header at one that it does not know, a
-        date in another language among them, and misses what stands behind it."""
+        """Line before the first frame. The reader ends the header at an unknown line, such as a
+        date in another language, and misses the lines after it."""
         self._relative |= _RELATIVE.match(line) is not None
         self.in_frames |= _HEADER_OVER.match(line) is not None
         return line if _HEADER.match(line) else None
@@ -299,7 +298,7 @@ _COMMA = re.compile(r"(;\$STARTTIME=\d+|\s*\d+\)?\s+\d+),(\d+)(?=\s|$)")
 
 
 class Trc:
-    """Lines of a TRC file; `version` is what it says of itself, "" where nothing."""
+    """Lines of a TRC file; `version` is the stated one, "" without one."""
 
     def __init__(self) -> None:
         self.version = ""

@@ -1,10 +1,9 @@
-"""Recorded CAN bus, read by the drivers that would serve it live: `fusiond process --can LOG`.
+"""Recorded CAN bus through the daemon's drivers: `fusiond process --can LOG`.
 
-Frames go to the very drivers that the configuration names, and their stamps to the daemon's own
-`Clock`, whose host lives by the log: the recorder's stamp of a frame is the instant at which it
-came, and its clock is the system's, which may be set (fusiond.clock.recorder_clock). Times are
-those of the log, POSIX seconds where the recorder knew the date; where its clock was set, they are
-those of the clock as it was at the end.
+Frames go to the configured drivers, and their stamps to the daemon's own `Clock`, with the log as
+host time: the recorder's stamp of a frame is its arrival, and the recorder's clock is the system
+clock, which may be set (fusiond.clock.recorder_clock). Times are those of the log, POSIX seconds if
+the recorder knew the date; if its clock was set, those of the clock at the end.
 """
 
 from __future__ import annotations
@@ -72,11 +71,11 @@ REFUSALS = {
 
 class CanLog(NamedTuple):
     """Contents of a log: IMU samples with their refusals, measurements with their arrivals,
-    refusals of frames (`can`) and by source of a measurement; `events` (code, text); how many
+    refusals of frames (`can`) and by source of a measurement; `events` (code, text); number of
     `frames`.
 
-    `units` are the samples of all units with their instants (ns), in the order in which they came,
-    where the configuration has a spare; `imu` is then of the first alone."""
+    With a spare in the configuration `units` are the samples of all units with their instants (ns),
+    in order of arrival, and `imu` those of the first alone."""
 
     imu: ImuTable
     arrivals: list[Arrival]
@@ -104,8 +103,8 @@ class _LogTime:
 
 
 def read_can_log(path: Path, config: Config) -> CanLog:
-    """Take the log apart by the drivers of the configuration: once more where its reports of UTC
-    tell that the recorder's clock was slewed. Raises `TableError`."""
+    """Read the log by the configured drivers; twice if its reports of UTC show that the recorder's
+    clock was slewed. Raises `TableError`."""
     once = _Replay(path, config)
     log = once.read()
     source, slews = once.reports.slews(config.clock.max_clock_drift_ppm)
@@ -236,7 +235,7 @@ class _Replay:
         )
 
     def _report_pause(self, passed_ns: int) -> None:
-        """Report a pause, which resembles a step of the clock where no device reports UTC."""
+        """Report a pause, which resembles a step of the clock if no device reports UTC."""
         if passed_ns > PAUSE_NS:
             text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
             if not self.reports:

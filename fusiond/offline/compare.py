@@ -1,15 +1,15 @@
-"""A solution against a truth: errors, and whether the stated sigma covers them.
+"""Comparison of a solution with a truth: errors, and errors relative to the stated sigma.
 
 The solution is interpolated to the truth's epochs, linearly in position, velocity, sigma and in
 unwrapped angles; never beyond its ends, never across a gap of more than `MAX_GAP_S`. Errors are
 solution minus truth, position in metres north, east, down by the radii of curvature at the truth.
 
-"Inside k sigma horizontally" is d^2 = (north / sd_n)^2 + (east / sd_e)^2 <= k^2, the error
-ellipse whose axes lie north and east. For a two-dimensional Gaussian the share is the Rayleigh
+"Inside k sigma horizontally" is d^2 = (north / sd_n)^2 + (east / sd_e)^2 <= k^2, the error ellipse
+whose axes lie north and east. For a two-dimensional Gaussian the share is the Rayleigh
 distribution's 1 - exp(-k^2 / 2): 39.3 %, 86.5 %, 98.9 % for k = 1, 2, 3. The normalised estimation
 error squared (NEES) is taken from the same diagonal, d^2 + (down / sd_d)^2, mean 3 when honest
-(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.2).
-A truth's own error is not taken off: an RTK track adds its centimetres to every figure.
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.2). A
+truth's own error is not subtracted: an RTK track adds its centimetres to every figure.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Report: TypeAlias = dict[str, float | int | None]
 
 
 class NothingToCompareError(Exception):
-    """Solution and truth have no epoch in common; the text says which times each covers."""
+    """Solution and truth have no common epoch; the text has the times that each covers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class Errors:
     """Solution minus truth at n common epochs `t_s`, and the solution's sigma.
 
     All (n, 3): `position` (m) and `velocity` (m/s) north, east, down, `attitude` (rad) roll, pitch,
-    yaw; `sd_*` alike; NaN where a file does not say. `not_covered` epochs of the truth have no
-    solution.
+    yaw; `sd_*` likewise; NaN for values that a file lacks. `not_covered` epochs of the truth have
+    no solution.
     """
 
     t_s: Floats
@@ -98,10 +98,10 @@ def errors_of(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float 
 
 
 def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 0.0) -> Report:
-    """Error statistics, flat, units in the names; None where a file does not hold the quantity.
+    """Error statistics, flat, units in the names; None if a file lacks the quantity.
 
-    `after_s` leaves out what lies less than this after the solution's first epoch. `*_p95_*` is the
-    95th percentile of the absolute error. Raises `NothingToCompareError`.
+    `after_s` omits that time after the solution's first epoch. `*_p95_*` is the 95th percentile of
+    the absolute error. Raises `NothingToCompareError`.
     """
     return report_of(errors_of(solution, truth, after_s))
 

@@ -263,9 +263,8 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     """Read UBX or RTCM 3 bytes of a wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
     must be GPS second of week or POSIX seconds.
 
-    What the satellites broadcast is known from the first epoch on, as to a receiver that has been
-    on for some minutes: a recording that starts in the middle would take half a minute to several
-    to say it again.
+    Broadcast data are known from the first epoch on, as to a receiver that has been on for some
+    minutes; a recording would need half a minute or more to repeat them.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
     from fusiond.offline.receiver_logs import read_rinex, rinex_text  # noqa: PLC0415

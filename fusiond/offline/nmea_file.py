@@ -55,8 +55,8 @@ _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
 
 
 class Receiver(NamedTuple):
-    """Owner of the sentences, by the configuration: source and options of the receiver, and of the
-    compass where there is one."""
+    """Owner of the sentences, by the configuration: source and options of the receiver, and of a
+    compass, if any."""
 
     source: str
     decoding: NmeaDecoding
@@ -96,7 +96,7 @@ def read_nmea(
     path: Path, imu_s: tuple[float, float] | None, by: Receiver
 ) -> tuple[list[Received], list[Rejection]]:
     """Measurements in the file's order; times are POSIX, as the IMU's from and to `imu_s`, or GPS
-    second of week where that is None. What makes them poorer than they could be is a note.
+    second of week if that is None. A note tells what would improve them.
 
     Raises `TableError` for a file without a single measurement, with the reason.
     """

@@ -72,15 +72,14 @@ def process(
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
-    Of the solution: its rows, by mode too; when it begins; the sentence `why` where there is none.
-    Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
+    The result on the solution: its rows, by mode too; its start; a sentence `why` if there is none.
+    Samples whose units contradict their columns are not navigated, and no `out` is written.
     `systems` are the satellite systems of raw data to use, instead of the configuration's.
-    `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` sees the navigator
-    each time it has advanced; `progress(done, total)` counts samples. With `smooth` the solution
-    written at each sample is of all measurements, not of those until then. Raises `TableError` for
-    a file that cannot be read as what it is said to be, and for an outage of a source that there is
-    not; `ConfigError` for a filter that cannot be smoothed; `MissingPackageError` for a format
-    whose package is not installed.
+    `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` receives the
+    navigator after each advance; `progress(done, total)` counts samples. With `smooth` the solution
+    at each sample uses all measurements, later ones too. Raises `TableError` for a file that is not
+    of its stated kind, and for an outage of an unknown source; `ConfigError` for a filter that
+    cannot be smoothed; `MissingPackageError` for a format whose package is not installed.
     """
     with _imports_left_alone():
         read = read_recorded(config, imu_path, measurements, outages or (), systems, can_log)

@@ -185,7 +185,7 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
 
 
 def _said(doubt: warnings.WarningMessage) -> str:
-    """Words of the unpacking program on what it has left out, on one line."""
+    """Message of the unpacking program on omitted data, on one line."""
     return f"the unpacking says: {' '.join(str(doubt.message).split())}"
 
 
@@ -203,7 +203,7 @@ def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
     """Read epochs of an observation file, or messages of a navigation file.
 
     An ephemeris arrives when it was sent; the first of each satellite is known from the start, as
-    to a receiver that has been on. TableError where it is neither."""
+    to a receiver that has been on. TableError for any other file."""
     counters = Counter[str]()
     try:
         text = as_version_3(text)

@@ -1,8 +1,8 @@
 """Reports of UTC in a recorded CAN bus, as evidence on its recorder's clock.
 
-Before and behind a leap of its stamps they tell by how much it was set; all of them together, by
-how much it was slewed (fusiond.clock.recorder_clock, recorder_rate). What comes later is looked at
-by drivers of its own, of which nothing remains.
+Reports before and after a jump of the stamps show the step of the clock; all of them together show
+its slew (fusiond.clock.recorder_clock, recorder_rate). Reports ahead of the present frame are read
+by separate drivers, whose state is discarded.
 """
 
 from __future__ import annotations

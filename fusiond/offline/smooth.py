@@ -7,9 +7,9 @@ measurements before an alignment are no evidence on the navigation after it. Inv
 remain invalid: measurements that contradicted the filter do not improve it backward.
 
 Measurements at 12 instants a second make 0.3 GB of tape an hour, samples at 100 Hz 0.06 GB of
-solutions. An hour is kept in memory, where it costs least; what comes beyond that goes to a
-temporary file without a name, where TMPDIR says. Nothing is thinned out or rounded to single
-precision: P_s = P - P Lambda P is a small difference of large numbers where smoothing helps most.
+solutions. An hour is kept in memory; anything beyond it goes to a temporary file without a name in
+TMPDIR. Nothing is thinned out or rounded to single precision: P_s = P - P Lambda P is a small
+difference of large numbers where smoothing helps most.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def taped(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> TapedKalm
 class SmoothedRows:
     """Writer of the navigator's rows, smoothed once their start has ended.
 
-    `navigator` has an estimator of `taped`. `rows`, `nodes`, `starts` count what was smoothed.
+    `navigator` has an estimator of `taped`. `rows`, `nodes`, `starts` count the smoothed ones.
     """
 
     def __init__(self, navigator: Navigator, writer: RowsWriter) -> None:
@@ -175,7 +175,7 @@ class _Spool:
         self._held_bytes = 0
 
     def put(self, *arrays: NDArray[Any]) -> Held:
-        """Keep arrays; whoever holds what is returned gets them back."""
+        """Store arrays; return a handle to read them back."""
         size = sum(array.nbytes for array in arrays)
         if self._held_bytes + size <= MOST_BYTES:
             self._held_bytes += size

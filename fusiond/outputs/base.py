@@ -43,7 +43,7 @@ class Output(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Context of an output: `on_event(code, text)` receives what it reports."""
+    """Context of an output: `on_event(code, text)` receives its events."""
 
     vehicle: str
     on_event: Callable[[str, str], None]

@@ -45,7 +45,7 @@ def readable_by_all(path: Path | None) -> bool:
 def tls_context(options: Mqtt) -> ssl.SSLContext | None:
     """TLS context that verifies the broker and its name; None if TLS is off.
 
-    Raises `ConfigError` for files that cannot be used, or that are given while TLS is off.
+    Raises `ConfigError` for unusable files, or for files with TLS off.
     """
     given = [k for k in ("ca_file", "cert_file", "key_file") if getattr(options, k) is not None]
     if not options.tls:

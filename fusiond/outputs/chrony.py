@@ -2,9 +2,9 @@
 
     offset = true UTC - CLOCK_REALTIME, at an instant of CLOCK_REALTIME
 
-The report with the least delay of each second counts, since delay is one-sided. Reports go on
-as they came, past the daemon's own estimate of UTC: chrony has a filter, and what it does to the
-clock must show in the next sample. Nothing goes out before UTC is settled.
+The report with the least delay of each second counts, since delay is one-sided. Reports are passed
+on unchanged, without the daemon's own estimate of UTC: chrony has a filter, and its effect on the
+clock must show in the next sample. Nothing is sent before UTC is settled.
 
 Source: refclock_sock.c of chrony 4.3, struct sock_sample.
 """

@@ -1,9 +1,9 @@
-"""Places of a server: who gives way when all are taken and one more comes.
+"""Places of a server: the client to disconnect when a new one finds all taken.
 
-First a client that owes something: a missing request, or an answer that it does not read. Then, if
-one host has more connections than the newcomer's would have, that host's last one: a host may have
-all places while nobody else wants one. An IPv6 host is its network of 64 bits, all addresses of
-which it may have (RFC 4291, 2.5.4).
+First a client without a request, or one that does not read its answer. Then, if one host has more
+connections than the newcomer's would have, that host's last one: a host may have all places while
+no other host wants one. An IPv6 host is its network of 64 bits, all addresses of which it may have
+(RFC 4291, 2.5.4).
 """
 
 from __future__ import annotations

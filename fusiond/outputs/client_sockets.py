@@ -49,7 +49,7 @@ class Guest(Protocol):
     """Client connection."""
 
     def look(self, now_ns: int) -> None:
-        """Wake up, or give up: called four times a second."""
+        """Continue or abort a wait; called four times a second."""
 
 
 class Guests:
@@ -84,7 +84,7 @@ class Guests:
         return len(self._open) >= self.most
 
     def places(self, wanted: int) -> int:
-        """Share of a server that wants `wanted` places, where there are too few for all."""
+        """Share of a server that wants `wanted` places, if there are too few for all."""
         return min(wanted, self.most * wanted // max(wanted, self.wanted))
 
     def came(self, guest: Guest) -> None:

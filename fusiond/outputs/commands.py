@@ -1,4 +1,4 @@
-"""Commands on `cmd/<name>`: what may be asked of the daemon over MQTT, and how it is checked."""
+"""Commands on `cmd/<name>` over MQTT, and their checks."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class RequestFix(Command):
 class SendMessage(Command):
     """Send a text to another card by the RDSS terminal.
 
-    With `receipt` the other side, which must be fusiond's, confirms it, and it goes again until it
-    has: see `docs/rdss-messages.md`. `source` names the terminal where there are several.
+    With `receipt` the receiving fusiond confirms it, and it is sent again until confirmed: see
+    `docs/rdss-messages.md`. `source` names the terminal, if there are several.
     """
 
     card: Annotated[int, Field(ge=1, le=9_999_999)]
@@ -89,7 +89,7 @@ class Inject(Command):
 
 
 class SetGates(Command):
-    """The gates of a configuration that was read again; nobody sends it."""
+    """Gates of a reloaded configuration; internal, not sent over MQTT."""
 
     gates: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]]
     """`gate_probability` by section of `aiding`."""

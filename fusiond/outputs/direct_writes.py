@@ -1,8 +1,7 @@
-"""Direct writes of an MQTT client: a packet goes out as it is made, while the socket takes it.
+"""Direct writes of an MQTT client: a packet is sent as it is made, if the socket has room.
 
-aiomqtt has the loop wake for each packet to write it, by a byte through a pipe of its own, and a
-task waits for that: three turns of the loop, half of what a message costs. Here the loop is asked
-for the rest only where the socket is full.
+aiomqtt wakes the loop for each packet by a byte through a pipe, and a task waits for it: three
+turns of the loop, half the cost of a message. Here the loop is used only if the socket is full.
 """
 
 from __future__ import annotations

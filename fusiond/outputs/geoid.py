@@ -38,7 +38,7 @@ class SeaHeight(NamedTuple):
 
 def sea_height(nav: NavMessage, configured_m: float | None) -> SeaHeight | None:
     """Height of a solution above the sea, by the configured geoid height, else by the table. None
-    where the solution lacks position, height or the height's sigma."""
+    if the solution lacks position, height or the height's sigma."""
     lat, lon, height = known(nav.lat_deg), known(nav.lon_deg), known(nav.height_m)
     if not usable(nav) or lat is None or lon is None or height is None:
         return None

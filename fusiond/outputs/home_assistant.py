@@ -1,8 +1,8 @@
-"""Home Assistant finds the vehicle: one retained message at the broker describes its entities.
+"""Home Assistant's discovery: one retained message at the broker describes the entities.
 
-They read the topics that there are: `tracker`, `status` and `health`, never `nav`, which would
-flood Home Assistant's recorder. The broker keeps the description; it is sent again when Home
-Assistant says that it has started, for brokers that forget.
+They read the topics `tracker`, `status` and `health`, never `nav`, which would flood Home
+Assistant's recorder. The broker retains the description; it is sent again when Home Assistant
+starts, for brokers that lose it.
 
 Source: "MQTT Discovery, device discovery payload" of Home Assistant's documentation, the
 abbreviations of its release 2025.4.

@@ -1,4 +1,4 @@
-"""A place for one value: what comes replaces what has not been taken."""
+"""Place for one value: a new value replaces one that was not read."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ T = TypeVar("T")
 
 
 class Latest(Generic[T]):
-    """`put` never waits; `next` waits for a value that it has not given yet. `replaced` counts
-    values that nobody took; `last` is the newest, taken or not."""
+    """`put` never waits; `next` waits for a new value. `replaced` counts unread values; `last` is
+    the newest, read or not."""
 
     def __init__(self) -> None:
         self.last: T | None = None

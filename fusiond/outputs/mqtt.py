@@ -152,7 +152,7 @@ class MqttPublisher:
     # ------------------------------------------------------------------ the connection
 
     async def run(self) -> None:
-        """Keep a connection until cancelled; then say `offline` and disconnect."""
+        """Keep a connection until cancelled; then publish `offline` and disconnect."""
         if broker_access.readable_by_all(self._options.password_file):
             path = self._options.password_file
             self._on_event("mqtt_password_exposed", f"{path} is readable by all: chmod 600 {path}")

@@ -1,4 +1,4 @@
-"""Version of MQTT for a broker: 5, or 3.1.1 where it does not know that.
+"""Version of MQTT for a broker: 5, or 3.1.1 if it does not support that.
 
 A client of version 5 states its largest packet (Maximum Packet Size, MQTT 5, 3.1.2.11.4): the
 broker keeps longer ones. It also learns whether a command was retained (Retain As Published,

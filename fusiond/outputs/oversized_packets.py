@@ -30,7 +30,7 @@ SOCKET_OPTIONS = (
 def limit(client: aiomqtt.Client, most_payload: int) -> None:
     """Limit the stored payload to `most_payload` bytes and one more.
 
-    paho has no such limit, so its reads are cut where it makes them; aiomqtt keeps it as `_client`.
+    paho has no such limit, so its reads are replaced; aiomqtt has it as `_client`.
     """
     paho = client._client
     read = paho._sock_recv

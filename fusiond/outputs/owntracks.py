@@ -28,7 +28,7 @@ _KMH_M_S = 1.0 / 3.6
 
 
 class Location(RootModel[dict[str, str | int | float]]):
-    """`_type` location; what is not known is left out."""
+    """`_type` location; unknown values are omitted."""
 
 
 class OwnTracksLocations:

@@ -164,7 +164,7 @@ def _labelled(
     labels: tuple[str, ...],
     values: Mapping[Any, float | None],
 ) -> Family:
-    """A family of series by the tuple of their labels' values; what is not known is left out."""
+    """Family of series by the tuple of their labels' values; unknown values are omitted."""
     samples = tuple(
         ("", tuple(zip(labels, key, strict=True)), float(value))
         for key, value in values.items()

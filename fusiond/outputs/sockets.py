@@ -1,4 +1,4 @@
-"""Sockets of a TCP server: where it listens, and how a connection is set."""
+"""Sockets of a TCP server: listening address, and options of a connection."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ async def bound(host: str, port: int) -> list[socket.socket]:
 
 
 def tune(sock: socket.socket, timeout_s: float) -> None:
-    """Notice a far end that is gone without a word: after 20 s of silence it is asked, twice 5 s
-    apart; what it should have confirmed is waited for `timeout_s`."""
+    """Detect a dead connection: after 20 s of silence it is probed twice, 5 s apart; unconfirmed
+    data are waited for `timeout_s`."""
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

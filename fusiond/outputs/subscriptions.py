@@ -55,7 +55,7 @@ class Incoming:
             self._on_message(paho, userdata, message)
 
     async def flood(self) -> float:
-        """Wait for one; how long to listen to nobody, s."""
+        """Wait for a flood; return the pause of the subscriptions, s."""
         await self._flooded.wait()
         if time.monotonic() - self._since_s > PEACE_S:
             self._quiet.reset()

@@ -271,9 +271,10 @@ class TcpServer:
 
     `greet(client)` gives the session of a connection. `counters`: `clients` (since the start),
     `clients_refused` (too many at once), `clients_dropped` (did not read), `clients_flooding`
-    (asked too often), `clients_gave_way` (to one of another host, or with an answer that it did not
-    take), `clients_faulty` (a fault of ours), `slowed` (read later, for what it sent), `malformed`,
-    `sent`, `skipped` (epochs that a client was too slow for). `port` says how it stands.
+    (asked too often), `clients_gave_way` (to one of another host, or with an unread answer),
+    `clients_faulty` (a fault of the server), `slowed` (read later, as it sent too much),
+    `malformed`, `sent`, `skipped` (epochs that a client was too slow for). `port` has the state of
+    the listening port.
     """
 
     def __init__(

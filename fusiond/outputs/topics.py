@@ -1,4 +1,4 @@
-"""The MQTT topics of a vehicle: what each carries and how it is delivered."""
+"""MQTT topics of a vehicle with content and delivery."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Topic:
         return f"{self.name}/{self.below}" if self.below else self.name
 
     def address(self, base: str) -> str:
-        """Address at the broker; an `absolute` one stands outside `base`."""
+        """Address at the broker; an `absolute` one is outside `base`."""
         return self.path if self.absolute else f"{base}/{self.path}"
 
 

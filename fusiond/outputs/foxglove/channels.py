@@ -66,7 +66,7 @@ _LOG = _object(
 class Channel:
     """Channel: `payload(message)` converts a message of `topic`; None sends nothing.
 
-    `schema()` is made when somebody asks for it: those of all topics take 0.05 s.
+    `schema()` is made on demand: those of all topics take 0.05 s.
     """
 
     id: int

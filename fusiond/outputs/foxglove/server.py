@@ -1,11 +1,12 @@
 """WebSocket server for Foxglove, Lichtblick and compatible viewers; needs `websockets`.
 
 A message is encoded once for all its viewers. Each viewer has a place for each of its
-subscriptions, in which a newer message replaces one that has not been sent: a slow one waits for
-itself alone, and holds no bytes of its own but those on their way. One that takes nothing for half
-a minute is disconnected, as is one that is gone without a word (`fusiond.outputs.tcp`).
+subscriptions, in which a newer message replaces an unsent one: a slow viewer delays only itself,
+and holds only the bytes in flight. A viewer that reads nothing for half a minute is disconnected,
+as is one whose connection is dead (`fusiond.outputs.tcp`).
 
-A browser says whose page connects (`Origin`): pages of this computer may, and those of `origins`.
+A browser states the origin of the page (`Origin`): pages of this computer and of `origins` may
+connect.
 
 Source: Foxglove WebSocket Protocol v1 (`foxglove.websocket.v1`, and `foxglove.sdk.v1`, which is the
 same for this server): serverInfo, advertise, subscribe, unsubscribe; binary message data is opcode

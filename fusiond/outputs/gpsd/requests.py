@@ -2,7 +2,7 @@
 
 A request is `?NAME;` or `?NAME={...};`. Clients end it with the semicolon, with a line end, with
 both, or, after an object, with neither: an object ends where its brackets close. Each byte is
-looked at once, in pieces of any size.
+examined once, in pieces of any size.
 
 Source: gpsd_json(5) of gpsd 3.22, "Core protocol commands"; what its clients really send.
 """

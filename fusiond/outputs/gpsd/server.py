@@ -41,8 +41,8 @@ class Watch:
     def ask(self, wanted: dict[str, Any]) -> str | None:
         """Adopt a client's object; the reason if it is invalid.
 
-        One that says no `enable` wants to watch; one that names no format gets no reports, as from
-        gpsd 3.22: clients that then connect again and ask for JSON read the answer first.
+        Without `enable` it starts watching; without a format it gets no reports, as from gpsd 3.22:
+        clients that then connect again and ask for JSON read the answer first.
         """
         asked = {k: v for k, v in wanted.items() if k in self.__slots__ and k != "raw"}
         wrong = [key for key, value in asked.items() if not isinstance(value, bool)]

@@ -32,7 +32,7 @@ def warning(meaning: str, advice: str) -> Entry:
 
 
 def error(meaning: str, advice: str) -> Entry:
-    """Entry of something that does not work until somebody acts."""
+    """Entry of a failure that needs an operator's action."""
     return Entry("error", meaning, advice)
 
 

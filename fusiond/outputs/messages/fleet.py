@@ -15,7 +15,7 @@ from fusiond.outputs.messages.short_message import Card
 
 
 class FleetMessage(Message):
-    """WGS 84, one sigma each; its time is that of the place. What was not said is null."""
+    """WGS 84, one sigma each; the time is that of the position. Unknown values are null."""
 
     card: Card
     source: str = Field(description="the terminal that received it")

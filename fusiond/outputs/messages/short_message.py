@@ -16,7 +16,7 @@ Card = Annotated[
 
 
 class ShortMessage(Message):
-    """Stage of one message: each change of one of ours, and each that comes, once.
+    """State of one message: each change of an own one, and each received one, once.
 
     Its time is that of the change. A report that a killed daemon could not publish follows after
     its restart: the same `serial` marks the same message.
