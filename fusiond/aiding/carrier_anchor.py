@@ -32,7 +32,7 @@ added to B and C once, when they are cloned,
     (B, C) += G n(a),   G = (H^T W H + I)^-1 H^T W,   H = [-u_a, -1],   W = diag(1 / s_i^2)
 
 (I, (1 m)^-2, lets a direction that too few satellites measure have none.) Beside it B and C walk by
-what of the satellites' own drift looks like one, G cov(d) G^T a second, d of `DRIFT_M_SQRT_S` each
+what of the satellites' own drift looks like one, G cov(d) G^T a second, and the place with B
 (fusiond.aiding.carrier_anchor_noise): orbits and clocks drift for minutes, three or four satellites
 make many times as much of a place, and what is added at the anchor alone the inertial unit bridges.
 What is left of n(a) is a constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its
@@ -43,8 +43,8 @@ leverage, which least squares do not see. It shows in their residuals v of z, an
 with f = 1 - h, and of b again what least squares see is left out: the gains differ, and what they
 made of a displacement would be followed by the place, unseen, for ever. So the noise of a row is
 that of its own epoch and V. q is what atmosphere, orbit and clock do beside their models, as a
-walk, thin 1 at the zenith; B walks by it, too. Residuals d of what z has changed by since the epoch
-before show how noisy this receiver's phases are,
+walk, thin 1 at the zenith. Residuals d of what z has changed by since the epoch before show how
+noisy this receiver's phases are,
 
     scale = (20 + sum d^2 / 2 s^2) / (20 + sum (n - 4)),       s^2 <- scale s^2
 
