@@ -1,7 +1,7 @@
 r"""Sizes of a bank's hypotheses, and the covariance that they add to the published one.
 
-Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
-the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
+Of the mixture of fusiond.estimators.fault_mixture nine variances are published, with three products
+of the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
 
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 

@@ -19,7 +19,7 @@ it is known to `clock_sd_s` and shares nothing with the state. The same sums hol
 clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
 
 What hypotheses of a fault leave open, as they are weighed, is added to it: variances (9,) that are
-no part of P (fusiond.estimators.fault_odds).
+no part of P (fusiond.estimators.fault_mixture).
 
 Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
 its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
