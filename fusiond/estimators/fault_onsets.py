@@ -161,7 +161,6 @@ def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> Non
     """Keep the onset whose turn to restart has come, in place of a less likely one of the level
     above.
 
-
     The mixture then loses the least likely of all, as any sum that is cut to length."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
