@@ -6,8 +6,9 @@ With H of the satellites (fusiond.aiding.carrier_anchor), W = diag(1 / s_i^2) of
 
 v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is
 the deviation of a satellite's orbit, clock and atmosphere from the broadcast, which drifts at the
-same rate for minutes: a way r t, which no walk has at two times. Up to the end of an anchor, it is that of a walk of q_a, and in minutes that of q > q_a. Carriers measure the way of the antenna
-and, in it, the satellites' drift:
+same rate for minutes: a way r t, which no walk has at two times. Over an anchor it is that of a
+walk of q_a, and over minutes that of q > q_a. Carriers measure the way of the antenna and, in it,
+the satellites' drift:
 
     B <- B + w_a + w,    dr <- dr - E^T w,    v of w_a = q_a^2 dt,  v of w = (q^2 - q_a^2) dt
 

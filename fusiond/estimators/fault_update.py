@@ -299,8 +299,7 @@ def account(
     work: Single,
 ) -> None:
     """Update the bank from `work` of `sensitivity_rows` and the whitened innovation y (m,); `fused`
-    if the filter uses the rows, with g (m, w) from `whiten`. They stand for `rows` rows, whose
-    innovation has in its square a `noise` that no hypothesis explains."""
+    rows have g (m, w) of `whiten`. They stand for `rows` rows with an unexplained square `noise`."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
