@@ -163,6 +163,10 @@ class MultiscaleEstimator(Estimator):
             return Outcome("not_finite", nis, degrees)
         return Outcome("gated", nis, degrees)
 
+    def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
+        """The measurement's innovation, linear in the error state, of which P is not `_covs` alone."""
+        return self._weighed(measurement, measurement.innovation(self.state))
+
     def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
         """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
         z, h, r = rows
