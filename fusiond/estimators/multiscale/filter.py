@@ -164,7 +164,7 @@ class MultiscaleEstimator(Estimator):
         return Outcome("gated", nis, degrees)
 
     def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
-        """The measurement's innovation, linear in the error state, of which P is not `_covs` alone."""
+        """The innovation of a measurement, which sees P and not Q alone."""
         return self._weighed(measurement, measurement.innovation(self.state))
 
     def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
