@@ -102,6 +102,10 @@ class Broker:
             self._process.wait(PATIENCE_S)
             self._process = None
 
+    def set_nice(self, nice: int) -> None:
+        assert self._process is not None
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
+
     def freeze(self) -> None:
         """The kernel still accepts connections and bytes; nobody reads them."""
         assert self._process is not None

@@ -62,7 +62,8 @@ class NmeaDecoder:
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `datum_refused`, `height_implausible`, `speed_implausible`, `sigma_too_large`; within one
     `heading_mode_refused`, `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`,
-    `gga_awaited`, `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`.
+    `gga_awaited`, `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`, `bad_date`,
+    `course_missing`, `speed_held_at_zero`, `two_receivers`.
     """
 
     def __init__(
@@ -200,6 +201,7 @@ class NmeaDecoder:
                 self._close(found, learn=True)
             elif again:  # of another talker: the same fix by another name
                 self.counters["repeated_sentence"] += 1
+                self.counters["two_receivers"] += _is_elsewhere(sentence, epoch)
                 return
         elif time_ns is None and self._closed_by == "last" and formatter not in self._cycle.last:
             self._delayed()
@@ -279,6 +281,13 @@ class NmeaDecoder:
         self._cycle.ended(epoch.cycle, epoch.phase_ns, learn=learn)
         self._closed, self._closed_by = epoch, by
         self._judge.epoch(epoch, found)
+
+
+def _is_elsewhere(sentence: Sentence, epoch: Epoch) -> bool:
+    """True if another talker's GGA of this epoch prints another place."""
+    place = ",".join(sentence.fields[1:5]).encode()
+    others = [raw for raw in epoch.raws if raw[3:6] == b"GGA"]
+    return sentence.formatter == "GGA" and bool(others) and not any(place in r for r in others)
 
 
 def _is_tail(epoch: Epoch) -> bool:

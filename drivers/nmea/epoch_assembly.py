@@ -41,6 +41,7 @@ from drivers.nmea.fields import (
     typed_fields,
 )
 from drivers.nmea.mixed_framing import Sentence
+from drivers.nmea.printed_velocity import PrintedSpeed
 from drivers.nmea.time import parse_time_of_day, printed_time
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.quantization import NEAREST_SD
@@ -56,11 +57,9 @@ MAX_CYCLE = 24
 
 KNOT_M_S = 1852.0 / 3600.0
 KM_H_M_S = 1.0 / 3.6
-STANDSTILL_M_S = 0.05
-"""Speed below which an absent course means standing still: the Doppler velocity noise of a receiver
-(u-blox ZED-F9P data sheet: 0.05 m/s)."""
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
 _ESTIMATED = frozenset("EMS")
+_METRES = ("M", "")
 _NOT_VALID = frozenset(("V", "N", ""))
 NOVATEL_SBAS = 9
 """GGA quality of NovAtel for a fix with satellite corrections (WAAS)."""
@@ -101,6 +100,8 @@ class Epoch:
     by_plain: str = ""
     """Sentence with position and mode where neither GGA nor GNS exists: RMC or GLL."""
     place: PrintedPosition | None = None
+    talker: str = ""
+    """Talker of the sentence with the place."""
     altitude_m: float | None = None
     height_step_m: float = 0.0
     separation_m: float | None = None
@@ -118,8 +119,7 @@ class Epoch:
     """Fix mode of GSA: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
     sd_ned_m: Vector3 | None = None
     """Printed sigmas; `implausible` checks them."""
-    speed_m_s: float | None = None
-    course_deg: float | None = None
+    speed: PrintedSpeed | None = None
     heading_deg: float | None = None
     heading_mode: str | None = None
 
@@ -134,6 +134,8 @@ class Epoch:
         self.t_seen_ns = t_seen_ns
         if formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
             self.t_day_seen_ns = t_seen_ns
+        if formatter in ("GGA", "GNS"):
+            self.talker = self.talker or sentence.talker
         self.cycle.append(formatter)
         self.addresses.add(sentence.address)
         self.raws.add(sentence.raw)
@@ -194,20 +196,11 @@ class Epoch:
         height = (self.altitude_m or 0.0) + (self.separation_m or 0.0)
         if not within(height, HEIGHT_M):
             return "height_implausible"
-        if self.speed_m_s is not None and self.speed_m_s > SPEED_M_S:
+        if self.speed is not None and self.speed.speed_m_s > SPEED_M_S:
             return "speed_implausible"
         if self.sd_ned_m is not None and max(self.sd_ned_m) > SIGMA_M[1]:
             return "sigma_too_large"
         return None
-
-    def v_ned_m_s(self) -> tuple[float, float, None] | None:
-        """Horizontal velocity; None when the receiver gives no course though it moves."""
-        if self.speed_m_s is None:
-            return None
-        if self.course_deg is None:
-            return (0.0, 0.0, None) if self.speed_m_s < STANDSTILL_M_S else None
-        course = math.radians(self.course_deg)
-        return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:
@@ -223,6 +216,8 @@ def time_of_day_ns(sentence: Sentence) -> int | None:
 
 def _take_height(epoch: Epoch, fields: Fields) -> None:
     epoch.altitude_m, epoch.separation_m = number(fields, "alt"), number(fields, "sep")
+    if letter(fields, "altUnit").upper() not in _METRES:  # feet, by some simulators
+        epoch.altitude_m = None
     if epoch.altitude_m is not None:
         epoch.height_step_m = step(fields["printed"][8])
 
@@ -278,7 +273,8 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     else:
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
     if speed is not None and epoch.rmc_valid:
-        epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
+        step_m_s = step(fields["printed"][6]) * KNOT_M_S
+        epoch.speed = PrintedSpeed(speed * KNOT_M_S, step_m_s, course)
 
 
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
@@ -297,12 +293,13 @@ def _take_vtg(epoch: Epoch, fields: Fields) -> None:
     epoch.modes |= set(mode)
     if mode == "N":
         return
-    if epoch.speed_m_s is not None:
-        epoch.course_deg = course if epoch.course_deg is None else epoch.course_deg
+    if epoch.speed is not None:
+        if epoch.speed.course_deg is None:
+            epoch.speed = epoch.speed._replace(course_deg=course)
     elif knots is not None:
-        epoch.speed_m_s, epoch.course_deg = knots * KNOT_M_S, course
+        epoch.speed = PrintedSpeed(knots * KNOT_M_S, step(fields["printed"][4]) * KNOT_M_S, course)
     elif km_h is not None:
-        epoch.speed_m_s, epoch.course_deg = km_h * KM_H_M_S, course
+        epoch.speed = PrintedSpeed(km_h * KM_H_M_S, step(fields["printed"][6]) * KM_H_M_S, course)
 
 
 def _take_gsa(epoch: Epoch, fields: Fields) -> None:

@@ -24,6 +24,7 @@ from drivers.measurements import (
 )
 from drivers.nmea.epoch_assembly import INTEGRATED, Epoch
 from drivers.nmea.geoid_fallback import Geoid, states_geoid
+from drivers.nmea.printed_velocity import VelocityReader
 from drivers.nmea.reasons import Received, count_name
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
@@ -54,8 +55,11 @@ class EpochConverter:
         self._order = EpochOrder(counters)
         self._trust = TimeTrust()
         self._geoid = Geoid()
+        self._velocity = VelocityReader(counters)
         self._without_gga = 0
         """Consecutive epochs with RMC or GLL but neither GGA nor GNS."""
+        self._talker = ""
+        """Talker of the last position."""
 
     def in_two_parts(self) -> None:
         """The last epoch was no whole one: it has what one of them lacked."""
@@ -64,6 +68,9 @@ class EpochConverter:
     def epoch(self, epoch: Epoch, found: list[Measurement]) -> None:
         """Judge one that is closed; what it comes to is `found`."""
         self.counters["epochs"] += 1
+        if epoch.place is not None and epoch.talker != self._talker:
+            self.counters["two_receivers"] += bool(self._talker)
+            self._talker = epoch.talker
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
             count_name(self._received.statuses, epoch.unknown_status)
@@ -182,6 +189,7 @@ class EpochConverter:
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:
             self.counters["sigma_too_small"] += 1
             sd_ned_m = None
+        v_ned_m_s, open_sd_m_s = self._velocity.velocity_of(epoch.speed)
         return PositionFix(
             self._source,
             epoch.t_seen_ns,
@@ -194,7 +202,8 @@ class EpochConverter:
             epoch.hdop,
             epoch.vdop,
             sd_ned_m,
-            epoch.v_ned_m_s(),
+            v_ned_m_s,
             rounding_sd_ned_m=epoch.rounding_sd_ned_m,
+            rounding_sd_v_m_s=open_sd_m_s,
             geoid_sd_m=geoid_sd_m,
         )

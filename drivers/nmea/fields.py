@@ -39,7 +39,7 @@ Convert = Callable[[str], Any]
 
 def _degrees(printed: str) -> float:
     """Degrees of dddmm.mm. ValueError for invalid text, which pynmeagps passes as empty."""
-    found = dmm2ddd(printed)
+    found = dmm2ddd("0" + printed if printed.find(".") == 3 else printed)  # 812.5 of small devices
     if found == "":
         raise ValueError(f"not an angle: {printed!r}")
     return cast(float, found)
@@ -84,7 +84,7 @@ NO_DOP = 99.0
 """Receivers without a solution print 99.99."""
 MINUTE_M = 1852.0
 """Metres of a minute of latitude."""
-_PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
+_PRINTED_POSITION = re.compile(r"\d{1,2}[0-5]\d\.\d*,[NS],\d{1,3}[0-5]\d\.\d*,[EW]\Z")
 
 
 class PrintedPosition(NamedTuple):

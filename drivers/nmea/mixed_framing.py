@@ -56,6 +56,7 @@ _RDSS = frozenset(
     | {"LZM", "PWI", "SBX", "SNR", "TCI", "TXR", "WAA", "WBA", "ZTI"}
 )
 _RDSS_ZDA_FIELDS = 11
+_LINE_ENDS = b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,9 @@ class StreamSplitter(Splitter[Item]):
             # The two bytes behind the star may be the start of something else.
             why = "checksum_missing" if raw[-2] in b"\r\n" else "checksum_bad"
             return self._refuse(why, star + 1 - at)
-        address, *fields = raw[1:-3].decode("ascii").split(",")
+        if raw[-1:] in _LINE_ENDS:
+            raw = raw[:-1]
+        address, *fields = raw[1 : star - at].decode("ascii").split(",")
         if not _ADDRESS.match(address):
             return self._refuse("address_bad", len(raw))
         self.counters["sentences"] += 1
@@ -300,8 +303,12 @@ class NmeaSplitter:
 
 
 def _verifies(raw: bytes) -> bool:
-    """True if `$`...`*hh` contains the XOR of the characters between `$` and `*`."""
-    return b"%02X" % reduce(xor, raw[1:-3], 0) == raw[-2:].upper()
+    """True if `$`...`*hh` contains the XOR of the characters between `$` and `*`; below 16 it may
+    be one digit and the line's end (`%X` of small devices)."""
+    found, printed = reduce(xor, raw[1:-3], 0), raw[-2:].upper()
+    if printed[1:] in _LINE_ENDS:
+        return b"%X" % found == printed[:1]
+    return b"%02X" % found == printed
 
 
 def _ubx_length(buffer: bytearray, at: int) -> int | None:

@@ -237,7 +237,9 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
             "antenna more sky, or set the receiver to three dimensions"
         )
     if counters["height_missing"] > counters["fixes"] // 2:
-        found["height_missing"] = "the altitude in GGA is empty: fixes are used without a height"
+        found["height_missing"] = (
+            "the altitude in GGA is empty or not in metres: fixes are used without a height"
+        )
     if counters["rmc_alone"]:
         refused = " (other sentences have fields that cannot be true)" * (
             counters["bad_field"] >= MANY
@@ -269,6 +271,21 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
         status = received.statuses.most_common(1)[0][0]
         found["unknown_status"] = (
             f"RMC has the status {status!r}, which NMEA does not know: its velocity is not used"
+        )
+    if counters["two_receivers"] > max(counters["fixes"] // 2, MANY):
+        found["two_receivers"] = (
+            "positions of two talkers take turns and differ: two receivers are on this line, and "
+            "their fixes are taken for one's; give each a port of its own"
+        )
+    if counters["course_missing"] > max(counters["fixes"] // 2, MANY):
+        found["course_missing"] = (
+            "the receiver moves and gives a speed without a course: its fixes are used without "
+            "velocity; switch the course on in RMC or VTG"
+        )
+    if counters["speed_held_at_zero"] >= MANY:
+        found["speed_held_at_zero"] = (
+            "the receiver prints a speed of 0 whenever it is slow: it is used as one below 1.4 "
+            "m/s; switch static navigation (static hold) off"
         )
     return found
 

@@ -100,13 +100,16 @@ class Renewal(NamedTuple):
 
     The states t of the `blocks`, in units of their initial sigmas, become R t + w, with R `kept`
     and cov(w) `new` (k, k). A clone adds a part of the navigation errors: `of_navigation` (k, 9)
-    times them, in the states' units, with its `estimate` (k,)."""
+    times them, in the states' units, with its `estimate` (k,). `with_navigation`, A (9, k) and
+    C (k, k), is noise of covariance C that the states take and, as A times it, the navigation
+    errors."""
 
     blocks: tuple[str, ...]
     kept: Array
     new: Array
     of_navigation: Array | None = None
     estimate: Array | None = None
+    with_navigation: tuple[Array, Array] | None = None
 
 
 class Packed(NamedTuple):

@@ -32,7 +32,7 @@ is added to B and C once, at the cloning,
     (B, C) += G n(a),   G = (H^T W H + I)^-1 H^T W,   H = [-u_a, -1],   W = diag(1 / s_i^2)
 
 (I, (1 m)^-2, bounds directions that too few satellites measure.) B and C also walk by the
-corresponding part of the satellites' drift, G cov(d) G^T a second, d of `DRIFT_M_SQRT_S` each
+corresponding part of the satellites' drift, G cov(d) G^T a second, and the position walks with B
 (fusiond.aiding.carrier_anchor_noise): orbits and clocks drift for minutes, three or four satellites
 amplify that in the position, and the inertial unit bridges noise that is added at the anchor alone.
 The rest of n(a) is a constant b_i of each satellite, of variance s_i^2 (1 - h_i), h_i its leverage.
@@ -42,8 +42,8 @@ It shows in the residuals v of z, and is subtracted,
 
 with f = 1 - h; the part of b that least squares would see is removed: as gains differ, it would
 displace the position for ever, unseen. So the noise of a row is that of its own epoch and V. q is
-the walk of atmosphere, orbit and clock beside their models, thin 1 at the zenith; B walks by it,
-too. Residuals d of the change of z since the epoch before show the noise of this receiver's phases,
+the walk of atmosphere, orbit and clock beside their models, thin 1 at the zenith. Residuals d of
+the change of z since the epoch before show the noise of this receiver's phases,
 
     scale = (20 + sum d^2 / 2 s^2) / (20 + sum (n - 4)),       s^2 <- scale s^2
 

@@ -5,8 +5,16 @@ With H of the satellites (fusiond.aiding.carrier_anchor), W = diag(1 / s_i^2) of
     G = (H^T W H + I)^-1 H^T W        cov = G diag(v_i) G^T
 
 v = s^2 at the anchor, once; v = q^2 dt for the time dt since the clone last walked. The latter is
-the deviation of a satellite's orbit, clock and atmosphere from the broadcast: smooth over minutes,
-so that its effect on a position in 200 s is that of a walk, and in a second far less. If it were
+the deviation of a satellite's orbit, clock and atmosphere from the broadcast, which drifts at the
+same rate for minutes: a way r t, which no walk has at two times. Over an anchor it is that of a
+walk of q_a, and over minutes that of q > q_a. Carriers measure the way of the antenna and, in it,
+the satellites' drift:
+
+    B <- B + w_a + w,    dr <- dr - E^T w,    v of w_a = q_a^2 dt,  v of w = (q^2 - q_a^2) dt
+
+(E north, east and down in ECEF). w moves the clone and the position together: the way since the
+anchor does not contain it, nor does the velocity; the position does, beside ranges and other fixes.
+If all of it were the clone's, the stated velocity error would be twice the true one. If it were
 added to the clone at the anchor only, the inertial unit, which knows the position across that
 instant to millimetres, would accept the carriers' velocity as true: with four satellites of a DOP
 of 40, orbits that drift by 0.7 mm/s move the position by 30 mm/s.
@@ -40,7 +48,11 @@ none any more after some updates."""
 DRIFT_M_SQRT_S = 0.003
 """Walk of orbits and clocks over minutes: 42 mm in 200 s. Of a station with a known place each
 satellite's carrier goes from its range at 0.12 to 0.22 mm/s, the same rate for minutes (28 to 44 mm
-in 200 s), so that shorter times have less than a walk says, 4 to 7 mm for 16 in 30 s."""
+in 200 s)."""
+ANCHOR_M_SQRT_S = 0.0012
+"""That walk over an anchor: 6.6 mm in 30 s, of the same station 4.3 to 6.6 mm."""
+OF_ANCHOR = (ANCHOR_M_SQRT_S / DRIFT_M_SQRT_S) ** 2
+"""Share of the walk that the clone takes without the place."""
 WALKS_S = 0.9
 """Between two steps of the walk: those of each second."""
 

@@ -83,7 +83,7 @@ from fusiond.aiding.carrier_anchor import (
     antenna,
     go_on,
 )
-from fusiond.aiding.carrier_anchor_noise import phase_noise, walk_noise
+from fusiond.aiding.carrier_anchor_noise import OF_ANCHOR, phase_noise, walk_noise
 from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
@@ -342,5 +342,10 @@ class PseudorangeMeasurement(AidingMeasurement):
             phase_noise(self.values, place, self.left, noise)
             return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
         if cloned and walk_noise(self.values, place, t_s, self.left, noise):
-            return Renewal(_CLONED, _ALL_KEPT, noise)
+            # Antenna of the place: its transpose takes an error in ECEF back to north, east, down.
+            of_place, shared = np.zeros((9, 4)), np.zeros((4, 4))
+            of_place[6:9, :3] = of_navigation[:3, 6:9].T
+            shared[:3, :3] = (1.0 - OF_ANCHOR) * noise[:3, :3]
+            noise *= OF_ANCHOR
+            return Renewal(_CLONED, _ALL_KEPT, noise, with_navigation=(of_place, shared))
         return None

@@ -19,7 +19,9 @@ again to the present, with a position fix five times a second and a checkpoint e
 velocity in order of validity, files read and the solution written at every row;
 `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
 `late_tick_ratio`, the tick in which a fix comes that is 10 s late
-(`fusiond.bench.delayed_fix`).
+(`fusiond.bench.delayed_fix`);
+`late_raw_tick_ratio`, the same of an RDSS fix 1.5 s late over raw epochs of 40 satellites
+(`fusiond.bench.delayed_raw`).
 
 Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
 
@@ -56,6 +58,7 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.bench.delayed_fix import delayed_fix
+from fusiond.bench.delayed_raw import delayed_raw
 from fusiond.bench.fix_path import ordinary_fix
 from fusiond.bench.raw_epoch import raw_epoch
 from fusiond.bench.start import start
@@ -121,6 +124,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
     figures["raw_epoch_40_ratio"] = ratio(raw_epoch, repetitions)
     figures["late_tick_ratio"] = ratio(delayed_fix(repetitions), repetitions)
+    figures["late_raw_tick_ratio"] = ratio(delayed_raw(repetitions), repetitions)
     figures["multiscale_step_ratio"] = _step_ratio(
         lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), _one_source(), repetitions
     )

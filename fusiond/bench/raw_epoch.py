@@ -41,7 +41,8 @@ def raw_epoch(_: int) -> Callable[[], int]:
     section = RawAiding(systems=("G", "C"))
     intake = Intake({"gnss": section})
     raw = intake.receivers["gnss"]
-    before, epoch = _crowded(receiver, raw)
+    crowd = Crowd(receiver, 10, raw)
+    before, epoch = (crowd.of(receiver.epoch(at)) for at in (10, 11))
     start = truth.at(np.array([epoch.tow_s - receiver.start[1]]))
     imu = Imu()
     model = make_model("ins21", imu_noise(imu), *intake.extra_blocks())
@@ -74,36 +75,37 @@ def raw_epoch(_: int) -> Callable[[], int]:
     return work
 
 
-def _crowded(receiver: GnssRaw, raw: RawGnss) -> tuple[RawGnssEpoch, RawGnssEpoch]:
-    """Two successive epochs of 40 satellites; `raw` knows their ephemerides.
+class Crowd:
+    """A receiver's epochs with 40 satellites each, whose ephemerides `raw` knows.
 
     Half of them are doubles under numbers that the simulated constellations leave free, BeiDou's of
     the same kind of orbit.
     """
-    for model in receiver.ionosphere:
-        raw.learn(model)
-    epochs = receiver.epoch(10), receiver.epoch(11)
-    geostationary, others = iter(range(1, 6)), iter(range(6, 23))
-    gps = iter(range(33, 64))
-    doubles: dict[tuple[System, int], int] = {}
-    for s in epochs[0].signals:
-        if (s.system, s.prn) in doubles:
-            continue
-        free = gps if s.system == "G" else others
-        if is_beidou_geo(s.system, s.prn):
-            free = geostationary
-        doubles[s.system, s.prn] = next(free)
-    for e in receiver.broadcast(float(receiver.t_s[10]), set(doubles)):
-        raw.learn(e)
-        raw.learn(replace(e, prn=doubles[e.system, e.prn]))
-    few = list(doubles)[: SATELLITES - len(doubles)]
 
-    def crowded(epoch: RawGnssEpoch) -> RawGnssEpoch:
+    def __init__(self, receiver: GnssRaw, at: int, raw: RawGnss, source: str = "gnss") -> None:
+        self._source = source
+        for model in receiver.ionosphere:
+            raw.learn(model)
+        geostationary, others = iter(range(1, 6)), iter(range(6, 23))
+        gps = iter(range(33, 64))
+        self._doubles: dict[tuple[System, int], int] = {}
+        for s in receiver.epoch(at).signals:
+            if (s.system, s.prn) in self._doubles:
+                continue
+            free = gps if s.system == "G" else others
+            if is_beidou_geo(s.system, s.prn):
+                free = geostationary
+            self._doubles[s.system, s.prn] = next(free)
+        for e in receiver.broadcast(float(receiver.t_s[at]), set(self._doubles)):
+            raw.learn(e)
+            raw.learn(replace(e, prn=self._doubles[e.system, e.prn]))
+        self._few = set(list(self._doubles)[: SATELLITES - len(self._doubles)])
+
+    def of(self, epoch: RawGnssEpoch) -> RawGnssEpoch:
+        """The epoch with its doubles."""
         copied = [
-            replace(s, prn=doubles[s.system, s.prn])
+            replace(s, prn=self._doubles[s.system, s.prn])
             for s in epoch.signals
-            if (s.system, s.prn) in few
+            if (s.system, s.prn) in self._few
         ]
-        return replace(epoch, signals=(*epoch.signals, *copied))
-
-    return crowded(epochs[0]), crowded(epochs[1])
+        return replace(epoch, source=self._source, signals=(*epoch.signals, *copied))

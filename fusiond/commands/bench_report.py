@@ -22,6 +22,7 @@ _ROWS = {
     "unscented_propagation_step_ratio": ("second of it, propagation too", _KALMAN),
     "process_epoch_ratio": ("IMU row of `process`", _PRODUCT),
     "late_tick_ratio": ("tick with a fix that is 10 s late", _PRODUCT),
+    "late_raw_tick_ratio": ("tick with an RDSS fix 1.5 s late, raw GNSS", _PRODUCT),
     "reduced_order_step_ratio": ("step of 17 states", "step of 23 states"),
     "process_start_s": ("`process` before its first row", "a second"),
 }

@@ -17,14 +17,9 @@ if TYPE_CHECKING:
     from fusiond.doctor.forward_axis import Phase
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
-_NAMES = {
-    "can_imu": "imu",
-    "can_gnss": "gnss",
-    "nmea": "gnss",
-    "gnss": "gnss",
-    "compass": "compass",
-    "rdss": "rdss",
-}
+_NAMES = {"can_imu": "imu", "compass": "compass", "rdss": "rdss"}
+_RECEIVER = "gnss"
+"""Name of every other device that is recognised: a receiver, whatever it speaks."""
 ARM = typer.Option(metavar="F,R,D", help="m forward, right, down of the IMU.")
 Out = Annotated[Path, typer.Argument(metavar="CONFIG", help="File to write.")]
 VehicleClassName = Annotated[
@@ -234,7 +229,7 @@ def _sources(devices: list[Device]) -> list[DraftSource]:
     sources: dict[str, DraftSource] = {}
     raw = False
     for device in devices:
-        name = base = _NAMES[device.driver]
+        name = base = _NAMES.get(device.driver, _RECEIVER)
         if base == "imu" and base in sources:
             continue
         number = 1

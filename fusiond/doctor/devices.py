@@ -49,6 +49,8 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
             return [finding(code, detail=detail) for code in HINDRANCES if driver.counters[code]]
         return [detail] if detail else []
     if port is None:
+        if options.interface != "socketcan":
+            return [finding("bus_silent_elsewhere", detail=detail, name=name)]
         return [finding("bus_silent", detail=detail, channel=options.channel, name=name)]
     if on_network(str(port)):
         cause = getattr(driver, "cause", "")

@@ -41,13 +41,17 @@ FINDINGS: Mapping[str, str] = {
         "{channel} does not exist: load its driver or correct [sources.{name}]; {others}"
     ),
     "bus_down": (
-        "{channel} is down: ip link set {channel} up (with `type can bitrate 500000` where it is "
-        "not set yet)"
+        "{channel} is down: ip link set {channel} up (with `type can bitrate 250000`, or what the "
+        "unit has, where it is not set yet)"
     ),
     "bus_unusable": "{channel} cannot be used ({detail}): check the interface",
     "bus_silent": (
         "{detail}: check bit rate (ip -d link show {channel}), wiring and power; `candump "
         "{channel}` shows the frames on the bus, [sources.{name}] those required"
+    ),
+    "bus_silent_elsewhere": (
+        "{detail}: check that the unit sends, and that interface and channel in [sources.{name}] "
+        "are its"
     ),
     "bus_errors": (
         "{count} CAN error frames: check bit rate, wiring and the two 120 ohm terminators"

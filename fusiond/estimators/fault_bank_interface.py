@@ -48,7 +48,8 @@ from fusiond.estimators.fault_bank import (
     group_at,
     is_evidence,
 )
-from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
+from fusiond.estimators.fault_mixture import estimate, mixture
+from fusiond.estimators.fault_odds import FOUND, judge
 from fusiond.estimators.fault_onsets import begin_again, begin_all
 from fusiond.estimators.fault_prescreen import judge_what_waits
 from fusiond.estimators.fault_sizes import OPENED_WORK, RARE, judge_and_widen, widen_by_faults

@@ -1,4 +1,4 @@
-r"""Odds of a bank's hypotheses, and the uncertainty that they add to the published solution.
+r"""Odds of a bank's hypotheses.
 
     log odds            log(rate T) + l / 2 - max(p log(N) / 2, log det(I + S L) / 2)
                         for a kind of known size
@@ -7,16 +7,13 @@ r"""Odds of a bank's hypotheses, and the uncertainty that they add to the publis
     weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
                         a hypothesis does not explain what has come
     left unexplained    J - l against N - p by chi-square's mean and variance
-    left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
-                        the estimate of the filter, which is that of nothing wrong
 
 The gain of p unknowns by chance is subtracted, by the number of rows (Schwarz) or by the expected
 size of such a fault, whichever is more: a far smaller fault cannot be distinguished from unmodelled
 errors of a working receiver. Between kinds that fit alike there is no decision (`judge`).
 
 Source: as of fusiond.estimators.fault_bank; Schwarz, Estimating the dimension of a model, Annals of
-Statistics 6 (1978), 461; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for the moments of a
-mixture.
+Statistics 6 (1978), 461.
 """
 
 from __future__ import annotations
@@ -52,7 +49,6 @@ from fusiond.estimators.fault_bank import (
     L_ROWS,
     LANES,
     LASTS_S,
-    LEAST_WEIGHT,
     LENGTH,
     LIKELY,
     LOG_ODDS,
@@ -67,7 +63,6 @@ from fusiond.estimators.fault_bank import (
     P_AT,
     PRIOR,
     RESTARTS,
-    SENSITIVITIES,
     SIGNATURE,
     SIZE,
     SUSPECTS,
@@ -77,7 +72,6 @@ from fusiond.estimators.fault_bank import (
     UNEXPLAINED_SIGMAS,
     UNJUDGED,
     WEIGHT,
-    column_of,
     explained_by_three,
     group_at,
 )
@@ -354,68 +348,3 @@ def identified(found: Array) -> bool:
     `found`."""
     apart = found[BEST] >= 0.0 and found[AHEAD] > APART
     return bool(apart)
-
-
-@compiled("void(f8[::1], f8[:, ::1], i8, f8[:, ::1])", allocates=True)
-def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
-    """Write the covariance that the weighted hypotheses add to the first rows of the error state
-    (q, q)."""
-    q = opened.shape[0]
-    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
-    columns = v.shape[0] // n
-    opened[:] = 0.0
-    m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
-    for number in range(int(bank[ALL])):
-        at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
-        weight = bank[at + WEIGHT]
-        if weight < LEAST_WEIGHT:
-            continue
-        solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
-        for c in range(size):
-            for d in range(size):
-                x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
-            first = column_of(bank, number, c)
-            for i in range(q):
-                rows[c, i] = v[first + i * columns]
-        for i in range(q):
-            for c in range(size):
-                along = 0.0
-                for d in range(size):
-                    along += x[c, d] * rows[d, i]
-                for j in range(q):
-                    opened[i, j] += rows[c, j] * along
-
-
-@compiled("void(f8[::1], f8[:, ::1], i8, i8, f8[::1], f8[:, ::1])", allocates=True)
-def estimate(
-    bank: Array,
-    numbers: Array,
-    n: int,
-    number: int,
-    size_and_variance: Array,
-    effect: Array,
-) -> None:
-    """Write b (3,) and M (9,) of a group, and its effect V b and V M V^T: `effect` (1 + n, n)."""
-    at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
-    v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
-    columns = v.shape[0] // n
-    m = np.empty(12)
-    solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
-    size_and_variance[:] = 0.0
-    effect[:] = 0.0
-    rows = np.empty((3, n))
-    for c in range(size):
-        size_and_variance[c] = m[9 + c]
-        first = column_of(bank, number, c)
-        for i in range(n):
-            rows[c, i] = v[first + i * columns]
-            effect[0, i] += rows[c, i] * m[9 + c]
-        for d in range(size):
-            size_and_variance[3 + 3 * c + d] = m[3 * c + d]
-    for i in range(n):
-        for c in range(size):
-            along = 0.0
-            for d in range(size):
-                along += m[3 * c + d] * rows[d, i]
-            for j in range(n):
-                effect[1 + i, j] += rows[c, j] * along

@@ -27,7 +27,6 @@ from fusiond.estimators.fault_bank import (
     OF_THREE,
     ONSET,
     PERIODS_NS,
-    PROMOTED,
     RESTARTED,
     RESTARTS,
     SENSITIVITIES,
@@ -159,9 +158,10 @@ def begin_all(
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
 def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
-    """Replace the less likely onset of the level above, if much less likely.
+    """Keep the onset whose turn to restart has come, in place of a less likely one of the level
+    above.
 
-    The replacement is the hypothesis that is due to restart."""
+    The mixture then loses the least likely of all, as any sum that is cut to length."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return
@@ -172,7 +172,7 @@ def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> Non
         above = bank[group_at(bank, RESTARTS * kind + slot) + LOG_ODDS]
         if above < least:
             least, found = above, slot
-    if found < 0 or not odds > least + PROMOTED:
+    if found < 0 or not odds > least:
         return
     to = RESTARTS * kind + found
     there = group_at(bank, to)

@@ -1,7 +1,7 @@
 r"""Sizes of a bank's hypotheses, and the covariance that they add to the published one.
 
-The mixture of fusiond.estimators.fault_odds adds to nine published variances and three products of
-attitude errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
+The mixture of fusiond.estimators.fault_mixture adds to nine published variances and three products
+of attitude errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
 
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 

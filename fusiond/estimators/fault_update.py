@@ -286,23 +286,33 @@ def sensitivity_rows(
     return columns
 
 
-@compiled("void(f8[::1], i8, i8, f8[::1], f8[:, ::1], b1, f4[::1])")
+@compiled("void(f8[::1], i8, i8, f8[::1], f8[:, ::1], b1, i8, f8, f4[::1])")
 def account(
-    bank: Array, n: int, measures: int, y: Array, g: Array, fused: bool, work: Single
+    bank: Array,
+    n: int,
+    measures: int,
+    y: Array,
+    g: Array,
+    fused: bool,
+    rows: int,
+    noise: float,
+    work: Single,
 ) -> None:
     """Update the bank from `work` of `sensitivity_rows` and the whitened innovation y (m,); `fused`
-    if the filter uses the rows, with g (m, w) from `whiten`."""
+    rows have g (m, w) of `whiten`. They stand for `rows` rows with `noise`, an unexplained
+    square."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n
     square = 0.0
     for a in range(m):
         square += y[a] * y[a]
+    square += noise
     left = square
     if measures > ROLLS:
-        left += m * (1.0 - min(bank[SHOWN], 1.0))
+        left += rows * (1.0 - min(bank[SHOWN], 1.0))
         if fused:
-            bank[SHOWN] += (square - m * bank[SHOWN]) / SHOWN_KEPT
+            bank[SHOWN] += (square - rows * bank[SHOWN]) / SHOWN_KEPT
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     eights = threes + (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
@@ -315,7 +325,7 @@ def account(
         for k in range(length):
             j = own + unsigned(k)
             bank[j + unsigned(J_AT)] += left
-            bank[j + unsigned(N_AT)] += m
+            bank[j + unsigned(N_AT)] += rows
         for a in range(m):
             y_a = y[a]
             at_0 = unsigned(a * columns + first * LANES)

@@ -121,7 +121,7 @@ def fold_and_account(
         columns = sensitivity_rows(*rows)
         if fails:
             nis = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-        account(bank, n, measures, y, g, nis <= threshold, work)
+        account(bank, n, measures, y, g, nis <= threshold, y.shape[0], 0.0, work)
     if nis <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -130,36 +130,3 @@ def fold_and_account(
         feed_back(nav, xi, dx)
         dx[:] = 0.0
     return nis
-
-
-@compiled(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1],"
-    "f8[:, ::1], f8[::1], i8, i8, i8, f4[::1], f8[::1])"
-)
-def account_for(
-    nav: Array,
-    step: Array,
-    h: Array,
-    r: Array,
-    y: Array,
-    g: Array,
-    fused: bool,
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    lanes: Array,
-    t_ns: int,
-    measures: int,
-    device: int,
-    work: Single,
-    found: Array,
-) -> None:
-    """Update the bank by rows, `fused` or not, with y (m,) and g (m, w) from `whiten`, for a filter
-    that keeps its estimate."""
-    n = h.shape[1]
-    if restarts(bank, t_ns):
-        judge_what_waits(bank, ints, numbers, lanes, found)
-    bank[UNWEIGHED] = np.inf
-    restart_due(bank, ints, numbers, n, t_ns, nav, step)
-    sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
-    account(bank, n, measures, y, g, fused, work)

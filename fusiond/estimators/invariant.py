@@ -313,7 +313,8 @@ class InvariantFilter(TiltAxesFilter):
             bank.begin(self.t_ns, self.nav, self.step)
         kept = np.array(found.rows) == KEPT if found.rows else np.ones(len(rows.z), dtype=np.bool_)
         if kept.any():
-            self._account_for(measurement, rows, kept, found.passed)
+            before = self._cov, self._dx
+            self._account_for(measurement, rows, before, kept, found.passed)
 
     def _unfelt(self, p: Array) -> None:
         """Remove the heading coupling of a velocity within its noise from P (n, n): F would treat

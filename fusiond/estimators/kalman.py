@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
-from fusiond.estimators.gated_update import account_for, fold_and_account
+from fusiond.estimators.fault_update_by_rows import account_for
+from fusiond.estimators.gated_update import fold_and_account
 from fusiond.estimators.row_kernels import AT_H, NO_AXES, Axes
-from fusiond.estimators.update import fuse, whiten, work
+from fusiond.estimators.update import fuse, work
 from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
 
@@ -45,8 +46,6 @@ class KalmanEstimator(Estimator):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
-        self._spaces: dict[int, tuple[Array, Array, NDArray[np.float32]]] = {}
-        """Work space of the bank's update by so many rows."""
         self._run_by(NO_AXES)
 
     def _run_by(self, axes: Axes) -> None:
@@ -85,9 +84,12 @@ class KalmanEstimator(Estimator):
         if not self._holding:
             nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *of_bank)
         else:
+            before = cov.copy(), dx.copy()
             nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
             if nis < math.inf and of_bank[0].size:
-                account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *of_bank)
+                kept = np.ones(degrees, dtype=np.bool_)
+                fused = bool(nis <= threshold)
+                self._account_for(measurement, innovation, before, kept, fused)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()), first=z.item(0))
         if not math.isfinite(nis):
@@ -112,7 +114,7 @@ class KalmanEstimator(Estimator):
         if not kept:
             return Outcome("gated", s.nis, 0, (), codes)
         if self.hypotheses is not None:
-            self._account_for(measurement, rows, s.codes == KEPT, True)
+            self._account_for(measurement, rows, (self._cov, self._dx), s.codes == KEPT, True)
         cov[:] = s.cov
         dx[:] = s.dx
         if not self._holding:
@@ -121,21 +123,22 @@ class KalmanEstimator(Estimator):
         return Outcome("fused", s.nis, kept, tuple(s.y.tolist()), codes)
 
     def _account_for(
-        self, measurement: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
+        self,
+        measurement: Linearised,
+        rows: Innovation,
+        before: tuple[Array, Array],
+        kept: NDArray[np.bool_],
+        fused: bool,
     ) -> None:
-        """Update the bank by rows that will be fused or have failed."""
-        bank, count = self.hypotheses, int(np.count_nonzero(kept))
+        """Update the bank by rows that will be fused or have failed, with P and dx before them."""
+        bank = self.hypotheses
         assert bank is not None
-        z, h, r = rows
-        if count < kept.size:
-            z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
-        if (space := self._spaces.get(count)) is None:
-            of_bank = np.empty(count * bank.columns, dtype=np.float32)
-            space = self._spaces[count] = *work(count, self.model.width), of_bank
-        y, g, of_bank = space
-        if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            of_row = bank.bank, *bank.table[:3], measurement.t_ns, *bank.of(measurement)
-            account_for(self.nav, self.step, h, r, y, g, fused, *of_row, of_bank, bank.found)
+        table = bank.table
+        account_for(
+            *(self.nav, self.step, *before, *rows, kept, fused),
+            *(bank.bank, table.ints, table.numbers, table.lanes),
+            *(measurement.t_ns, *bank.of(measurement), bank.found),
+        )
 
     def hold(self) -> None:
         """Estimate without feedback from now on; errors propagate beside the state."""

@@ -18,7 +18,8 @@ own t, and tau is the error of that clock, the IMU's: not estimated, of sigma `c
 uncorrelated with the state. The same sums hold with P_tt = clock_sd_s^2 and the rest of P's row
 zero: a position has v times that sigma.
 
-Weighted fault hypotheses add variances (9,) that are not part of P (fusiond.estimators.fault_odds).
+Weighted fault hypotheses add variances (9,) that are not part of P
+(fusiond.estimators.fault_mixture).
 
 The attitude is that of the nominal axes of the configured inertial unit. C_nb is that of its gyros'
 axes, out of square within the data sheet, or of a spare's. Their orientation against the nominal

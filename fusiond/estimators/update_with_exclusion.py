@@ -291,8 +291,9 @@ def screened_update(
 
 
 def jumped(codes: Codes, h: Array, offsets: Sequence[int]) -> bool:
-    """True if the better half of the ranges fails. `codes` (m,) and `h` (m, n) of the rows; slots
-    of the clock's offsets."""
+    """True if the better half of the ranges fails.
+
+    `codes` (m,) and `h` (m, n) of the rows; `offsets` are the slots of the clock's offsets."""
     if np.count_nonzero(codes) < FEWEST_JUMPING:  # KEPT is 0
         return False
     # One in a range, nothing in a rate: nothing up to the rounding of sigma points.

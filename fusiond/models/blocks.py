@@ -26,9 +26,6 @@ minutes; what is left beside it is the drift's walk."""
 CARRIER_ANCHOR, CARRIER_CLOCK = "carrier_anchor", "carrier_clock"
 """Antenna position (ECEF, m) at the epoch from which carriers are counted, and the carriers' clock
 since (m): fusiond.aiding.carrier_anchor."""
-CARRIER_WALK = 0.0012**2
-"""Random walk of all carriers beside their models (m^2/s), as in fusiond.gnss.range_kernel for
-each; the displacement error of a sky is about that of one satellite at the zenith."""
 SAR_MISALIGNMENT = "sar_misalignment"
 # One sigma (rad) of how a SAR antenna is mounted where nothing else says it: 0.1 deg, about what
 # paper 002's accuracy needs and a mechanical alignment keeps.
@@ -184,7 +181,7 @@ def carrier_blocks(noise: ClockNoise) -> list[Block]:
     """Carrier anchor and carrier clock, which drifts with the code clock."""
     columns = (-1, -1, -1)
     return [
-        Block(CARRIER_ANCHOR, "m", ("x", "y", "z"), columns, initial=1.0, white=CARRIER_WALK),
+        Block(CARRIER_ANCHOR, "m", ("x", "y", "z"), columns, initial=1.0),
         Block(
             *(CARRIER_CLOCK, "m", ("carriers",), (-1,)),
             initial=1.0,

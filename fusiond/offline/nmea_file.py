@@ -213,8 +213,10 @@ def _is_refusal(name: str) -> bool:
 def _why_nothing(decoder: NmeaDecoder, refused: Counter[str], kind: str) -> str:
     """Reason for the absence of measurements; `kind` is the file's probable kind."""
     if refused["undated"] or refused["untimed"]:
-        missing = "no measurement with a date (RMC or ZDA missing)"
-        return decoder.cautions.get("implausible_date", missing)
+        absent = "that of RMC is empty" if decoder.received.used["RMC"] else "RMC or ZDA missing"
+        cautions = decoder.cautions
+        known = (cautions[name] for name in ("implausible_date", "bad_date") if name in cautions)
+        return next(known, f"no measurement with a date ({absent})")
     if not decoder.counters["sentences"]:
         return kind or decoder.cause or "no NMEA sentence whose checksum is right"
     name = max(REFUSALS, key=lambda each: refused[each])

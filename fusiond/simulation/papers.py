@@ -129,7 +129,7 @@ PAPERS: dict[str, Paper] = {
         {"estimator": {"model": "ins23"}, "aiding": {"gnss": {"kind": "raw"}}},
         ("imu", "gnss", "star_tracker", "sar"),
         lambda: _by_ranges(replace(SCENARIOS["flight-sar"], path=partial(flight, rest_s=REST_S))),
-        {"alignment": {"heading": ["gnss_course"]}},
+        {"imu": NO_SCALES, "alignment": {"heading": ["gnss_course"]}},
         raw="ubx",
     ),
     "003": Paper(

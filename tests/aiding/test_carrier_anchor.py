@@ -158,8 +158,17 @@ def test_a_clone_walks_by_what_satellites_drift() -> None:
         assert (found is None) == (walked_s is None), t_s
         if found is not None and walked_s is not None:
             walked = noise.DRIFT_M_SQRT_S**2 * walked_s * gain @ gain.T
-            assert found.new == pytest.approx(walked, rel=1e-6)
+            assert found.new == pytest.approx(noise.OF_ANCHOR * walked, rel=1e-6)
+            assert found.with_navigation is not None
+            of_place, shared = found.with_navigation
+            place = (1.0 - noise.OF_ANCHOR) * walked[:3, :3]
+            assert shared[:3, :3] == pytest.approx(place, rel=1e-6)
             assert (found.kept == np.eye(4)).all()
+            # What the place walks by with the clone is no way since the anchor.
+            h_now = rows(of, nav, xi, now).h
+            seen = h_now[:, :9] @ of_place[:, :3] + h_now[:, of.slots_of(CARRIER_ANCHOR)]
+            assert np.abs(h_now[:, 6:9]).max() > 0.5
+            assert np.abs(seen).max() < 1e-4
             assert found.of_navigation is None
             assert found.estimate is None
         before = now.left

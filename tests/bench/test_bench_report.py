@@ -19,6 +19,7 @@ FIGURES = (
     "rewind_2s_ratio",
     "raw_epoch_40_ratio",
     "late_tick_ratio",
+    "late_raw_tick_ratio",
     "multiscale_step_ratio",
     "federated_step_ratio",
     "unscented_step_ratio",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import re
 import tomllib
 from pathlib import Path
@@ -231,6 +232,47 @@ async def test_compasses_become_sections_that_check_passes(tmp_path: Path) -> No
         assert f"{port}: a compass ({said}) at 115200 baud" in done.stdout
         assert config.sources[kinds[port]].driver == "compass"
         assert config.aiding[kinds[port]].kind == kind
+
+
+async def test_a_quickstarts_set_and_receivers_with_logs_become_a_file_that_check_passes(
+    tmp_path: Path,
+) -> None:
+    """An MTi-600, a UM980 and others that send no NMEA: what is seen is what the page says."""
+    data = {"bestpos": bestpos(), "ubx": pvt(), "sbf": sbf_pvt()}
+    devices = {name: Device(tmp_path / name) for name in data}
+    for device in devices.values():
+        device.plug()
+    (known,) = (d for d in KNOWN_DEVICES if d.title == "Xsens MTi-600")
+    channel = str(tmp_path)
+    imu = CanImu(CanImuOptions(**known.options, interface="virtual", channel=channel))
+
+    async def send() -> None:
+        with can.Bus(interface="virtual", channel=channel) as bus:
+            for number in itertools.count():
+                for frame in imu.frames(number, number * 10_000_000, (0, 0, 0), (0, 0, 9.8)):
+                    bus.send(frame)
+                for name, device in devices.items():
+                    with contextlib.suppress(BlockingIOError):
+                        device.send(data[name])
+                await asyncio.sleep(0.01)
+
+    sending = asyncio.create_task(send())
+    out = tmp_path / "pc.toml"
+    arguments = ["config", "init", str(out), "--yes", "--can", f"virtual:{channel}"]
+    arguments += [text for device in devices.values() for text in ("--port", str(device.link))]
+    done = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+    sending.cancel()
+    for device in devices.values():
+        device.unplug()
+    assert done.exit_code == 0, done.output
+    page = (REPOSITORY / "docs" / "quickstart-pc.md").read_text()
+    for seen in ("frames of Xsens MTi-600", "logs of the BESTPOS family at 115200 baud"):
+        assert seen in page
+        assert seen in done.stdout
+    config = load_config(out)
+    assert {source.driver for source in config.sources.values()} == {"can_imu", *data}
+    assert {section.kind for section in config.aiding.values()} == {"gnss"}
+    assert doubts(config) == []
 
 
 @pytest.mark.parametrize("page", ["can-imu.md", "can-gnss.md"])

@@ -66,6 +66,28 @@ def test_what_is_kept_and_what_is_new(make: Any) -> None:
     assert estimator.xi == pytest.approx(t @ xi)
 
 
+@pytest.mark.parametrize("name", ["ins15", "planar15"])
+def test_noise_that_the_place_shares(name: str) -> None:
+    """It is that of both by one draw, in the states' units; what a planar model holds stays."""
+    m = make_model(name, imu_noise(Imu()), *BLOCKS)
+    estimator = KalmanEstimator(m, 0.1)
+    begun(estimator)
+    held = np.flatnonzero(~m.active)
+    estimator._covs[:, held] = estimator._covs[..., held] = 0.0
+    p = estimator.covariance.copy()
+    taken, noise = np.zeros((9, 3)), positive(3, 7)
+    taken[6:9] = np.random.default_rng(8).normal(size=(3, 3))
+    shared = renewal()._replace(with_navigation=(taken, noise), kept=np.eye(3))
+    estimator._renew(shared)
+    of_noise = np.zeros((m.size, 3))
+    of_noise[:9] = taken * m.active[:9, None]
+    of_noise[m.slots_of_all(RANGE_BIAS)] = np.diag([0.5, 0.5, 1.0])
+    own = np.zeros((m.size, 3))
+    own[m.slots_of_all(RANGE_BIAS)] = np.diag([0.5, 0.5, 1.0])
+    expected = p + of_noise @ noise @ of_noise.T + own @ renewal().new @ own.T
+    assert estimator.covariance == pytest.approx(expected)
+
+
 def test_of_each_subset() -> None:
     estimator = SeparatedEstimator(model(), 0.1, ("gnss",))
     p, _ = begun(estimator)

@@ -1,7 +1,9 @@
 """Public bug reports through the daemon: what people's receivers send, each on a line of its own.
 
-Files and numbers are those of the cases. One daemon serves all lines and buses at once; the kinds
-that are of recorders' files, and those that take minutes of driving, are tested by `process`.
+Files and numbers are those of the cases. One daemon serves all lines and buses at once. Case 10 is
+of a recorder's file (`tests.offline.test_can_clock`). What 02, 03, 11, 19 and 22 come to takes
+minutes of driving (`tests.offline.test_reported_cases`): here is what is read of their lines, of
+which 19 and 22 have none.
 """
 
 from __future__ import annotations
@@ -9,6 +11,8 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,6 +46,7 @@ LINES = {
     "case17": ("nmea", "17_ubx_nav_only.bin"),
     "case17_ubx": ("ubx", "17_ubx_nav_only.bin"),
     "case18": ("gnss", "18_rtcm_of_2016.rtcm3"),
+    "case21": ("gnss", None),
 }
 """Driver and what is sent, by source."""
 BUSES = (
@@ -55,6 +60,7 @@ BUSES = (
 """Recorded buses of a car whose tester asks for the speed."""
 SPEED = b"\x41\x0d"
 EPOCHS_WITH_A_PAUSE = 3
+B1C_RANGES = 4174
 
 
 def _sections(folder: Path) -> Iterator[str]:
@@ -88,6 +94,12 @@ async def _send_with_pauses(device: Device) -> None:
         await asyncio.sleep(0.12)
 
 
+def _b1c(folder: Path) -> bytes:
+    """The walk with B1C alone, as `21_b1c_only.py` makes it."""
+    subprocess.run([sys.executable, CASES / "21_b1c_only.py"], cwd=folder, check=True)
+    return (folder / "b1c.ubx").read_bytes()
+
+
 def _answers() -> Iterator[can.Message]:
     """The speeds of every recorded bus, 20 to 50 each."""
     for file in BUSES:
@@ -99,6 +111,7 @@ async def test_what_people_report_is_read_or_named_by_the_daemon(bench: Bench) -
     devices = {name: Device(bench.folder / name) for name in LINES}
     for device in devices.values():
         device.plug()
+    b1c = _b1c(bench.folder)
     daemon = bench.daemon(*_sections(bench.folder), NO_MQTT)
     arrived: dict[str, list[Any]] = defaultdict(list)
     daemon.sources.on_arrival = lambda m, instant: arrived[m.source].append(m)
@@ -116,6 +129,7 @@ async def test_what_people_report_is_read_or_named_by_the_daemon(bench: Bench) -
                 bus.send(answer)
             async with asyncio.TaskGroup() as sending:
                 sending.create_task(_send_with_pauses(devices["case05"]))
+                sending.create_task(_send(devices["case21"], b1c))
                 for name, (_, file) in LINES.items():
                     if file is not None:
                         sending.create_task(_send(devices[name], (CASES / file).read_bytes()))
@@ -123,6 +137,7 @@ async def test_what_people_report_is_read_or_named_by_the_daemon(bench: Bench) -
         await until(lambda: len(of("case05")) >= EPOCHS_WITH_A_PAUSE)
         await until(lambda: len(of("case18", RawGnssEpoch)) >= 12)  # from the first week on
         await until(lambda: len(of("case11", Heading)) == 60)
+        await until(lambda: sum(len(e.signals) for e in of("case21", RawGnssEpoch)) == B1C_RANGES)
         await until(lambda: "without a checksum" in detail("case14"))
         await until(lambda: 'driver = "ubx"' in detail("case17"))
         await until(lambda: all(arrived[n] for n in LINES if n not in ("case14", "case17")))
@@ -140,6 +155,13 @@ async def test_what_people_report_is_read_or_named_by_the_daemon(bench: Bench) -
     assert of("case05")[-1].v_ned_m_s == pytest.approx((0.224, 5.139, None), abs=1e-3)
     assert all(math.isclose(h.yaw_rad, math.radians(30.0)) for h in of("case11", Heading))
     assert arrived["case14"] == arrived["case17"] == []
+    # Pilots of B1C, and B-CNAV1 with the delays of each satellite: nothing else is needed.
+    assert {(s.system, s.signal) for e in of("case21", RawGnssEpoch) for s in e.signals} == {
+        ("C", "1P")
+    }
+    counters = bench.health["case21"].counters
+    assert counters["subframes_bcnav1"] == 148
+    assert counters["measured_C"] == B1C_RANGES
     assert len(of("case15")) == 6
     assert {fix.quality for fix in of("case16")} == {2}
     assert len(of("case17_ubx")) >= 7

@@ -76,15 +76,11 @@ class Fix(NamedTuple):
     source: str = ""
 
 
-def _instant(fix: Fix) -> int:
-    return fix.velocity.t_ns
-
-
 def _moved_m(lat_rad: float, lon_rad: float, last: PositionCandidate) -> tuple[float, float]:
     """Displacement north and east (m) from a place to a position."""
     north, east = last.lat_rad - lat_rad, math.remainder(last.lon_rad - lon_rad, 2.0 * math.pi)
-    metres = 1.0 / as_geodetic(np.ones(3), lat_rad)[:2]
-    return north * metres.item(0), east * metres.item(1)
+    per_metre_n, per_metre_e, _ = as_geodetic(np.ones(3), lat_rad).tolist()
+    return north / per_metre_n, east / per_metre_e
 
 
 @dataclass(slots=True)
@@ -321,8 +317,10 @@ class AlignmentEvidence:
     def _keep(self, fix: Fix) -> None:
         """Insert a fix in order of validity."""
         oldest = max(fix.velocity.t_ns, self.fixes[-1].velocity.t_ns if self.fixes else 0)
-        kept = self.fixes[bisect_left(self.fixes, oldest - FIXES_NS, key=_instant) :]
-        insort(kept, fix, key=_instant)
+        kept = self.fixes[
+            bisect_left(self.fixes, oldest - FIXES_NS, key=lambda each: each.velocity.t_ns) :
+        ]
+        insort(kept, fix, key=lambda each: each.velocity.t_ns)
         self.fixes = kept[-MOST_FIXES:]
         if self._speed < self._options.course_speed_m_s:
             self.moving_since_ns = 0
@@ -369,9 +367,7 @@ class AlignmentEvidence:
             suspect = other.t_ns - self.contradicted_ns.get(source, -ANY_TIME_NS) < FIXES_NS
             if other is p or suspect or interval_s > TOGETHER_NS * 1e-9:
                 continue
-            moved = np.array([other.lat_rad - p.lat_rad, other.lon_rad - p.lon_rad])
-            moved[1] = math.remainder(float(moved[1]), 2.0 * math.pi)
-            away = math.hypot(*(moved / as_geodetic(np.ones(3), p.lat_rad)[:2]).tolist())
+            away = math.hypot(*_moved_m(p.lat_rad, p.lon_rad, other))
             sd = math.hypot(max(p.sd[:2]), max(other.sd[:2]))
             if away - self._speed * interval_s > CONTRADICTION_SIGMAS * sd:
                 largest = max(largest, away)

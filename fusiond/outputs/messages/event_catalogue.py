@@ -117,6 +117,9 @@ RECEIVERS: Mapping[str, Entry] = {
     "unknown_status": info(
         "RMC has an unknown status; its velocity is not used.", "Check the firmware."
     ),
+    "two_receivers": warning("Two receivers send on one line.", "Give each a port of its own."),
+    "course_missing": info("Speeds have no course, fixes no velocity.", "Switch the course on."),
+    "speed_held_at_zero": info("Slow speeds are printed as 0.", "Switch static navigation off."),
 }
 
 TERMINAL: Mapping[str, Entry] = {

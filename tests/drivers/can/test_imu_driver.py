@@ -13,86 +13,23 @@ import subprocess
 import threading
 import time
 import tomllib
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 
 import can
 import pytest
 
 from drivers.can import bus as can_bus
 from drivers.can.bus import CanBus, CanFrame
-from drivers.can.errors import controller_state
 from drivers.can.frame_decoding import Content
 from drivers.can.imu import CanImuDriver, CanImuOptions
-from drivers.measurements import DeviceEvent, DeviceStamp, ImuSample, KernelStamp, Measurement
+from drivers.measurements import DeviceEvent, DeviceStamp, KernelStamp, Measurement
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from tests.drivers.can.imu_at_work import SBG, SECOND, Running, sample_frames
 from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 
 GROUP = f"239.74.{os.getpid() >> 8 & 0xFF}.{os.getpid() & 0xFF}"
 """A multicast group of this process: tests run side by side."""
-SECOND = 1_000_000_000
-SBG = {
-    "dbc": "sbg_ellipse",
-    "gyro": ("IMU_GYRO.GYRO_X", "IMU_GYRO.GYRO_Y", "IMU_GYRO.GYRO_Z"),
-    "accel": ("IMU_ACCEL.ACCEL_X", "IMU_ACCEL.ACCEL_Y", "IMU_ACCEL.ACCEL_Z"),
-    "device_time": "IMU_INFO.TIME_STAMP",
-    "timeout_s": 0.2,
-}
-
-
-def sample_frames(k: int) -> list[can.Message]:
-    parts = (
-        (0x120, struct.pack("<IHh", 5000 * k, 0, 2500)),
-        (0x121, struct.pack("<3h", k % 1000, 2, 981)),
-        (0x122, struct.pack("<3h", k % 1000, 20, 350)),
-    )
-    return [can.Message(arbitration_id=i, data=d, is_extended_id=False) for i, d in parts]
-
-
-def error_frame(classes: int, detail: int = 0) -> can.Message:
-    return can.Message(
-        arbitration_id=classes,
-        data=bytes([0, detail, 0, 0, 0, 0, 0, 0]),
-        is_error_frame=True,
-        is_extended_id=False,
-    )
-
-
-class Running:
-    """A driver at work, with what it emitted. Its clock stands still but for what a test adds."""
-
-    def __init__(self, **options: object) -> None:
-        self.now_ns = 7_000 * SECOND
-        self.emitted: list[Measurement | DeviceEvent] = []
-        self.driver = CanImuDriver(
-            "imu",
-            CanImuOptions.model_validate({**SBG, **options}),
-            self.emitted.append,
-            lambda: self.now_ns,
-        )
-
-    def follow_the_host(self) -> None:
-        """Take the host's clock for the driver's."""
-        self.driver._bus._now_ns = time.monotonic_ns
-
-    @property
-    def samples(self) -> list[ImuSample]:
-        return [e for e in self.emitted if isinstance(e, ImuSample)]
-
-    @property
-    def codes(self) -> list[str]:
-        return [e.code for e in self.emitted if isinstance(e, DeviceEvent)]
-
-    @contextlib.asynccontextmanager
-    async def run(self) -> AsyncIterator[Running]:
-        task = asyncio.create_task(self.driver.run())
-        try:
-            await until(lambda: self.driver.status.state != "starting")
-            yield self
-        finally:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -197,54 +134,6 @@ async def test_bus_stamps_are_reported() -> None:
     (sample,) = imu.samples
     assert isinstance(sample.stamp, KernelStamp)
     assert sample.stamp.latency_s == 0.003
-
-
-async def test_error_frames_become_events_and_state() -> None:
-    async with Running(interface="virtual", channel="t-error").run() as imu:
-        with can.Bus(interface="virtual", channel="t-error", ignore_config=True) as sender:
-            for message in sample_frames(0):
-                sender.send(message)
-            for _ in range(3):
-                sender.send(error_frame(0x004, 0x20))
-            sender.send(error_frame(0x004, 0x01))
-            sender.send(error_frame(0x008 | 0x020 | 0x080))
-            sender.send(error_frame(0x040))
-            await until(lambda: "bus_off" in imu.codes)
-            assert imu.driver.status.state == "silent"
-            assert "left the bus" in imu.driver.status.detail
-            sender.send(error_frame(0x100))
-            for message in sample_frames(1):
-                sender.send(message)
-            await until(lambda: len(imu.samples) == 2)
-            assert imu.driver.status.state == "running"
-    assert imu.codes == ["error_passive", "bus_off", "error_active"]
-    counters = imu.driver.counters
-    assert counters["error_frames"] == 7
-    assert counters["error_controller"] == 4
-    assert counters["error_overflow"] == 1
-    for name in ("protocol", "no_acknowledge", "bus_error", "bus_off", "restarted"):
-        assert counters[f"error_{name}"] == 1
-
-
-async def test_a_shorted_bus_does_not_flood_the_operator() -> None:
-    async with Running(interface="virtual", channel="t-short").run() as imu:
-        with can.Bus(interface="virtual", channel="t-short", ignore_config=True) as sender:
-            for _ in range(50):
-                sender.send(error_frame(0x040))
-                sender.send(error_frame(0x100))
-            await until(lambda: imu.driver.counters["error_frames"] == 100)
-    assert imu.codes == ["bus_off", "error_active"]
-    assert imu.driver.counters["error_bus_off"] == 50
-
-
-def test_controller_state_of_error_frames() -> None:
-    assert controller_state(0x040, bytes(8)) == "bus_off"
-    assert controller_state(0x100, bytes(8)) == "active"
-    assert controller_state(0x004, bytes([0, 0x04])) == "warning"
-    assert controller_state(0x004, bytes([0, 0x10])) == "passive"
-    assert controller_state(0x004, bytes([0, 0x40])) == "active"
-    assert controller_state(0x004, b"") is None
-    assert controller_state(0x001, bytes(8)) is None
 
 
 async def test_garbage_on_the_wire_is_counted() -> None:
