@@ -204,8 +204,8 @@ class AidingMeasurement:
         return "at_once"
 
     def packed(self, model: Model) -> Packed | None:
-        """Row of numbers of which a kernel makes the innovation (fusiond.aiding.packed); None where
-        it is made here alone."""
+        """Row of numbers for a kernel's innovation (fusiond.aiding.packed); None without a
+        kernel."""
         return None
 
     def at(self, nav: Array) -> AidingMeasurement:

@@ -180,8 +180,8 @@ def _take(
     v_e: float,
     sd_v: float,
 ) -> None:
-    """The next fix: its instant (ns), place (rad, rad), stated variance (m^2), velocity (m/s) and
-    that one's sigma."""
+    """Add the next fix: instant (ns), position (rad, rad), stated variance (m^2), velocity (m/s)
+    and its sigma."""
     at = packed[:1].view(np.int64)
     mean = packed[_MEAN:_POINTS]
     begins, step_s = packed[_VARIANCE] == 0.0, (t_ns - at[0]) * 1e-9

@@ -53,7 +53,7 @@ BIAS_BLOCK = "rdss_bias"
 class RdssPositionMeasurement(AidingMeasurement):
     """Fix (rad, rad) with `covariance` (nn, ne, ee) in m^2.
 
-    `moved_s`: the computed velocity times this is added to the fix (position compensation).
+    `moved_s`: time by which the fix is moved with the computed velocity (position compensation).
     `holds`: the estimate is not fed back until a `HeldFeedback` comes (optimal prediction).
     """
 

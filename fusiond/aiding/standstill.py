@@ -89,7 +89,7 @@ def _earth_rate(state: State) -> Array:
 
 
 def _rate_error(state: State, mean_rate: Array) -> Array:
-    """Mean rates (3,) or (k, 3) less the estimated bias and the Earth's rate."""
+    """Mean rates (3,) or (k, 3) minus the estimated bias and the Earth's rate."""
     bias = np.array([sum(state.xi[s] for s in state.model.parameters(9 + j)) for j in range(3)])
     error: Array = mean_rate - bias - state.dcm.T @ _earth_rate(state)
     return error

@@ -206,10 +206,10 @@ class SystemClock:
         return chosen
 
     def _before_slew(self, t_ns: int) -> int:
-        """The instant of a stamp that the offset of the last sample puts at `t_ns`.
+        """Instant of a stamp at `t_ns` by the offset of the last sample.
 
-        While the system clock is slewed the offset was another one then:
-        t = t_ns + r (sampled - t), r the clock's rate."""
+        While the system clock is slewed, the offset was different at that time: t = t_ns + r
+        (sampled - t), r the clock's rate."""
         age_ns = self._sampled_ns - t_ns
         if age_ns <= 0 or abs(self._rate_ppb) * _SLEW_PER_NS <= SECOND_NS:
             return t_ns

@@ -207,7 +207,7 @@ class RangeModel:
         return self.follow(self.pick(epoch), self._kept)
 
     def pick(self, epoch: RawGnssEpoch) -> ChosenSignals:
-        """Choose the signals that serve."""
+        """Choose the signals to use."""
         keys = list(map(_KEY, epoch.signals))
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan

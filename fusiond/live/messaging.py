@@ -243,7 +243,7 @@ def _known(value: float) -> float | None:
 
 
 def _utc_of(report: PositionReport, seen_utc_ns: int | None) -> int | None:
-    """Instant when a report's place was true; one without a date is of the last day."""
+    """Instant of validity of a report's position; a report without a date is of the last day."""
     if report.dated:
         return round(report.t_s * SECOND_NS)
     if seen_utc_ns is None:

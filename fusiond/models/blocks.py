@@ -172,7 +172,7 @@ def clock_blocks(
 
 
 def clock_ramp() -> Block:
-    """The rate of a clock's drift."""
+    """Rate of a clock's drift."""
     sd = RAMP_M_S2
     return Block(CLOCK_RAMP, "m/s^2", ("ramp",), (-1,), initial=sd, tau_s=RAMP_S, steady=sd)
 

@@ -45,8 +45,8 @@ def axle_lever_block(sd_m: float) -> Block:
 
 
 def drift_block(name: str, sd_m_s: float, lasts_s: float) -> Block:
-    """A velocity (m/s) that lasts for a while: sideways what tyres, a road's crown and wind leave,
-    of a wheel what slip and quantised steps do."""
+    """Velocity error (m/s) that lasts for seconds: sideways by tyres, a road's crown and wind; of a
+    wheel by slip and quantised steps."""
     return Block(name, "m/s", ("v",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s)
 
 

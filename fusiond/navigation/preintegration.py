@@ -144,7 +144,7 @@ def integrate_sensed(
     attitude (k, 3, 3), and the derivatives of that velocity by the biases (k, 3, 6).
 
     `times` (m + 1,) ns holds the begin before the first sample. Over tens of seconds: Earth rate,
-    transport and Coriolis are left out, and so is gravity.
+    transport and Coriolis and gravity are neglected.
     """
     lanes, made = np.empty(_END), np.empty(_MADE // LANES)
     dcm, own, v, d, s = np.eye(3), np.empty((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))

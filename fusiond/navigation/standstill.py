@@ -162,8 +162,8 @@ class StandstillDetector:
         return windows
 
     def _judge(self, end_ns: int, samples: Array, first: int, end: int) -> Window:
-        """Judge rows first ... end-1 as one window, with the quiet windows before it: it is none
-        itself if the mean force has left that of the first window of this rest."""
+        """Judge rows first ... end-1 as one window, with the quiet windows before it. It is not
+        quiet if the mean force differs from that of the first window of this rest."""
         limits, found = self.limits, np.empty((4, 3))
         _moments(samples, first, end, found)
         mean_rate, mean_force, rate_sd, force_sd = found.tolist()

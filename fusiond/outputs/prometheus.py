@@ -1,7 +1,7 @@
 """Prometheus output: the daemon's state as metrics at `/metrics`.
 
-Answers from the latest messages, with a text that is made once a second at most, so that scrapes
-cost no tick anything. Units are Prometheus's base units: seconds, metres, radians, bytes.
+Answers from the latest messages, with a text made once a second at most, so that scrapes do not
+load the tick. Units are Prometheus's base units: seconds, metres, radians, bytes.
 
 Source: Prometheus text exposition format 0.0.4; OpenMetrics 1.0 for state sets (a series a state,
 1 for the one that holds).

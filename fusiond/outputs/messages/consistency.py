@@ -29,7 +29,7 @@ class SourceConsistency(BaseModel):
 
 
 class ConsistencyMessage(Message):
-    """Can the filter's sigma be believed: one verdict a source."""
+    """Verdict on the filter's sigma by each source's innovations."""
 
     sources: dict[str, SourceConsistency]
 

@@ -9,7 +9,7 @@ from fusiond.outputs.messages.event_catalogue import Level, entry_of
 
 
 class EventMessage(Message):
-    """Something an operator should know."""
+    """Event for the operator."""
 
     level: Level
     code: str = Field(description="stable, for rules")

@@ -129,7 +129,7 @@ TERMINAL: Mapping[str, Entry] = {
     "rdss_hold_over": info("The hold time is over; fixes are requested again."),
     "rdss_request": info("An operator requested a fix."),
     "rdss_self_test": info(
-        "Result of the terminal's self test.", "Have a faulty terminal repaired."
+        "The terminal reported its self test.", "If it failed, have it repaired."
     ),
     "rdss_no_answer": warning(
         "No terminal answers at these baud rates.",
@@ -186,7 +186,7 @@ MESSAGES: Mapping[str, Entry] = {
     ),
     "message_other_card": warning(
         "A message for another card arrived.",
-        "Nothing to do; if it was for you, inform the sender.",
+        "If it was for you, tell the sender your card number.",
     ),
     "messages_damaged": warning("The file of stored messages is damaged; it was set aside.", DISK),
     "messages_not_kept": warning("Messages cannot be stored over a restart.", DISK),
@@ -196,9 +196,10 @@ MESSAGES: Mapping[str, Entry] = {
 CLOCK: Mapping[str, Entry] = {
     "utc_jumped": warning("UTC of a source jumped.", "Check the receiver if this repeats."),
     "utc_implausible": warning(
-        "A source reports a year that cannot be right.", "Check the receiver."
+        "A source reports an impossible year; it is not used as UTC.",
+        "Update the receiver's firmware.",
     ),
-    "host_resumed": warning("The computer was suspended.", "Switch suspend off on a vehicle."),
+    "host_resumed": warning("The computer was suspended.", "Run `systemctl mask suspend.target`."),
     "system_clock_stepped": warning(
         "The system clock was set; navigation continues.", "Nothing to do."
     ),
@@ -206,16 +207,16 @@ CLOCK: Mapping[str, Entry] = {
 
 NAVIGATION: Mapping[str, Entry] = {
     "mode_waiting": info("No IMU data.", "Check power and bus of the IMU."),
-    "mode_aligning": info("Alignment runs; the text says what it needs."),
+    "mode_aligning": info("Alignment runs; no solution yet.", "Do what the text asks for."),
     "mode_navigating": info("The solution is usable."),
     "mode_coasting": info(
         "Inertial navigation without a position fix.", "Restore GNSS or RDSS; sigma grows."
     ),
     "mode_invalid": warning(
-        "The solution is not usable.", "Do not navigate by it; follow the text."
+        "The solution is not usable.", "Do not navigate by it; do what the text asks for."
     ),
     "not_aligned": info(
-        "Alignment lacks something.", "Follow the text; see docs/troubleshooting.md."
+        "Alignment waits for something.", "Do what the text asks; see docs/troubleshooting.md."
     ),
     "aligned": info("Navigation started; the text names the heading's source."),
     "states_absent": warning(
@@ -229,7 +230,8 @@ NAVIGATION: Mapping[str, Entry] = {
         "The vehicle moved while off; the saved heading is not used.", "Drive on."
     ),
     "fixes_late": info(
-        "Fixes are older than their stamps; the delay is applied.", "Check line and rate."
+        "Fixes are older than their stamps; the delay is corrected.",
+        "Raise the baud rate or send fewer sentences.",
     ),
     "diverged": warning(
         "The solution diverged; alignment restarts.",
@@ -244,7 +246,7 @@ NAVIGATION: Mapping[str, Entry] = {
     ),
     "calibration_damaged": warning("The saved calibration is damaged; it was set aside.", DISK),
     "saved_state_refused": warning(
-        "The saved state is too old or of another setup.", "Nothing to do: alignment runs."
+        "The saved heading is too old or of another setup.", "Nothing to do: alignment runs."
     ),
     "saved_state_damaged": warning("The saved state is damaged; it was set aside.", DISK),
     "warm_state_refused": warning(
@@ -257,7 +259,7 @@ NAVIGATION: Mapping[str, Entry] = {
     ),
     "isolated": warning(
         "A source is excluded from the solution.",
-        "Wait for `readmitted`; else see `diagnosis` in `health`.",
+        "Wait; if no `readmitted` follows, see `diagnosis` in `health`.",
     ),
     "readmitted": info("A source is used again."),
     "sensor_fault": error(
@@ -277,7 +279,8 @@ NAVIGATION: Mapping[str, Entry] = {
         "Sigma of a source is too large.", "Lower `sigma_scale` of its section."
     ),
     "verdict_coloured": warning(
-        "Errors of a source last from fix to fix.", "See docs/consistency.md."
+        "Errors of a source last from fix to fix; sigma may be too small.",
+        "Nothing now; its remedies are in docs/consistency.md.",
     ),
     "verdict_cannot_tell": info("The test cannot judge this source's sigma."),
     "verdict_too_few": info("Too few innovations to judge this source's sigma."),
@@ -296,12 +299,14 @@ IMU: Mapping[str, Entry] = {
     ),
     "imu_repeated": warning("The IMU repeats one sample.", "Restart the unit; check its firmware."),
     "imu_no_gravity": warning(
-        "No specific force: free fall or a wrong unit.", "Check `accel_unit` or the DBC."
+        "No gravity in the IMU's data: dead sensor or wrong unit.", "Check `accel_unit` or the DBC."
     ),
     "imu_spike": warning(
         "IMU samples jump more than a vehicle can.", "Check the line and the unit."
     ),
-    "imu_stamp_ahead": warning("IMU stamps are ahead of later ones.", "Check the unit's clock."),
+    "imu_stamp_ahead": warning(
+        "An IMU sample is stamped later than the next one.", "Check the unit's clock."
+    ),
     "imu_time": warning(
         "IMU stamps went back or lie ahead; alignment restarts.", "Check the unit's clock."
     ),
