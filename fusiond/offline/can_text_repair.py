@@ -39,8 +39,8 @@ Plain = Callable[[str], str | None]
 class TextLines:
     """Lines of a log, as a file for a reader of python-can.
 
-    `plain(line)` converts a line to a form that the reader knows, two lines at most; None: no frame.
-    `refused(line, text)` receives each lost line.
+    `plain(line)` converts a line to a form that the reader knows, two lines at most; None: no
+    frame. `refused(line, text)` receives each lost line.
     """
 
     def __init__(self, stream: BinaryIO, plain: Plain, refused: Callable[[int, str], None]) -> None:
