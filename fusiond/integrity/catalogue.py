@@ -86,8 +86,8 @@ the state for the offset in time."""
 @immutable()
 class Kind:
     """Fault hypothesis with `size` parameters of prior `sd` (SI), published times `per_unit` in
-    `unit`; its rate is `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device`,
-    or of its `devices`, it affects the series that `locates` and `moves` select, or all."""
+    `unit`; its rate is `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device`
+    or `devices` it affects the series that `locates` and `moves` select, or all."""
 
     name: str
     text: str
