@@ -15,7 +15,7 @@ from typing import Annotated, Protocol, Self
 from pydantic import Field, PositiveFloat, model_validator
 
 from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from drivers.measurements import DeviceEvent, Measurement, TimeReport
 from drivers.network_port import PortName, on_network, open_port
 from drivers.ntrip.client import NtripClient, NtripOptions

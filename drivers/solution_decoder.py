@@ -1,6 +1,7 @@
 """Common part of the decoders `ubx`, `bestpos` and `sbf`: messages of bytes, epochs of messages.
 
-An epoch is closed as `drivers.cycle` finds, and judged by `drivers.solution`. No I/O, no clock.
+An epoch is closed as `drivers.epoch_ends` finds, and judged by `drivers.solution`. No I/O, no
+clock.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ from collections import Counter
 from collections.abc import Hashable, Iterable
 from typing import Generic, TypeVar
 
-from drivers.cycle import Cycle, Name
 from drivers.decoder_options import SolutionDecoding
+from drivers.epoch_ends import Cycle, Name
+from drivers.framing_base import Splitter
 from drivers.measurements import Measurement
 from drivers.nmea.reasons import implausible_date
 from drivers.solution import Solution, SolutionJudge
-from drivers.splitter import Splitter
 
 Message = TypeVar("Message")
 Epoch = TypeVar("Epoch")

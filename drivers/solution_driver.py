@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.decoder_options import SolutionDecoding
-from drivers.nmea.foreign_protocols import protocol_sentence
 from drivers.nmea.mixed_framing import StreamSplitter
 from drivers.nmea.reasons import MANY
+from drivers.nmea.unsupported_protocols import protocol_sentence
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 from drivers.solution import REFUSALS
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # the same names as in _HOMES, for whoever reads types
     from fusiond.files.measurement_csv import read_solution as read_solution
     from fusiond.files.measurement_csv import read_truth as read_truth
     from fusiond.files.measurement_csv import read_wheel as read_wheel
-    from fusiond.files.solution_table import trajectory_of as trajectory_of
+    from fusiond.files.solutions_to_table import trajectory_of as trajectory_of
     from fusiond.models.blocks import Block as Block
     from fusiond.models.catalogue import MODELS as MODELS
     from fusiond.models.catalogue import make_model as make_model
@@ -64,7 +64,7 @@ _HOMES = {
         *("TrajectoryTable", "read_attitude", "read_bearing", "read_gnss", "read_imu"),
         *("read_rdss", "read_solution", "read_truth", "read_wheel"),
     ),
-    "fusiond.files.solution_table": ("trajectory_of",),
+    "fusiond.files.solutions_to_table": ("trajectory_of",),
     "fusiond.models.blocks": ("Block",),
     "fusiond.models.catalogue": ("MODELS", "make_model"),
     "fusiond.models.model": ("Model",),

@@ -123,7 +123,7 @@ def test_shipped_files_are_the_installed_ones(installed: Path, tmp_path: Path) -
         installed / "python",
         "-c",
         "from drivers.can.dbc import find_dbc; print(find_dbc('xsens_mti600'))\n"
-        "from drivers.shipped import shipped; print(shipped('vehicle.toml'))",
+        "from drivers.shipped_files import shipped; print(shipped('vehicle.toml'))",
         folder=tmp_path,
     )
     for path in map(Path, where.split()):

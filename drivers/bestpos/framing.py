@@ -15,6 +15,7 @@ import re
 from dataclasses import dataclass
 from zlib import crc32
 
+from drivers.framing_base import Splitter
 from drivers.plausible import LEAP_SECONDS, within
 from drivers.raw.weeks import (
     BDT_BEHIND_GPS_S,
@@ -22,7 +23,6 @@ from drivers.raw.weeks import (
     LAST_WEEK,
     WEEK_S,
 )
-from drivers.splitter import Splitter
 
 MAX_LOG = 2048
 """Most bytes from `#` to the CRC. A position has 300; longer logs such as RANGE are not read."""

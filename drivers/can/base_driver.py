@@ -27,7 +27,7 @@ from drivers.base import (
 )
 from drivers.can.bus import CanBus, CanFrame, Interface
 from drivers.can.errors import ControllerState
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from drivers.measurements import (
     ArrivalStamp,
     DeviceEvent,

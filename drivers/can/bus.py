@@ -5,7 +5,7 @@ descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descrip
 `udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn, or
 when its owner calls `poll`: an IMU sends its frames one by one, and a daemon that wakes for each
 spends five times their cost on waking. A bus without one (`virtual`) is read by a thread into a
-ring of `RING_FRAMES`. How a frame lies in what a socket gives: `drivers.can.frame_decoding`.
+ring of `RING_FRAMES`. How a frame lies in what a socket gives: `drivers.can.socket_frames`.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from can.typechecking import CanFilter
 
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.can.errors import ControllerState, controller_state, error_names
-from drivers.can.frame_decoding import (
+from drivers.can.python_can_import import can
+from drivers.can.socket_frames import (
     CANFD_BYTES,
     DATAGRAM_BYTES,
     Decode,
     datagram_decoder,
     of_can_frame,
 )
-from drivers.can.python_can_import import can
 
 FRAMES_PER_WAKEUP = 64
 """Most frames handled in one turn of the loop: 2 ms of work, 15 ms of a full 500 kbit/s bus."""

@@ -24,7 +24,7 @@ from cantools.database.can.signal import Signal
 from drivers.base import PermanentDriverError
 from drivers.can.dbc_salvage import SoundPart, UnreadableError, read_whole, sound_part, unselected
 from drivers.can.signal_bits import AbsentSignalError, Layout
-from drivers.shipped import shipped
+from drivers.shipped_files import shipped
 
 log = logging.getLogger(__name__)
 

@@ -20,8 +20,8 @@ from functools import reduce
 from operator import xor
 from typing import Literal
 
+from drivers.framing_base import Splitter
 from drivers.nmea.incremental_checksum import RunningCrc24q, RunningFletcher
-from drivers.splitter import Splitter
 
 MAX_SENTENCE = 256
 """Bytes from `$` to the checksum. The standard says 82, receivers exceed it; a longer run of text

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 
-from drivers.nmea.foreign_protocols import protocol_sentence, verified_protocol
+from drivers.nmea.unsupported_protocols import protocol_sentence, verified_protocol
 
 REFUSALS = {
     "no_fix": "the receiver has no fix",

@@ -17,16 +17,16 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeReport
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
-from drivers.rdss.fraction import FractionUnit
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.mail import MessageStage
 from drivers.rdss.messages import BeamPower, Decoder, DeviceClock, Family, Message, Unknown
 from drivers.rdss.outbox import Outbox
 from drivers.rdss.position_report_coding import PositionReport
+from drivers.rdss.reply_time_fraction import FractionUnit
 from drivers.rdss.request_state_machine import Terminal
 from drivers.rdss.state_tables import (
     BITS_A_BYTE,

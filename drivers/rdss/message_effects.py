@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import replace
 
 from drivers.plausible import HEIGHT_M, within
-from drivers.rdss.fraction import FractionReader
 from drivers.rdss.inbox import Inbox
 from drivers.rdss.messages import (
     BeamPower,
@@ -25,6 +24,7 @@ from drivers.rdss.messages import (
     Text,
     Unknown,
 )
+from drivers.rdss.reply_time_fraction import FractionReader
 from drivers.rdss.request_cycle_state import RequestCycleState
 from drivers.rdss.state_tables import (
     ALWAYS,

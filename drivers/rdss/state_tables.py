@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from drivers.rdss.fraction import FractionUnit
 from drivers.rdss.mail import Mail
 from drivers.rdss.messages import Family, Fix, Outcome
+from drivers.rdss.reply_time_fraction import FractionUnit
 from drivers.rdss.vehicle_message_envelope import Carriage
 
 SECOND = 1_000_000_000

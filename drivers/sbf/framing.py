@@ -13,7 +13,7 @@ from __future__ import annotations
 import binascii
 from typing import NamedTuple
 
-from drivers.splitter import Splitter
+from drivers.framing_base import Splitter
 
 MAX_BLOCK = 8192
 """MeasEpoch of 80 channels takes 5 kB; a longer length is a false header."""

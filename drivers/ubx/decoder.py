@@ -1,6 +1,6 @@
 """UBX-NAV frames of a receiver in, measurements out: epochs by iTOW, judged. No I/O, no clock.
 
-An epoch closes with NAV-EOE, or as `drivers.cycle` finds.
+An epoch closes with NAV-EOE, or as `drivers.epoch_ends` finds.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ l is the lever arm from the IMU, w the rate of the body against the Earth, whose
 lever is under 1 mm/s per 10 m. e is the error of the rate (computed minus true), dl that of the
 lever arm's rest, an estimate (true minus estimated).
 
-The slope by dl uses the part of w that is not noise (fusiond.aiding.preintegrated_measurement).
+The slope by dl uses the part of w that is not noise (fusiond.aiding.smoothed_imu_jacobian).
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.preintegrated_measurement import turning
+from fusiond.aiding.smoothed_imu_jacobian import turning
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.strapdown import VN

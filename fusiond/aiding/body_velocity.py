@@ -12,7 +12,7 @@ m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, w
 seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the rounding p, as
 a share of a step q, are estimated if the model has their blocks
 (fusiond.models.vehicle_parameter_blocks). c is the learned factor of a configured drift
-(fusiond.navigator.sensor_drift_magnitudes). With z = h(x^) - y, navigation errors computed minus
+(fusiond.navigator.drift_level_estimation). With z = h(x^) - y, navigation errors computed minus
 true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
@@ -20,7 +20,7 @@ true, parameters true minus estimated, and e_i the axis's unit vector:
         - tau e_i exp[m x] (e - C^T [g x] phi)) - c ds_w + q sign(y) dp + v               (wheel)
 
 a_forward = f + C^T g is smoothed, e is the error of its force
-(fusiond.aiding.preintegrated_measurement): single samples of a vibrating sensor would bias the
+(fusiond.aiding.smoothed_imu_jacobian): single samples of a vibrating sensor would bias the
 latency towards zero.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
@@ -51,7 +51,7 @@ from fusiond.aiding.base import (
 )
 from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.initialisation import STEADY, SpeedCandidate
-from fusiond.aiding.preintegrated_measurement import add_of_force, turning
+from fusiond.aiding.smoothed_imu_jacobian import add_of_force, turning
 from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import AXLE_LEVER, MOUNTING, SIDE_DRIFT

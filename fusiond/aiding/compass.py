@@ -5,7 +5,7 @@ r"""Heading of a compass: magnetic, with the deviation of the vehicle.
 D is the declination at the vehicle. a (mounting, and the error of the field's model) and b, c (the
 vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d lasts for
 some seconds (bridges, vehicles beside, own currents), a first-order Gauss-Markov process with a
-learned factor (fusiond.navigator.sensor_drift_magnitudes); v is white. The measurement is psi_m +
+learned factor (fusiond.navigator.drift_level_estimation); v is white. The measurement is psi_m +
 D:
 
     z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev

@@ -7,9 +7,9 @@ r"""Position of an antenna: a GNSS fix, with or without height.
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
 ionosphere), s its share in this fix, c an error of seconds, of w metres, down larger by the ratio
-of the fix's sigmas (fusiond.aiding.fix_errors), tau the time from the fix's stamp to its validity,
-v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
-(fusiond.aiding.preintegrated_measurement); with states in the model they are estimated; dl, db,
+of the fix's sigmas (fusiond.aiding.fix_error_correlation), tau the time from the fix's stamp to its
+validity, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
+(fusiond.aiding.smoothed_imu_jacobian); with states in the model they are estimated; dl, db,
 dtau are true minus estimated. A timing error of sigma s_t that is not shared moves the antenna by v
 s_t, which adds (v_i s_t)^2 to the variance of each axis. An error that lasts for seconds and has no
 state is noise.
@@ -27,8 +27,9 @@ a metre are 5 cm, with u = C dl
     z_2 = phi x u,   var(phi_j u_k - phi_k u_j) = P_jj U_kk + X_kj^2 + P_kk U_jj + X_jk^2
                                                   - 2 (P_jk U_jk + X_jj X_kk)
 
-with P, U and X = cov(u, phi) of the two. (96 cars of tests/estimators/test_unknown_lever_arm.py,
-NEES a degree of lever arm and place: 1.5 without it, 1.1 with it.)
+with P, U and X = cov(u, phi) of the two. (96 cars of
+tests/estimators/test_lever_arm_after_attitude_update.py, NEES a degree of lever arm and place: 1.5
+without it, 1.1 with it.)
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3; Bar-Shalom, Li, Kirubarajan (2001),
 section 10.3.2 (second-order terms).
@@ -59,7 +60,7 @@ from fusiond.aiding.base import (
 )
 from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.initialisation import PositionCandidate
-from fusiond.aiding.preintegrated_measurement import add_of_force
+from fusiond.aiding.smoothed_imu_jacobian import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius

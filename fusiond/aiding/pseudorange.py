@@ -36,7 +36,7 @@ been subtracted. Neglected are the change of the flight time in the rate, under 
 Earth's own rate times the lever. dc_k and dd are true minus estimated, as all parameters.
 
 A double-star system's two path lengths L1 = 2 rho_1, L2 = rho_1 + rho_2 (fusiond.aiding.
-rdss_geometry) are two ranges without a clock: rho_1 = L1 / 2 and rho_2 = L2 - L1 / 2 have
+rdss_fix_covariance) are two ranges without a clock: rho_1 = L1 / 2 and rho_2 = L2 - L1 / 2 have
 independent errors.
 
 Source: Groves, 2nd ed., eq. 14.114 to 14.128 and 9.165.

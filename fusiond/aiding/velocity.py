@@ -5,7 +5,7 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
 w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is the time from the
 velocity's stamp to its validity, a the acceleration (its error da:
-fusiond.aiding.preintegrated_measurement), smoothed: with the noise of single samples in the
+fusiond.aiding.smoothed_imu_jacobian), smoothed: with the noise of single samples in the
 Jacobian an offset would be biased and too certain. The product of the two errors is not treated as
 noise: on drive_0708 that cost a tenth of the accuracy in outages without a more honest sigma. A
 timing error of sigma s_t that is not shared changes the velocity by a s_t, which adds (a_i s_t)^2
@@ -45,7 +45,7 @@ from fusiond.aiding.base import (
 )
 from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.initialisation import VelocityCandidate
-from fusiond.aiding.preintegrated_measurement import add_of_force
+from fusiond.aiding.smoothed_imu_jacobian import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity

@@ -61,7 +61,7 @@ def _config(path: Path) -> Config:
 
 def _recording(config_path: Path, files: list[Path]) -> Row:
     # The daemon's parts come only where there is a recording.
-    from fusiond.replay.run import ReplayOptions, replay  # noqa: PLC0415
+    from fusiond.replay.replay_output import ReplayOptions, replay  # noqa: PLC0415
 
     summary = replay(files, ReplayOptions(config=config_path))
     problems = [*summary.pop("problems"), *summary.pop("driver_faults")]

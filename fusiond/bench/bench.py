@@ -23,7 +23,8 @@ velocity in order of validity, files read and the solution written at every row;
 `late_raw_tick_ratio`, the same of an RDSS fix 1.5 s late over raw epochs of 40 satellites
 (`fusiond.bench.delayed_raw`).
 
-Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
+Seconds: `process_start_s`, `fusiond process` before its first row
+(`fusiond.bench.process_startup`).
 
 As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
 multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
@@ -36,7 +37,7 @@ Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
 (`fusiond.studies.reduced_order.cost`).
 
 Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
-to published sigma, and the modules that they are in (`fusiond.bench.fix_path`).
+to published sigma, and the modules that they are in (`fusiond.bench.fix_call_trace`).
 """
 
 from __future__ import annotations
@@ -59,9 +60,9 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.bench.delayed_fix import delayed_fix
 from fusiond.bench.delayed_raw import delayed_raw
-from fusiond.bench.fix_path import ordinary_fix
+from fusiond.bench.fix_call_trace import ordinary_fix
+from fusiond.bench.process_startup import start
 from fusiond.bench.raw_epoch import raw_epoch
-from fusiond.bench.start import start
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator

@@ -79,8 +79,8 @@ def init(
     commented and passes `fusiond check`, whose doubts are printed.
     """
     from fusiond.configuration.draft import Draft  # noqa: PLC0415
-    from fusiond.configuration.plausibility import VehicleClass  # noqa: PLC0415
     from fusiond.configuration.sensor_class import SensorClass  # noqa: PLC0415
+    from fusiond.configuration.vehicle_class import VehicleClass  # noqa: PLC0415
 
     if out.exists() and not force:
         raise typer.BadParameter(f"{out} exists: --force overwrites it")

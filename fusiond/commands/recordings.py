@@ -68,8 +68,8 @@ def replay(
 
     Exit code 1: the bits differ from the recorded ones."""
     with compiling():
-        from fusiond.replay.run import ReplayOptions  # noqa: PLC0415
-        from fusiond.replay.run import replay as run_replay  # noqa: PLC0415
+        from fusiond.replay.replay_output import ReplayOptions  # noqa: PLC0415
+        from fusiond.replay.replay_output import replay as run_replay  # noqa: PLC0415
 
     logging.getLogger("fusiond").addHandler(logging.NullHandler())  # events go into --out
     wish = ReplayOptions(config, tuple(settings or ()), out, speed)

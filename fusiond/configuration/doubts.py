@@ -15,8 +15,8 @@ from pathlib import Path
 
 from fusiond.configuration.aiding import CompassAiding, GnssAiding, RawAiding, RdssAiding
 from fusiond.configuration.model_fit import model_doubts
-from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
+from fusiond.configuration.vehicle_class import VehicleClass
 from fusiond.files.install_extra import install_command
 
 LONGEST_M: dict[VehicleClass, float] = {

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Axes
 from fusiond.configuration.sensor_class import SensorClass
+from fusiond.configuration.vehicle_class import VehicleClass
 
 Vector = tuple[float, float, float]
 

@@ -35,10 +35,10 @@ from fusiond.configuration.constraints import Constraints
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.outputs import Host, Outputs, Port
-from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
+from fusiond.configuration.vehicle_class import PLAUSIBILITY, Plausibility, VehicleClass
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:

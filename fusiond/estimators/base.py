@@ -28,9 +28,9 @@ from fusiond.aiding.base import (
     State,
 )
 from fusiond.estimators.corrected_imu import sensor_estimates
-from fusiond.estimators.error_decorrelation import renew
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.fault_bank_interface import Hypotheses
+from fusiond.estimators.measurement_loop_kernel import KNOWS, RESULT, TURNED, run_for
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
@@ -40,7 +40,7 @@ from fusiond.estimators.propagation import (
 )
 from fusiond.estimators.published_state import WIDER, Published, sigmas, surely_moves, widen
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.row_kernels import KNOWS, RESULT, TURNED, run_for
+from fusiond.estimators.shared_error_renewal import renew
 from fusiond.estimators.state_array import AHEAD, memory
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.estimators.update_with_exclusion import KEPT, Screened, screened

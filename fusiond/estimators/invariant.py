@@ -73,8 +73,8 @@ from fusiond.estimators.invariant_error import (
     vehicle_axes,
     write_jacobian,
 )
+from fusiond.estimators.measurement_loop_kernel import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.row_kernels import KNOWN, LARGE, PLAIN, SETTLES
 from fusiond.estimators.tilt_axes_update import keep_down_rows, keep_downward
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.estimators.update_with_exclusion import KEPT

@@ -19,7 +19,7 @@ from fusiond.estimators.base import AS_STATED, THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.fault_update_by_rows import account_for
 from fusiond.estimators.gated_update import fold_and_account
-from fusiond.estimators.row_kernels import AT_H, NO_AXES, Axes
+from fusiond.estimators.measurement_loop_kernel import AT_H, NO_AXES, Axes
 from fusiond.estimators.update import fuse, work
 from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.model import Model
@@ -35,7 +35,7 @@ class KalmanEstimator(Estimator):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
     packs: ClassVar[bool] = True
-    """True if an update is that of fusiond.estimators.row_kernels."""
+    """True if an update is that of fusiond.estimators.measurement_loop_kernel."""
 
     def __init__(
         self,

@@ -36,8 +36,6 @@ from fusiond.estimators.multi_sample_covariance import (
     add_up,
     cross_for,
 )
-from fusiond.estimators.multi_sample_sigmas import ROW, ROWS, WAITING, begin, fill, first_order
-from fusiond.estimators.multi_sample_sigmas import SIZE as BETWEEN
 from fusiond.estimators.published_state import (
     ENTRIES,
     WIDER,
@@ -47,6 +45,15 @@ from fusiond.estimators.published_state import (
     sigmas_of,
     widen,
 )
+from fusiond.estimators.sigmas_between_covariance_steps import (
+    ROW,
+    ROWS,
+    WAITING,
+    begin,
+    fill,
+    first_order,
+)
+from fusiond.estimators.sigmas_between_covariance_steps import SIZE as BETWEEN
 from fusiond.estimators.state_array import (
     AHEAD,
     BANK,

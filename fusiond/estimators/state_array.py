@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from fusiond.estimators.covariance_propagation import KEPT, work_size
 from fusiond.estimators.fault_bank import FaultTable, bank_size, begin_bank
 from fusiond.estimators.multi_sample_covariance import SUMS
-from fusiond.estimators.multi_sample_sigmas import SIZE as BETWEEN
 from fusiond.estimators.published_state import WIDER, Published
+from fusiond.estimators.sigmas_between_covariance_steps import SIZE as BETWEEN
 from fusiond.estimators.tilt_axes_propagation import TURN_SIZE
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import COEFFICIENTS

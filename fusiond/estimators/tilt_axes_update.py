@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_carried import mix
-from fusiond.estimators.gyro_error_of_update import keep_turn
+from fusiond.estimators.gyro_error_after_rate_update import keep_turn
+from fusiond.estimators.lever_arm_after_attitude_update import keep_antenna
 from fusiond.estimators.tilt_axes_propagation import UPRIGHT
-from fusiond.estimators.unknown_lever_arm import keep_antenna
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, PHI

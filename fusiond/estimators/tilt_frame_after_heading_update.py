@@ -75,10 +75,11 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Linearised
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
-from fusiond.estimators.gyro_error_of_update import gyro_slots
+from fusiond.estimators.gyro_error_after_rate_update import gyro_slots
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.lever_arm_after_attitude_update import antenna_slots
+from fusiond.estimators.measurement_loop_kernel import UNDOUBTED, Axes
 from fusiond.estimators.propagation import TURN_TILT
-from fusiond.estimators.row_kernels import UNDOUBTED, Axes
 from fusiond.estimators.tilt_axes_update import (
     ESTIMATE_SIZE,
     carry_over,
@@ -86,7 +87,6 @@ from fusiond.estimators.tilt_axes_update import (
     may_part,
     remember_estimate,
 )
-from fusiond.estimators.unknown_lever_arm import antenna_slots
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import FORCE_ERROR
 from fusiond.navigation.strapdown import STEP_RESTS_S
@@ -99,8 +99,9 @@ class TiltAxesFilter(KalmanEstimator):
     """Centralised filter whose tilt axes turn with the heading.
 
     P keeps three quantities over an update: the tilt in axes that turn with the heading, the gyro
-    errors relative to the turn (fusiond.estimators.gyro_error_of_update), and, with an estimated
-    lever arm, the antenna's position (fusiond.estimators.unknown_lever_arm)."""
+    errors relative to the turn (fusiond.estimators.gyro_error_after_rate_update), and, with an
+    estimated lever arm, the antenna's position
+    (fusiond.estimators.lever_arm_after_attitude_update)."""
 
     def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
         super().__init__(model, gap_s, faults=faults)

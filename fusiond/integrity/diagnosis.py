@@ -38,8 +38,8 @@ from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, iden
 from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
+from fusiond.integrity.fault_findings import Finding, Lasting
 from fusiond.integrity.position_velocity_agreement import Agreement
-from fusiond.integrity.series_exclusion import Finding, Lasting
 from fusiond.integrity.series_states import (
     DISAGREES,
     FORGET_NS,

@@ -12,7 +12,7 @@ from pathlib import Path
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.state_keeper import state_file
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigator.imu_handover import published_of_spare
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_calibration import (

@@ -18,7 +18,7 @@ from fusiond.live.injection import Injection
 from fusiond.live.messaging import Messaging
 from fusiond.live.operator import Operator
 from fusiond.live.sources import Sources
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.checkpoints import Key
 from fusiond.navigator.navigator import Navigator

@@ -33,11 +33,11 @@ from fusiond.live.process_usage import (
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
-from fusiond.live.standard_error import StandardErrorHandler
 from fusiond.live.state_in_memory import KEPT_STATE, WarmKeeper
 from fusiond.live.state_keeper import StateKeeper
+from fusiond.live.stderr_log_handler import StandardErrorHandler
 from fusiond.live.supervision import supervise
-from fusiond.live.tick import SECOND_NS, Every, Scheduler
+from fusiond.live.tick_scheduler import SECOND_NS, Every, Scheduler
 from fusiond.navigation.compiled import kernels_can_be_kept, load_compiler, load_kernels
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.kernel_widths import kernel_widths

@@ -14,7 +14,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
 from fusiond.live.output_tasks import OutputTasks
 from fusiond.live.service_manager import ServiceManager
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.mode_reasons import reason
 from fusiond.outputs.base import Output

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fusiond.live.log_limit import LogLimit
-from fusiond.live.standard_error import StandardErrorHandler
+from fusiond.live.stderr_log_handler import StandardErrorHandler
 
 SOCKET = Path("/run/systemd/journal/socket")
 PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}

@@ -22,7 +22,7 @@ from drivers.rdss.mail import (
 from drivers.rdss.position_report_coding import DAY_S, PositionReport
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import CommandRefusedError, SendMessage
 from fusiond.outputs.messages.base import Message

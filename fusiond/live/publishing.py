@@ -10,7 +10,7 @@ from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.process_usage import ProcessUsage
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import Driver, Emitted
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from drivers.measurements import DeviceEvent, Height, ImuSample, Measurement, TimeReport
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from drivers.rdss.mail import Mail

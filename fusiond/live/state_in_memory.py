@@ -21,7 +21,7 @@ from fusiond.clock.stamp_mapping import Clock
 from fusiond.clock.utc_from_arrivals import UtcKnown
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.imu_handover import published_of_spare
 from fusiond.navigator.navigator import Navigator

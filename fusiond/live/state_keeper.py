@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.saved_state import SavedState, load_state, save_state
 from fusiond.navigator.state_file import DamagedStateError, RefusedStateError, set_aside

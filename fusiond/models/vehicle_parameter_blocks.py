@@ -75,7 +75,7 @@ def clock_skew_block(name: str) -> Block:
 
 def fix_markov_block(name: str, lasts_s: float) -> Block:
     """Error that fixes share for a while, of sigma one; each measurement scales it in metres
-    (fusiond.aiding.fix_errors)."""
+    (fusiond.aiding.fix_error_correlation)."""
     return Block(name, "1", ("n", "e", "d"), (-1,) * 3, initial=1.0, steady=1.0, tau_s=lasts_s)
 
 

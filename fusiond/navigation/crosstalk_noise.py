@@ -51,7 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.stepwise_factors import FromInstants
+from fusiond.navigation.sample_noise_factors import FromInstants
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -134,7 +134,7 @@ class Crosstalk:
         )
         self._mean = np.zeros(13)
         self.squares = FromInstants()
-        """Factor (1,) of m^2 as estimated for the unit (fusiond.navigator.unit_grade)."""
+        """Factor (1,) of m^2 as estimated for the unit (fusiond.navigator.imu_grade)."""
 
     def follow(self, times: Stamps, samples: Array, densities: Array) -> None:
         """Add the densities, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples (m, 6) at `times`

@@ -7,8 +7,8 @@ With means y_k of n samples, each over tau = n T, the Hadamard variance
 is N^2 / tau for white noise of density N^2, independent of bias and drift. Motion, and vibration
 that averages out, only add to tau H(tau) at one tau or another, so the smallest over several tau
 bounds the density that attitude and velocity integrate; the share that they do is estimated by
-predictions (fusiond.navigator.imu_noise_share). The mean is over past samples of the last seconds
-alone: an engine that starts shows at once, and a replay gives the same numbers.
+predictions (fusiond.navigator.imu_vibration_noise_share). The mean is over past samples of the last
+seconds alone: an engine that starts shows at once, and a replay gives the same numbers.
 
 Ten seconds are too slow for a noise that rises tenfold at once: after one second the attitude is
 off by four sigma. A faster mean would take each bump for noise, although it is motion that the
@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.stepwise_factors import FromInstants
+from fusiond.navigation.sample_noise_factors import FromInstants
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -18,7 +18,7 @@ from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
-from fusiond.integrity.source_monitors import Verdicts
+from fusiond.integrity.consistency_monitors import Verdicts
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError

@@ -1,8 +1,8 @@
 """Noise of an inertial unit as observed in navigation.
 
 Two estimates: the share of the samples' variation that is noise
-(fusiond.navigator.imu_noise_share), and the unit's grade within its class
-(fusiond.navigator.unit_grade). Both use the filter's state of `SETTLES_NS` ago, on a time grid, and
+(fusiond.navigator.imu_vibration_noise_share), and the unit's grade within its class
+(fusiond.navigator.imu_grade). Both use the filter's state of `SETTLES_NS` ago, on a time grid, and
 apply to samples `COUNTS_NS` later. So neither the order of measurements nor the number of samples
 at once matters.
 """
@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from fusiond.aiding.fix_errors import SETTLES_NS
+from fusiond.aiding.fix_error_correlation import SETTLES_NS
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG
 from fusiond.estimators.base import Estimator
@@ -21,10 +21,10 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS, NoiseShares
-from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
+from fusiond.navigator.drift_level_estimation import DriftLevels
+from fusiond.navigator.imu_grade import UnitGrade
+from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS, NoiseShares
 from fusiond.navigator.timeline import Timeline
-from fusiond.navigator.unit_grade import UnitGrade
 
 STEP_NS = 1_000_000_000
 """Step of a prediction's propagation, so that no tick carries all of it."""

@@ -37,6 +37,7 @@ from fusiond.navigator.assembly import (
     verdicts_of,
 )
 from fusiond.navigator.calibration import CalibrationWatch
+from fusiond.navigator.drift_level_estimation import DriftLevels
 from fusiond.navigator.fault_events import ServiceEvents
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_handover import hand_over, publish_by_axes
@@ -56,7 +57,6 @@ from fusiond.navigator.published_solution import (
 )
 from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 from fusiond.navigator.source_status import SourceService
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.navigator.without_imu import WithoutImu, counted_together

@@ -8,7 +8,7 @@ The solution is the estimator's state, at its own instant or extrapolated.
 
 If the inertial unit is silent for longer than the extrapolation, the motion is unknown. For each
 second of it, one sigma is that the last motion continues or ends, and that the vehicle brakes or
-turns by a; 5 a is the hardest manoeuvre of its class (fusiond.configuration.plausibility):
+turns by a; 5 a is the hardest manoeuvre of its class (fusiond.configuration.vehicle_class):
 
     velocity  |a_last| + a      position  |v| + velocity t / 2      yaw  |w_last| + a / |v|
 
@@ -31,12 +31,12 @@ import numpy as np
 
 from fusiond.aiding.base import Vector3
 from fusiond.aiding.rest_evidence import RestEvidence
-from fusiond.configuration.plausibility import Plausibility
 from fusiond.configuration.schema import Config
+from fusiond.configuration.vehicle_class import Plausibility
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import published_ahead
+from fusiond.integrity.consistency_monitors import Verdicts
 from fusiond.integrity.diagnosis import Diagnosis
-from fusiond.integrity.source_monitors import Verdicts
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_elements

@@ -8,8 +8,8 @@ rounding,
     D = E[(nu_k - nu_j)^2] / 2 = W + q + (change of drift and filter error)^2 / 2
 
 is no less than the white variance W for any P (Allan's structure function, as for a receiver's
-fixes: fusiond.aiding.fix_errors). A repeated or smoothed wheel speed has changed its error within
-that lag. With n such pairs while driving, c^2 of the configured variance s^2 counts,
+fixes: fusiond.aiding.fix_error_correlation). A repeated or smoothed wheel speed has changed its
+error within that lag. With n such pairs while driving, c^2 of the configured variance s^2 counts,
 
     c^2 = (n max(LEAST, min(1, (D - q) / s^2)) + FIRST) / (n + FIRST)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from fusiond.estimators.federated.options import local_of
-from fusiond.integrity.series_exclusion import Finding
+from fusiond.integrity.fault_findings import Finding
 from fusiond.integrity.series_states import Series, Service
 from fusiond.navigator.timeline import Timeline
 

@@ -19,14 +19,14 @@ import numpy as np
 from fusiond.aiding.base import AidingMeasurement, Feedback
 from fusiond.aiding.initialisation import Candidate
 from fusiond.estimators.base import Estimator, Outcome
-from fusiond.estimators.row_kernels import JUDGE, KEEP
+from fusiond.estimators.measurement_loop_kernel import JUDGE, KEEP
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.checkpoints import Checkpoint, Key, Spacing
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
-from fusiond.navigator.measurement_rows import MeasurementRows, Span, raw_of
+from fusiond.navigator.packed_measurements import MeasurementRows, Span, raw_of
 from fusiond.navigator.ungated_innovation import RawInnovation, raw_innovation
 
 # Outcomes that say something of a source.

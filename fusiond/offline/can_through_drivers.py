@@ -43,8 +43,8 @@ from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, rejections_from_counts
 from fusiond.files.measurement_csv import ImuTable
 from fusiond.offline.can_log_reader import Refusals, channels, messages
+from fusiond.offline.can_utc_reports import Ahead, Reports, frame
 from fusiond.offline.measurement_files import Arrival
-from fusiond.offline.recorder_reports import Ahead, Reports, frame
 
 OFF_S = 1.0
 """Offset of a recorder's clock beyond which it is reported; receivers report UTC up to a second

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from drivers.bestpos.decoder import BestposDecoder
 from drivers.decoder_options import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
-from drivers.nmea.foreign_protocols import protocol_sentence
+from drivers.nmea.unsupported_protocols import protocol_sentence
 from drivers.raw.messages import (
     Bdgim,
     Correction,

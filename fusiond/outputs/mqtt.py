@@ -18,12 +18,12 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, oversized_packets, subscriptions
+from fusiond.outputs import broker_access, incoming_publications, oversized_packets
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.direct_writes import write_directly
 from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.messages.events import MOST_KEPT, events_message
+from fusiond.outputs.messages.recent_events import MOST_KEPT, events_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.mqtt_endings import FAREWELL_S, abandon, end, hang_up, honour_cancellation
 from fusiond.outputs.mqtt_version import MqttVersion
@@ -102,7 +102,7 @@ class MqttPublisher:
         """Callback with each queued message that the broker has confirmed."""
         self._reconnecting = Reconnecting()
         self._version = MqttVersion(MAX_PAYLOAD_BYTES + oversized_packets.LONGEST_TOPIC)
-        self._quiet = subscriptions.quiet()
+        self._quiet = incoming_publications.quiet()
         self.status = DriverStatus()
 
     def begin_with_3_1_1(self) -> None:
@@ -327,7 +327,7 @@ class MqttPublisher:
         addresses = [*self._listeners]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")
-        coming = subscriptions.Incoming(client, self.counters, self._quiet)
+        coming = incoming_publications.Incoming(client, self.counters, self._quiet)
         while True:
             for address in addresses:
                 await self._version.subscribe(client, address)
@@ -335,7 +335,7 @@ class MqttPublisher:
             quiet_s = await coming.flood()
             await client.unsubscribe(addresses)
             honour_cancellation()
-            most = f"{subscriptions.MESSAGES.per_s:.0f} a second"
+            most = f"{incoming_publications.MESSAGES.per_s:.0f} a second"
             text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
             self._on_event("mqtt_flooded", text)
             await asyncio.sleep(quiet_s)

@@ -24,9 +24,9 @@ from fusiond.outputs.base import Surroundings
 from fusiond.outputs.derived_figures import known, motion, usable
 from fusiond.outputs.geoid import sea_height
 from fusiond.outputs.latest_value import Latest
+from fusiond.outputs.listening_port import Port
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import TcpServer, Unheard
 from fusiond.outputs.topics import NAV, Topic
 

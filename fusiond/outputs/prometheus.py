@@ -21,13 +21,13 @@ from fusiond.integrity.series_states import Service
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.derived_figures import motion, usable
+from fusiond.outputs.listening_port import Port
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.status import StatusMessage
-from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import Client, TcpServer
 from fusiond.outputs.topics import Topic
 

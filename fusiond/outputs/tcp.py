@@ -20,10 +20,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fusiond.outputs.activation import activated
+from fusiond.outputs.client_rate_limits import Allowance
 from fusiond.outputs.client_slots import gives_way, host_of
 from fusiond.outputs.client_sockets import Guests, ServerQueue
-from fusiond.outputs.port import Port
-from fusiond.outputs.rate_limits import Allowance
+from fusiond.outputs.listening_port import Port
 from fusiond.outputs.sockets import LINGER_NOT, bound, tune
 
 MOST_CLIENTS = 256

@@ -10,11 +10,11 @@ from pydantic import BaseModel
 from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.messages.events import EventsMessage
 from fusiond.outputs.messages.fleet import FleetMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.innovations import InnovationsMessage
 from fusiond.outputs.messages.nav import NavMessage
+from fusiond.outputs.messages.recent_events import EventsMessage
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.short_message import ShortMessage
 from fusiond.outputs.messages.status import StatusMessage

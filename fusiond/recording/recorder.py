@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from drivers.can.bus import CanFrame
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from fusiond.clock.host import SECOND_NS, ReadClock
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording

@@ -212,7 +212,7 @@ KINDS_BY_INPUT = {
     "sent": Kind.SENT,
     "correction": Kind.CORRECTION,
 }
-"""Record kinds by kind of `drivers.input_queue`; any other kind is a timer of the driver."""
+"""Record kinds by kind of `drivers.external_inputs`; any other kind is a timer of the driver."""
 
 
 def input_record(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fusiond.configuration.schema import Config
-from fusiond.live.tick import SECOND_NS, Every
+from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from fusiond.recording.reader import Log

@@ -27,7 +27,7 @@ from fusiond.report.channel_arrays import (
     VerdictLists,
     number,
 )
-from fusiond.report.input_statistics import InputStatistics
+from fusiond.report.input_timing_and_spectrum import InputStatistics
 from fusiond.report.run import Event, LogParts, Problem, Run
 from fusiond.report.settings import changed_settings
 

@@ -15,7 +15,7 @@ from functools import partial
 from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any
 
-from drivers.shipped import shipped
+from drivers.shipped_files import shipped
 from fusiond.configuration.schema import Config
 from fusiond.simulation.gnss.raw_stream import RawFormat
 from fusiond.simulation.scenarios import SCENARIOS, Scenario

@@ -21,7 +21,7 @@ import numpy as np
 from fusiond.files.csv_tables import Floats
 from fusiond.files.measurement_csv import TrajectoryTable
 from fusiond.files.resumable_parquet import Row, flattened
-from fusiond.files.solution_table import trajectory_of
+from fusiond.files.solutions_to_table import trajectory_of
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.compare import NothingToCompareError, compare

@@ -84,7 +84,7 @@ def test_the_daemon_and_all_its_filters_but_one_are_there(environment: dict[str,
     code = """
 import sys
 from pathlib import Path
-import fusiond.live.daemon, fusiond.demo.demo, fusiond.doctor.doctor, fusiond.replay.run
+import fusiond.live.daemon, fusiond.demo.demo, fusiond.doctor.doctor, fusiond.replay.replay_output
 import fusiond.recording.log_metadata, fusiond.batch.batch
 from fusiond.configuration.load import load_config
 from fusiond.navigator.navigator import Navigator

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from drivers.shipped import shipped
+from drivers.shipped_files import shipped
 from fusiond.commands.app import app
 from fusiond.configuration.doubts import GIVES, doubts
 from fusiond.configuration.load import _DEFAULT_AIDING, load_config

@@ -29,7 +29,7 @@ from fusiond.demo.demo import (
 from fusiond.demo.outage_report import outage_report
 from fusiond.demo.terminal_view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from fusiond.simulation.papers import REST_S
 from tests.patience import PATIENCE_S
 

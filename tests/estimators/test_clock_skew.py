@@ -15,8 +15,8 @@ from fusiond.models.vehicle_parameter_blocks import (
 from fusiond.navigator.assembly import model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.matched_noise_drives import CODE, RTK, Vehicle, scene
 from fusiond.studies.faults.sensor_data import Recording
-from fusiond.studies.faults.sharpness_service_drives import CODE, RTK, Vehicle, scene
 from fusiond.studies.faults.solution_errors import errors_against
 
 SKEW = 250e-6

@@ -17,8 +17,8 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multi_sample_covariance import GRID_NS
-from fusiond.estimators.multi_sample_sigmas import ROWS
 from fusiond.estimators.published_state import Published
+from fusiond.estimators.sigmas_between_covariance_steps import ROWS
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

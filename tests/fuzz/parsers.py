@@ -16,7 +16,12 @@ class Parser(NamedTuple):
 _NMEA = ("decoder", "epoch_assembly", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("bcnav", "beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes")
-_SHARED = ("drivers.cycle", "drivers.solution", "drivers.solution_decoder", "drivers.splitter")
+_SHARED = (
+    "drivers.epoch_ends",
+    "drivers.solution",
+    "drivers.solution_decoder",
+    "drivers.framing_base",
+)
 _HUB = ("advice", "history", "vehicles", "message_parser", "vehicle")
 
 PARSERS = {

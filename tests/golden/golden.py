@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fusiond.recording.edit import merge
-from fusiond.replay.run import SOLUTION, ReplayOptions, replay
+from fusiond.replay.replay_output import SOLUTION, ReplayOptions, replay
 from tests.golden.recorded import Bus, Walk
 from tests.recording.driven import Drive
 from tests.recording.rig import Rig

@@ -30,7 +30,7 @@ def check(folder: Path) -> None:
     # Not where the drive is only watched: navigation takes seconds to load there.
     from fusiond.recording.info import info  # noqa: PLC0415
     from fusiond.recording.reader import Log  # noqa: PLC0415
-    from fusiond.replay.run import ReplayOptions, replay  # noqa: PLC0415
+    from fusiond.replay.replay_output import ReplayOptions, replay  # noqa: PLC0415
 
     parts = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
     assert len(parts) == 2, parts

@@ -11,8 +11,8 @@ from fusiond.estimators.fault_bank_interface import Estimated
 from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.matched_noise_drives import CODE, SHARING, Receiver, Vehicle
 from fusiond.studies.faults.service import Job, service_run
-from fusiond.studies.faults.sharpness_service_drives import CODE, SHARING, Receiver, Vehicle
 
 BLOCKS = ("gnss_bias", "gnss_bias_down")
 JUMP_SD_M = 0.6

@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
-from fusiond.aiding.fix_errors import SHOWN
+from fusiond.aiding.fix_error_correlation import SHOWN
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
-from fusiond.navigator.imu_noise_share import GRID
+from fusiond.navigator.drift_level_estimation import GRID as LEVELS
+from fusiond.navigator.imu_vibration_noise_share import GRID
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_calibration import (
     SavedCalibration,
@@ -23,7 +24,6 @@ from fusiond.navigator.saved_calibration import (
     save_calibration,
 )
 from fusiond.navigator.saved_noise import SavedNoise
-from fusiond.navigator.sensor_drift_magnitudes import GRID as LEVELS
 
 CONFIG: dict[str, Any] = {"constraints": {"non_holonomic": {"enabled": True}}}
 VALUES = {"mounting_yaw_deg": (2.0, 0.2)}

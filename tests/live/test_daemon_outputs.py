@@ -17,7 +17,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.outputs.commands import COMMANDS
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.recording.reader import Log
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from tests.broker import Broker, Listener, free_port, listening
 from tests.live.daemon_bench import PARKED, RDSS, Bench, driving, running
 from tests.patience import PATIENCE_S, until

@@ -17,7 +17,7 @@ from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from fusiond.live.events import Events
 from fusiond.live.journal import JournalHandler, handler
-from fusiond.live.standard_error import StandardErrorHandler
+from fusiond.live.stderr_log_handler import StandardErrorHandler
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.daemon import run_daemon
 from fusiond.live.reload import difference
 from fusiond.navigation.solution import Mode
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from tests.broker import free_port
 from tests.live.daemon_bench import NO_MQTT, PARKED, Bench, running
 from tests.patience import PATIENCE_S, until

@@ -16,7 +16,7 @@ from fusiond.configuration.si_units import DEG, sensor_to_body
 from fusiond.demo.demo import demo_setup
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_choice import ImuChoice
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from fusiond.simulation.can.imu import CanImu
 from fusiond.simulation.live_devices import SimulatedVehicle
 from fusiond.studies.faults.runs import error_sample

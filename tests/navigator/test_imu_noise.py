@@ -13,16 +13,16 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.sensor_class import CLASSES
 from fusiond.models.model import Model
 from fusiond.navigator.assembly import model_of
+from fusiond.navigator.imu_grade import UnitGrade
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.unit_grade import UnitGrade
-from fusiond.studies.faults.sensor_data import Recording
-from fusiond.studies.faults.sharpness_service_drives import (
+from fusiond.studies.faults.matched_noise_drives import (
     RATE_HZ,
     RTK,
     Vehicle,
     part_generator,
     scene,
 )
+from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.solution_errors import errors_against
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from drivers.measurements import (
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding
-from fusiond.configuration.plausibility import PLAUSIBILITY, VehicleClass
+from fusiond.configuration.vehicle_class import PLAUSIBILITY, VehicleClass
 from fusiond.navigator.intake import Intake
 
 SECOND = 1_000_000_000

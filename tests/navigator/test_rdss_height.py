@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.measurements import DelayedFix, MonotonicStamp
-from fusiond.aiding.rdss_geometry import RdssGeometry, Sensitivity
+from fusiond.aiding.rdss_fix_covariance import RdssGeometry, Sensitivity
 from fusiond.aiding.rdss_position import RdssPositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.navigator.intake.kind import Instants, Sections

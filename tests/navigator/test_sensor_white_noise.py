@@ -12,9 +12,9 @@ from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.navigator.assembly import model_of
-from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
+from fusiond.navigator.drift_level_estimation import DriftLevels
+from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 from fusiond.navigator.sensor_white_noise import FIRST, LEAST, WhiteNoise
 
 SD, LASTS_S, RATE_HZ = 0.1, 1.0, 10.0

@@ -20,8 +20,7 @@ from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.sensor_data import Recording, gnss_fixes
-from fusiond.studies.faults.sharpness_service_drives import (
+from fusiond.studies.faults.matched_noise_drives import (
     CODE,
     RTK,
     Receiver,
@@ -29,6 +28,7 @@ from fusiond.studies.faults.sharpness_service_drives import (
     part_generator,
     scene,
 )
+from fusiond.studies.faults.sensor_data import Recording, gnss_fixes
 from fusiond.studies.faults.solution_errors import errors_against, published_errors
 
 Array = NDArray[np.float64]

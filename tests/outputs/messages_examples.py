@@ -11,7 +11,7 @@ from drivers.rdss.text_coding import encode_shortest
 from fusiond.clock.results import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
-from fusiond.integrity.series_exclusion import Finding
+from fusiond.integrity.fault_findings import Finding
 from fusiond.integrity.series_states import Service
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter
@@ -19,7 +19,6 @@ from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
-from fusiond.outputs.messages.events import events_message
 from fusiond.outputs.messages.fault import fault_report
 from fusiond.outputs.messages.fleet import of_report
 from fusiond.outputs.messages.health import (
@@ -31,6 +30,7 @@ from fusiond.outputs.messages.health import (
 )
 from fusiond.outputs.messages.innovations import Innovation, innovations_message
 from fusiond.outputs.messages.nav import nav_message
+from fusiond.outputs.messages.recent_events import events_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.short_message import of_stage
 from fusiond.outputs.messages.status import DaemonState, RecordingStatus, status_message

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from fusiond.configuration.outputs import NmeaServed
 from fusiond.outputs import client_sockets as door
 from fusiond.outputs import tcp
+from fusiond.outputs.client_rate_limits import BYTES, MESSAGES, Bucket, Rate
 from fusiond.outputs.client_sockets import BUDGET_NS, WINDOW_NS, Guests, ServerQueue
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.nmea import NmeaServer
-from fusiond.outputs.rate_limits import BYTES, MESSAGES, Bucket, Rate
 from fusiond.outputs.topics import HEALTH, NAV
 from tests.broker import free_port
 from tests.outputs.guest_servers import descriptors, gpsd

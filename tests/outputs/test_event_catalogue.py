@@ -11,7 +11,7 @@ from drivers.can.base_driver import CONTROLLER_EVENTS
 from drivers.ntrip.client import NtripState
 from drivers.rdss.mail import ENDS, Fault
 from drivers.rdss.state_tables import REFUSALS
-from fusiond.integrity.source_monitors import Verdict
+from fusiond.integrity.consistency_monitors import Verdict
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_screening import TEXTS
 from fusiond.outputs.messages.event_catalogue import EVENTS, UNKNOWN, entry_of

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fusiond.outputs import subscriptions
+from fusiond.outputs import incoming_publications
 from fusiond.outputs.command_intake import BURST, REMEMBERED, CommandIntake
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
 from fusiond.outputs.topics import EVENT, NAV
@@ -105,7 +105,7 @@ async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> No
 async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(subscriptions, "QUIET_S", 0.5)
+    monkeypatch.setattr(incoming_publications, "QUIET_S", 0.5)
     taken: list[Command] = []
     flood = 3000
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from fusiond.outputs import subscriptions
+from fusiond.outputs import incoming_publications
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Command
-from fusiond.outputs.subscriptions import BYTES, MESSAGES, Incoming, quiet
+from fusiond.outputs.incoming_publications import BYTES, MESSAGES, Incoming, quiet
 from fusiond.outputs.topics import EVENT, NAV
 from tests.broker import Broker, listening
 from tests.outputs.publisher import BASE, event, heard, nav, options, running
@@ -44,7 +44,7 @@ async def test_a_flood_delays_no_confirmation_and_is_not_listened_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topic: str, size: int
 ) -> None:
     """Events are confirmed one by one: each would wait for all that was sent before."""
-    monkeypatch.setattr(subscriptions, "QUIET_S", 0.5)
+    monkeypatch.setattr(incoming_publications, "QUIET_S", 0.5)
     births: list[bytes] = []
     with Broker(tmp_path, "allow_anonymous true", "log_type error") as broker:
         async with (
@@ -85,8 +85,10 @@ def _coming(monkeypatch: pytest.MonkeyPatch) -> tuple[Incoming, Any, list[int], 
     """Of a client without a connection: how to let a message of so many bytes come, what of them
     got through, and the clock."""
     now_s, through = [100.0], list[int]()
-    monkeypatch.setattr(subscriptions.time, "perf_counter_ns", lambda: round(now_s[0] * 1e9))
-    monkeypatch.setattr(subscriptions.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(
+        incoming_publications.time, "perf_counter_ns", lambda: round(now_s[0] * 1e9)
+    )
+    monkeypatch.setattr(incoming_publications.time, "monotonic", lambda: now_s[0])
     paho = SimpleNamespace(on_message=lambda _p, _u, message: through.append(len(message.payload)))
     counters: Counter[str] = Counter()
     it = Incoming(SimpleNamespace(_client=paho), counters, quiet())  # type: ignore[arg-type]
@@ -110,7 +112,7 @@ async def test_ordinary_command_rates_are_not_a_flood(monkeypatch: pytest.Monkey
     assert len(through) == 3000 + MESSAGES.burst
     come(100)
     async with asyncio.timeout(1.0):
-        assert await it.flood() == subscriptions.QUIET_S
+        assert await it.flood() == incoming_publications.QUIET_S
 
 
 async def test_a_row_of_floods_is_listened_to_less_and_less(
@@ -132,7 +134,7 @@ async def test_a_row_of_floods_is_listened_to_less_and_less(
         waited.append(await it.flood())
         it.over()
     assert waited == [10.0, 20.0, 40.0, 60.0, 60.0]
-    now_s[0] += subscriptions.PEACE_S + 1.0
+    now_s[0] += incoming_publications.PEACE_S + 1.0
     for _ in range(10):
         come(60_000)
-    assert await it.flood() == subscriptions.QUIET_S
+    assert await it.flood() == incoming_publications.QUIET_S

@@ -20,7 +20,7 @@ from fusiond.live.events import Events
 from fusiond.live.publishing import Publishing
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.state_in_memory import KEPT_STATE, WarmKeeper
-from fusiond.live.tick import Scheduler
+from fusiond.live.tick_scheduler import Scheduler
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import NAMES, Command
 from fusiond.outputs.topics import EVENT

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import ClockOptions, Config

@@ -30,7 +30,7 @@ from fusiond.recording.records import Kind
 from fusiond.recording.track_export import WRITERS, Point
 from fusiond.replay.replay import Replay
 from fusiond.replay.replay_config import replay_config
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from tests.clock.host_time import S
 from tests.recording.driven import Drive
 from tests.replay.track_judges import gpsbabel_points, gpx_points

@@ -6,7 +6,7 @@ import asyncio
 import json
 from pathlib import Path
 
-from fusiond.replay.run import ReplayOptions, replay
+from fusiond.replay.replay_output import ReplayOptions, replay
 from tests.broker import Broker, listening
 from tests.recording.driven import Drive
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fusiond.configuration.schema import Config
 from fusiond.files.measurement_csv import TrajectoryTable
-from fusiond.report.input_statistics import spectrum
+from fusiond.report.input_timing_and_spectrum import spectrum
 from fusiond.report.page import page
 from fusiond.report.plot_arrays import BUCKETS, thinned
 from fusiond.report.report import document

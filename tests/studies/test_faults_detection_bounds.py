@@ -19,9 +19,9 @@ from fusiond.studies.faults.detection_bounds import (
     jobs,
     ungated_run,
 )
+from fusiond.studies.faults.matched_noise_drives import CODE, Scene, Vehicle, scene
 from fusiond.studies.faults.sensor_data import Alter
 from fusiond.studies.faults.service import FAULTS
-from fusiond.studies.faults.sharpness_service_drives import CODE, Scene, Vehicle, scene
 from fusiond.studies.faults.tables import TABLES
 
 BEGIN_S, END_S = 80.0, 110.0

@@ -8,6 +8,16 @@ import numpy as np
 import pytest
 
 from drivers.measurements import PositionFix
+from fusiond.studies.faults.matched_noise_drives import (
+    CODE,
+    RTK,
+    SHARED_S,
+    SHARES,
+    SHARING,
+    Vehicle,
+    part_generator,
+    scene,
+)
 from fusiond.studies.faults.measurement_faults import frozen_fix
 from fusiond.studies.faults.runs import ANTENNA_M
 from fusiond.studies.faults.sensor_data import Recording
@@ -25,16 +35,6 @@ from fusiond.studies.faults.service import (
     jobs,
     service_run,
     stale_fixes,
-)
-from fusiond.studies.faults.sharpness_service_drives import (
-    CODE,
-    RTK,
-    SHARED_S,
-    SHARES,
-    SHARING,
-    Vehicle,
-    part_generator,
-    scene,
 )
 from fusiond.studies.faults.solution_errors import (
     STEP_S,

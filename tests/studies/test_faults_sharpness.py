@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fusiond.studies.faults.matched_noise_drives import CODE, Vehicle, scene
 from fusiond.studies.faults.recorded_fault_free import DRIVES, RealJob, real_run
 from fusiond.studies.faults.recorded_fault_free import jobs as real_jobs
-from fusiond.studies.faults.sharpness_service_drives import CODE, Vehicle, scene
 from fusiond.studies.faults.sigma_sharpness import (
     CELLS,
     DURATION_S,

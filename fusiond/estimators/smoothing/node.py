@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.gyro_error_of_update import gyro_slots
+from fusiond.estimators.gyro_error_after_rate_update import gyro_slots
 from fusiond.models.blocks import CARRIER_ANCHOR
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
@@ -60,7 +60,7 @@ def links(model: Model) -> Indices:
     offsets by their rates, a clone by what it is of, and where the axes of a tilt were turned
     (fusiond.estimators.tilt_frame_after_heading_update) a vertical accelerometer's bias by those of
     the others, and each gyro's by the tilt and by those of the others
-    (fusiond.estimators.gyro_error_of_update)."""
+    (fusiond.estimators.gyro_error_after_rate_update)."""
     down, *others = [model.parameters(FORCE_ERROR + axis) for axis in (2, 0, 1)]
     cloned = (*range(PHI, PHI + 3), *range(DR, DR + 3))
     pairs = [(to, of) for to in model.slots_of(CARRIER_ANCHOR) for of in cloned]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, Renewal
 from fusiond.estimators.base import Outcome, Snapshot
-from fusiond.estimators.error_decorrelation import renew
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
+from fusiond.estimators.shared_error_renewal import renew
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
 from fusiond.estimators.tilt_axes_update import turn_rows
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter

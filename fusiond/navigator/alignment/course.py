@@ -37,7 +37,7 @@ from fusiond.navigator.alignment import motion_fit, sensed_motion
 from fusiond.navigator.alignment.evidence import TOGETHER_NS, Fix, Standstill
 from fusiond.navigator.alignment.heading_source_data import Basis
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.rest import rest_bias
+from fusiond.navigator.alignment.rate_bias_at_rest import rest_bias
 from fusiond.navigator.alignment.start import (
     BACKWARD,
     BIAS_SETTLING_S,
@@ -50,8 +50,8 @@ from fusiond.navigator.alignment.start import (
     build_start,
     velocity_of,
 )
+from fusiond.navigator.imu_worse_than_class import evidence_against, worse_classes
 from fusiond.navigator.mode_reasons import reason
-from fusiond.navigator.sensor_ladder import evidence_against, worse_classes
 
 Array = NDArray[np.float64]
 

@@ -23,6 +23,7 @@ from fusiond.aiding.rest_evidence import LEAST_SD_M_S, RestEvidence
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
+from fusiond.navigator.alignment.imu_grade_at_rest import UnitAtRest
 from fusiond.navigator.alignment.innovation_trend import NO_TREND, Offset
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
@@ -32,7 +33,6 @@ from fusiond.navigator.alignment.start import (
     as_geodetic,
     velocity_of,
 )
-from fusiond.navigator.alignment.unit_at_rest import UnitAtRest
 from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.saved_state import SavedState
 

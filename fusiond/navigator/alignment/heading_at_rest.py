@@ -17,7 +17,7 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.evidence import CONTRADICTION_SIGMAS, FIXES_NS
 from fusiond.navigator.alignment.heading_source_data import Basis
-from fusiond.navigator.alignment.rest import REST_VELOCITY_SD, rest_bias
+from fusiond.navigator.alignment.rate_bias_at_rest import REST_VELOCITY_SD, rest_bias
 from fusiond.navigator.alignment.start import (
     Levelled,
     Place,

@@ -36,7 +36,7 @@ from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standstill
 from fusiond.navigator.alignment.heading_bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.rest import REST_VELOCITY_SD, rest_bias
+from fusiond.navigator.alignment.rate_bias_at_rest import REST_VELOCITY_SD, rest_bias
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 from fusiond.navigator.mode_reasons import reason
 from fusiond.navigator.motion_constraints import GATE

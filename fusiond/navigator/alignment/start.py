@@ -35,7 +35,7 @@ from fusiond.navigation.error_model import (
     RATE_ERROR,
 )
 from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
-from fusiond.navigator.unit_grade import AS_ITS_CLASS
+from fusiond.navigator.imu_grade import AS_ITS_CLASS
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ class Start:
     used: tuple[Candidate, ...] = ()
     confirmed: bool = True
     grades: Array = field(default_factory=lambda: AS_ITS_CLASS)
-    """Of the unit (13,), with which its errors' priors count: fusiond.navigator.unit_grade."""
+    """Of the unit (13,), with which its errors' priors count: fusiond.navigator.imu_grade."""
 
     @property
     def origin(self) -> str:

@@ -5,7 +5,7 @@ Each measurement is checked here once, before any use. The configuration is appl
 sigma if the device states none, floors and gates. The results are in SI units with a settled
 instant. Each kind of measurement has a module of its own, listed in `KINDS`.
 
-Plausibility, by the limits of the vehicle's class (fusiond.configuration.plausibility):
+Plausibility, by the limits of the vehicle's class (fusiond.configuration.vehicle_class):
 
     not_finite              NaN or infinity
     position_implausible    not on the Earth, too near a pole for north and east, or exactly 0 N 0 E
@@ -57,7 +57,7 @@ from drivers.plausible import SIGMA_M, within
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import AnyAiding
-from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility
+from fusiond.configuration.vehicle_class import PLAUSIBILITY, Plausibility
 from fusiond.models.blocks import Block
 from fusiond.navigator.intake import (
     attitude,
@@ -79,7 +79,7 @@ from fusiond.navigator.intake.kind import (
 )
 
 if TYPE_CHECKING:
-    from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
+    from fusiond.navigator.drift_level_estimation import DriftLevels
 
 KINDS: tuple[Kind, ...] = (
     gnss.KIND,

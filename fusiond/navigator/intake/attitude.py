@@ -10,7 +10,7 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import Aiding, AttitudeAiding, StarTrackerAiding
 from fusiond.configuration.si_units import ARCSEC
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
-from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
+from fusiond.navigator.intake.misalignment_block import misalignment_block, misalignment_blocks
 
 
 def measurements_of(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.fix_errors import LASTS_S, Fix, FixErrors
+from fusiond.aiding.fix_error_correlation import LASTS_S, Fix, FixErrors
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import SUFFIX, VelocityMeasurement
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.fix_errors import FixErrors
+from fusiond.aiding.fix_error_correlation import FixErrors
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 
 if TYPE_CHECKING:
+    from fusiond.navigator.drift_level_estimation import DriftLevels
     from fusiond.navigator.raw_gnss import RawGnss
-    from fusiond.navigator.sensor_drift_magnitudes import DriftLevels
 
 S = TypeVar("S", bound=Aiding)
 LEAST_SPEED_SD_M_S = 1e-3

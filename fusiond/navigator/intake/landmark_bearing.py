@@ -8,7 +8,7 @@ from fusiond.aiding.landmark_bearing import SAR_BLOCK, BearingMeasurement
 from fusiond.configuration.aiding import SarAiding
 from fusiond.configuration.si_units import ARCSEC, DEG
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
-from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
+from fusiond.navigator.intake.misalignment_block import misalignment_block, misalignment_blocks
 
 
 def measurements_of(

@@ -8,7 +8,7 @@ import numpy as np
 from drivers.measurements import DelayedFix
 from fusiond.aiding.base import AidingMeasurement, NotApplicable
 from fusiond.aiding.height import HeightMeasurement
-from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_fix_covariance import RdssGeometry, with_floor
 from fusiond.aiding.rdss_position import BIAS_BLOCK, HeldFeedback, RdssPositionMeasurement
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.models.blocks import Block, position_bias

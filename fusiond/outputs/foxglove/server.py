@@ -27,9 +27,9 @@ from fusiond.configuration.outputs import Foxglove
 from fusiond.files.install_extra import install_command
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.foxglove.channels import CHANNELS, Channel
+from fusiond.outputs.listening_port import Port
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import Client, TcpServer
 from fusiond.outputs.topics import Topic
 

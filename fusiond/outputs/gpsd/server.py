@@ -16,11 +16,11 @@ from fusiond.outputs.gpsd import reports
 from fusiond.outputs.gpsd.reports import Report, encoded
 from fusiond.outputs.gpsd.requests import Malformed, Request, RequestReader
 from fusiond.outputs.latest_value import Latest
+from fusiond.outputs.listening_port import Port
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.health import HealthMessage, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.nmea import DEFAULT, sentences
-from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import Client, TcpServer
 from fusiond.outputs.topics import HEALTH, NAV, Topic
 

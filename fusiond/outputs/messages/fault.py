@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from fusiond.integrity.series_exclusion import Finding
+from fusiond.integrity.fault_findings import Finding
 from fusiond.outputs.messages.base import Number
 
 

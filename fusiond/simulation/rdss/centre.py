@@ -1,7 +1,7 @@
 r"""Simulated RDSS centre: the fix, its error and its delay, or nothing.
 
-The error is that of eq. 4 of paper 000 at the place (`fusiond.aiding.rdss_geometry`): slant ranges
-that are too long by d rho and a height that is too great by dH give
+The error is that of eq. 4 of paper 000 at the place (`fusiond.aiding.rdss_fix_covariance`): slant
+ranges that are too long by d rho and a height that is too great by dH give
 
     [dN, dE]^T = G d rho + g dH + f
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.rdss.messages import Family
 from fusiond.aiding.base import NotApplicable
-from fusiond.aiding.rdss_geometry import LONGITUDES_DEG, RdssGeometry, with_floor
+from fusiond.aiding.rdss_fix_covariance import LONGITUDES_DEG, RdssGeometry, with_floor
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 
 Array = NDArray[np.float64]

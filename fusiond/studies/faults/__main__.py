@@ -21,6 +21,7 @@ from fusiond.studies.faults.extra_faults import EVERY
 from fusiond.studies.faults.faulty_hours import faulty_hour_of
 from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
+from fusiond.studies.faults.matched_noise_drives import SHARES
 from fusiond.studies.faults.power import jobs, power_run
 from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.recorded_fault_free import jobs as real_jobs
@@ -28,7 +29,6 @@ from fusiond.studies.faults.recorded_fault_free import real_run
 from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.service import jobs as service_jobs
 from fusiond.studies.faults.service import service_run
-from fusiond.studies.faults.sharpness_service_drives import SHARES
 from fusiond.studies.faults.sigma_sharpness import jobs as sharpness_jobs
 from fusiond.studies.faults.sigma_sharpness import sharpness_run
 from fusiond.studies.faults.tables import TABLES, replace_table

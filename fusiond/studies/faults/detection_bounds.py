@@ -37,10 +37,10 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.studies.faults.error_sigma_score import LIE_S, MOST_SIGMA
 from fusiond.studies.faults.library import FAULTS as MATRIX
 from fusiond.studies.faults.library import PHASES, PhaseName
+from fusiond.studies.faults.matched_noise_drives import Share, Vehicle, part_generator, scene
 from fusiond.studies.faults.runs import TICKS_PER_S, VEHICLE, on_random_drive
 from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.service import BEGINS_S, DURATION_S, FAULTS, LASTS_S, RECEIVERS
-from fusiond.studies.faults.sharpness_service_drives import Share, Vehicle, part_generator, scene
 from fusiond.studies.faults.solution_errors import (
     JUDGED,
     STEP_S,

@@ -29,8 +29,7 @@ from fusiond.configuration.si_units import DEG
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults import measurement_faults as measurement
 from fusiond.studies.faults.error_sigma_score import LIE_S
-from fusiond.studies.faults.sensor_data import Alter, Received, Recording
-from fusiond.studies.faults.sharpness_service_drives import (
+from fusiond.studies.faults.matched_noise_drives import (
     CODE,
     RTK,
     SHARING,
@@ -41,6 +40,7 @@ from fusiond.studies.faults.sharpness_service_drives import (
     part_generator,
     scene,
 )
+from fusiond.studies.faults.sensor_data import Alter, Received, Recording
 from fusiond.studies.faults.solution_errors import (
     AXES,
     JUDGED,

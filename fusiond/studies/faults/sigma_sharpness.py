@@ -29,8 +29,7 @@ import numpy as np
 from scipy.stats import t
 
 from fusiond.configuration.sensor_class import CLASSES
-from fusiond.studies.faults.sensor_data import Recording
-from fusiond.studies.faults.sharpness_service_drives import (
+from fusiond.studies.faults.matched_noise_drives import (
     CODE,
     RTK,
     SHARING,
@@ -39,6 +38,7 @@ from fusiond.studies.faults.sharpness_service_drives import (
     Vehicle,
     scene,
 )
+from fusiond.studies.faults.sensor_data import Recording
 from fusiond.studies.faults.solution_errors import (
     AXES,
     STEP_S,

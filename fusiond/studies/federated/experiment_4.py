@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, PositionFix
 from fusiond.aiding.base import NotApplicable
-from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_fix_covariance import RdssGeometry, with_floor
 from fusiond.configuration.aiding import AnyAiding, GnssAiding, RdssAiding
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.base import Estimator

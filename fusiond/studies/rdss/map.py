@@ -1,7 +1,7 @@
 """Study: sigma north and east of an RDSS fix over latitude and longitude, from geometry.
 
-`fusiond.aiding.rdss_geometry` gives the linearised covariance on a grid; the part of the ranges
-and the part of the height stand apart, as in paper 000, eq. 4. At named places the nonlinear
+`fusiond.aiding.rdss_fix_covariance` gives the linearised covariance on a grid; the part of the
+ranges and the part of the height stand apart, as in paper 000, eq. 4. At named places the nonlinear
 positioning equations are solved with drawn errors as well, so that the linearisation answers for
 itself, and three readings of the paper's ranging error are compared with its "30 m".
 """
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from fusiond.aiding.base import Array, NotApplicable
-from fusiond.aiding.rdss_geometry import (
+from fusiond.aiding.rdss_fix_covariance import (
     ELEVATION_MASK_RAD,
     GEOSTATIONARY_RADIUS_M,
     MAX_AMPLIFICATION,

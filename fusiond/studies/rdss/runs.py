@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.aiding.base import NotApplicable
-from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_fix_covariance import RdssGeometry, with_floor
 from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise

@@ -1,7 +1,8 @@
 r"""Unscented against extended filter: the problems, and one Monte Carlo run of them.
 
 `double_star`   slant ranges of a terminal to two geostationary satellites every 1.5 s, from the two
-                path lengths that the centre measures (fusiond.aiding.rdss_geometry), and a height
+                path lengths that the centre measures (fusiond.aiding.rdss_fix_covariance), and a
+                height
 `pseudorange`   pseudoranges and rates of 4 to 10 BeiDou satellites every second, with the states of
                 a receiver clock whose drift is a first-order Markov process (paper 003)
 
@@ -29,7 +30,7 @@ from scipy.signal import lfilter
 from fusiond.aiding.base import AidingMeasurement, NotApplicable
 from fusiond.aiding.height import HeightMeasurement
 from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeMeasurement, epoch_values
-from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
+from fusiond.aiding.rdss_fix_covariance import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import DEG, imu_noise
 from fusiond.estimators.invariant import InvariantFilter

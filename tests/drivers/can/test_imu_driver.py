@@ -20,8 +20,8 @@ import pytest
 
 from drivers.can import bus as can_bus
 from drivers.can.bus import CanBus, CanFrame
-from drivers.can.frame_decoding import Content
 from drivers.can.imu import CanImuDriver, CanImuOptions
+from drivers.can.socket_frames import Content
 from drivers.measurements import DeviceEvent, DeviceStamp, KernelStamp, Measurement
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.drivers.can.imu_at_work import SBG, SECOND, Running, sample_frames

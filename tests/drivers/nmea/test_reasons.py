@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.foreign_protocols import protocol_sentence
 from drivers.nmea.reasons import MANY, MOST_NAMES, implausible_date
+from drivers.nmea.unsupported_protocols import protocol_sentence
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_NO_FIX,

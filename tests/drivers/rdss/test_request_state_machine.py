@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.rdss.fraction import FractionReader
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -20,6 +19,7 @@ from drivers.rdss.messages import (
     PositionRequest,
     SelfTest,
 )
+from drivers.rdss.reply_time_fraction import FractionReader
 from drivers.rdss.state_tables import SECOND, State, TerminalOptions
 from tests.drivers.rdss.bench import FIX, OK, USER, Bench, say
 

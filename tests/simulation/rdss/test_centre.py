@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import NotApplicable
-from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_fix_covariance import RdssGeometry, with_floor
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusiond.live.garbage_collection import Collector
-from fusiond.live.tick import LatencyHistogram, Scheduler
+from fusiond.live.tick_scheduler import LatencyHistogram, Scheduler
 
 MS = 1_000_000
 S = 1_000_000_000

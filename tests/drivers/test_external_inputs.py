@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from drivers.input_queue import Inputs
+from drivers.external_inputs import Inputs
 
 
 class Bench:

@@ -11,10 +11,10 @@ import pytest
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
 from fusiond.configuration.si_units import imu_noise
+from fusiond.navigator.imu_grade import AS_ITS_CLASS, GRID, Values, graded_at_rest
+from fusiond.navigator.imu_worse_than_class import grades_of, widened, worse_than_said
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
-from fusiond.navigator.unit_grade import AS_ITS_CLASS, GRID, Values, graded_at_rest
-from fusiond.studies.faults.sharpness_service_drives import CODE, Vehicle, scene
+from fusiond.studies.faults.matched_noise_drives import CODE, Vehicle, scene
 from fusiond.studies.faults.solution_errors import errors_against, longest_s
 
 UNITS, UNSEEN = 400, 0.02

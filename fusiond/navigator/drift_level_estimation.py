@@ -3,7 +3,7 @@ r"""Magnitudes of configured drifts: side slip, wheel drift, compass disturbance
 No device states them, and the configured values fit any vehicle. Each is a Markov state x of
 configured sigma s, of which c x acts on its measurement. From the filter's x^ and P, some
 correlation times apart, the measurements alone give x~ of variance R (as in
-fusiond.navigator.unit_grade),
+fusiond.navigator.imu_grade),
 
     1 / R = 1 / P - 1 / s^2,   x~ = x^ R / P,   x~ ~ N(0, g s^2 / c^2 + R)
 
@@ -40,7 +40,7 @@ from fusiond.aiding.compass import DISTURBANCE
 from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
-from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
+from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.sensor_white_noise import WhiteNoise
 
 Array = NDArray[np.float64]

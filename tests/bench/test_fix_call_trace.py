@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from fusiond.bench.fix_path import FixPath, ordinary_fix
+from fusiond.bench.fix_call_trace import FixPath, ordinary_fix
 
 FUNCTIONS, MODULES = 40, 12
 """What is asked."""

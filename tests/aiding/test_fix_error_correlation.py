@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.fix_errors import (
+from fusiond.aiding.fix_error_correlation import (
     LAG_S,
     LASTS_S,
     SETTLES_NS,

@@ -15,7 +15,7 @@ from scipy.optimize import root
 from scipy.stats import chi2
 
 from fusiond.aiding.base import NotApplicable
-from fusiond.aiding.rdss_geometry import (
+from fusiond.aiding.rdss_fix_covariance import (
     ELEVATION_MASK_RAD,
     MAX_AMPLIFICATION,
     Covariance,

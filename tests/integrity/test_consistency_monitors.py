@@ -13,7 +13,7 @@ from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.source_monitors import Verdicts
+from fusiond.integrity.consistency_monitors import Verdicts
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
 from fusiond.navigator.navigator import Navigator

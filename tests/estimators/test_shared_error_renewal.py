@@ -11,9 +11,9 @@ from fusiond.aiding.base import Renewal
 from fusiond.aiding.pseudorange import RANGE_BIAS
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
-from fusiond.estimators.error_decorrelation import renew, transition
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
+from fusiond.estimators.shared_error_renewal import renew, transition
 from fusiond.estimators.smoothing.node_recorder import TapedKalman
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model

@@ -1,7 +1,7 @@
 """Cars whose lever arm nobody has measured, with fixes of centimetres: the filter stays honest.
 
 What each correction of the attitude would tell of the lever, and is no turn, is carried over
-(fusiond.estimators.unknown_lever_arm).
+(fusiond.estimators.lever_arm_after_attitude_update).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.lever_arm_after_attitude_update import antenna_slots, keep_antenna
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
-from fusiond.estimators.unknown_lever_arm import antenna_slots, keep_antenna
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import (

@@ -18,7 +18,7 @@ import numpy as np
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.live.publishing import Publishing
-from fusiond.live.tick import SECOND_NS, LatencyHistogram
+from fusiond.live.tick_scheduler import SECOND_NS, LatencyHistogram
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.event import EventMessage

@@ -16,10 +16,10 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
 from fusiond.navigator.assembly import model_of
-from fusiond.navigator.imu_noise_share import COUNTS_NS, EVERY_NS
+from fusiond.navigator.drift_level_estimation import FIRST, DriftLevels
+from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.motion_constraints import vehicle_blocks
-from fusiond.navigator.sensor_drift_magnitudes import FIRST, DriftLevels
 from tests import runs
 
 CONFIG = Config.model_validate(

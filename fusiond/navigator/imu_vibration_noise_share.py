@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.fix_errors import SETTLES_NS
+from fusiond.aiding.fix_error_correlation import SETTLES_NS
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model

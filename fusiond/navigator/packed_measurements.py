@@ -14,12 +14,12 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.packed import BODY, HEADER, MEASURED, MOTION_ASKED, SIZE
 from fusiond.estimators.base import THRESHOLDS, Estimator, Outcome
 from fusiond.estimators.fault_bank_interface import Hypotheses
-from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
-from fusiond.estimators.row_kernels import (
+from fusiond.estimators.measurement_loop_kernel import (
     ENDS,
     INNOVATION,
     OF_STATE,
 )
+from fusiond.estimators.noise_scale import SIZE as NOISE_SIZE
 from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.integrity.series_states import Series
 from fusiond.navigator.ungated_innovation import RawInnovation, of_rows

@@ -12,8 +12,8 @@ from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.standstill import LONGEST_RUN, Window
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import LEVEL_SD_RAD
-from fusiond.navigator.sensor_ladder import grades_of, widened, worse_than_said
-from fusiond.navigator.unit_grade import AS_ITS_CLASS, Values, graded_at_rest
+from fusiond.navigator.imu_grade import AS_ITS_CLASS, Values, graded_at_rest
+from fusiond.navigator.imu_worse_than_class import grades_of, widened, worse_than_said
 
 if TYPE_CHECKING:
     from fusiond.navigator.alignment.evidence import Standstill
@@ -36,7 +36,7 @@ class UnitAtRest:
 
     def judge(self, w: Window) -> bool:
         """Grade the unit by the rates about level axes that gravity does not follow
-        (fusiond.navigator.sensor_ladder). True if it is worse than its data sheet."""
+        (fusiond.navigator.imu_worse_than_class). True if it is worse than its data sheet."""
         up = w.mean_force / float(np.linalg.norm(w.mean_force))
         self._ups = [*self._ups[1 - w.run :], up] if w.run > 1 else [up]
         if w.run <= self._longest_run or len(self._ups) < w.run:
@@ -68,7 +68,7 @@ class UnitAtRest:
         return grades_of(self.noise, self._sheet, self._options.misalignment_rad)
 
     def grades(self, s: Standstill, bias: Array, sd: float, g: float) -> Array:
-        """Grades (13,) of the unit (fusiond.navigator.unit_grade) from a rest: rate `bias` (3,) and
+        """Grades (13,) of the unit (fusiond.navigator.imu_grade) from a rest: rate `bias` (3,) and
         its one sigma."""
         if not self._options.graded:
             return self.unrested_grades

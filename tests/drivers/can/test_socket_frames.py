@@ -9,7 +9,7 @@ import msgpack
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
-from drivers.can.frame_decoding import Content, datagram_decoder, of_can_frame
+from drivers.can.socket_frames import Content, datagram_decoder, of_can_frame
 
 MESSAGES = (
     can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(8)),

@@ -89,7 +89,7 @@ def evidence_against(noise: ImuNoise, worse: ImuNoise) -> float:
 
 def grades_of(noise: ImuNoise, sheet: ImuNoise, misalignment_rad: float) -> Array:
     """Grades (13,) of a unit with `noise` relative to its data `sheet`, whose axes are out of
-    square by `misalignment_rad` (fusiond.navigator.unit_grade)."""
+    square by `misalignment_rad` (fusiond.navigator.imu_grade)."""
     pairs = (
         (noise.rate_bias_initial, sheet.rate_bias_initial),
         (noise.force_bias_initial, sheet.force_bias_initial),

@@ -19,7 +19,7 @@ from typing import Any
 import aiomqtt
 
 from drivers.base import Backoff
-from fusiond.outputs.rate_limits import Bucket, Rate
+from fusiond.outputs.client_rate_limits import Bucket, Rate
 
 MESSAGES = Rate(100.0, 500.0)
 """Five commands a second are carried out, twenty at once (`command_intake`). A message costs 0.1 ms
