@@ -129,11 +129,11 @@ def init(
 
 def _found(port: list[str] | None, can: list[str] | None, ask_terminal: bool) -> list[Device]:
     """Look for devices, and print what was found."""
-    devices, silent_ports = _look(port, can, ask_terminal)
+    devices, silent = _look(port, can, ask_terminal)
     for device in devices:
         typer.echo(f"found: {device.text}")
-    for silent in silent_ports if port is not None else ():
-        typer.echo(f"found nothing: {silent.text}")
+    for one in silent:
+        typer.echo(f"found nothing: {one.text}")
     if not devices:
         looked_at = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
         typer.echo(f"No supported device found on: {looked_at}")
@@ -188,6 +188,7 @@ def _driven_axis(imu: Device, down: str) -> str | None:
 def _look(
     ports: list[str] | None, buses: list[str] | None, ask_terminal: bool
 ) -> tuple[list[Device], list[SilentPort]]:
+    """Devices on buses, then on ports; and the buses and the named ports without one."""
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
@@ -204,9 +205,10 @@ def _look(
             *(device_on_port(line, ask_terminal=ask_terminal) for line in unique.values())
         )
         on_buses = await asyncio.gather(*(device_on_bus(*channel) for channel in channels))
-        looked_at = [device for devices in on_buses for device in devices]
-        looked_at += [one for one in found if isinstance(one, Device)]
-        return looked_at, [one for one in found if isinstance(one, SilentPort)]
+        looked_at = [one for bus in on_buses for one in bus]
+        looked_at += [one for one in found if ports is not None or isinstance(one, Device)]
+        devices = [one for one in looked_at if isinstance(one, Device)]
+        return devices, [one for one in looked_at if isinstance(one, SilentPort)]
 
     with spinner("listening to ports and buses"):
         return asyncio.run(look())

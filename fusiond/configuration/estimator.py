@@ -95,7 +95,7 @@ class Estimator(Section):
     buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
     """History for delayed measurements; at least 10 s."""
     checkpoint_s: PositiveFloat = 0.5
-    """Interval of the checkpoints that a rewind starts from."""
+    """Longest interval of a rewind's checkpoints; less where measurements come late."""
     coast_after_s: PositiveFloat = 10.0
     """Without a fused position for longer than this the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0

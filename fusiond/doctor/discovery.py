@@ -87,7 +87,7 @@ class Device:
 
 @dataclass(frozen=True, slots=True)
 class SilentPort:
-    """Port without a recognised device, and the reason."""
+    """Port or bus without a recognised device, and the reason."""
 
     text: str
 
@@ -205,8 +205,9 @@ async def _terminal(port: str) -> Device | None:
 
 async def device_on_bus(
     interface: Interface, channel: str, listen_s: float = BUS_S
-) -> list[Device]:
-    """Devices with a shipped DBC file on a CAN bus: the IMU and the receiver that fit best."""
+) -> list[Device | SilentPort]:
+    """Devices with a shipped DBC file on a CAN bus, the IMU and the receiver that fit best; or the
+    reason why none is recognised."""
     decoders: list[tuple[int, CanDecoder[Any]]] = []
     for number, known in enumerate(KNOWN_DEVICES):
         kind = _DRIVERS[known.driver]
@@ -214,6 +215,7 @@ async def device_on_bus(
         decoders.append((number, kind.Decoder(known.title, options)))
     samples: dict[int, list[int]] = {number: [] for number, _ in decoders}
     forces: dict[int, list[tuple[float, ...]]] = {number: [] for number, _ in decoders}
+    fault = ""
 
     def receive(frame: CanFrame) -> None:
         if frame.remote or frame.error:
@@ -224,8 +226,12 @@ async def device_on_bus(
                 if isinstance(measured, ImuSample):
                     forces[number].append(measured.accel_m_s2)
 
+    def link(up: bool, why: str) -> None:
+        nonlocal fault
+        fault = "" if up else why
+
     bus = CanBus(interface, channel)
-    async with _running(bus.run(receive, lambda up, why: None, lambda state: None)):
+    async with _running(bus.run(receive, link, lambda state: None)):
         await asyncio.sleep(listen_s)
     found: dict[str, tuple[int, int]] = {}
     for number, decoder in decoders:
@@ -234,6 +240,12 @@ async def device_on_bus(
         refused = sum(decoder.counters[name] for name in ("wrong_length", "out_of_range"))
         if count >= LEAST_SAMPLES and refused < count and count > found.get(driver, (0, 0))[0]:
             found[driver] = count, number
+    if not found:
+        frames = bus.counters["frames"]
+        silence = "no frames: check power, bit rate and wiring"
+        if frames:
+            silence = f"{frames} frames, of no unit with a shipped DBC file: name yours as `dbc`"
+        return [SilentPort(f"{interface} {channel}: {fault or silence}")]
     return [_on_bus(interface, channel, n, samples[n], forces[n]) for _, n in found.values()]
 
 

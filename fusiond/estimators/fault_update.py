@@ -299,7 +299,7 @@ def account(
     work: Single,
 ) -> None:
     """Update the bank from `work` of `sensitivity_rows` and the whitened innovation y (m,); `fused`
-    rows have g (m, w) of `whiten`. They count as `rows`; `noise`: their unexplained square."""
+    rows have g (m, w) of `whiten`. They stand for `rows` rows; no hypothesis explains `noise`."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :].view(np.float32)
     columns = v.shape[0] // n

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -71,7 +72,8 @@ METRES_SD_M = (2.0, 2.0, 3.0)
 satellites than before. Of code receivers no test tells it before the filter has followed it, so
 that it opens what is published and accuses nobody (`Kind.opens`)."""
 TOGETHER = "all receivers"
-"""Device name of a kind that concerns all devices."""
+"""Device name of a kind that concerns all GNSS receivers; a terminal of RDSS has its own line, and
+no GNSS spoofer carries it off."""
 LAGGED_S = 0.5
 """One sigma of an unknown lag."""
 FOLLOWED_SPREAD = 0.3
@@ -85,7 +87,7 @@ the state for the offset in time."""
 class Kind:
     """Fault hypothesis with `size` parameters of prior `sd` (SI), published times `per_unit` in
     `unit`; its rate is `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device`
-    it affects the series that `locates` and `moves` select, or all."""
+    or `devices` it affects the series that `locates` and `moves` select, or all."""
 
     name: str
     text: str
@@ -103,6 +105,7 @@ class Kind:
     axes: tuple[str, ...] = ("north", "east", "down")
     locates: bool = True
     moves: bool = True
+    devices: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -121,7 +124,7 @@ class Kind:
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
         """True if the fault invalidates a series of such a device."""
-        if self.corrected or self.device not in (TOGETHER, device):
+        if self.corrected or device not in (self.devices or (self.device,)):
             return False
         return self.of == OWN or (self.locates and locates) or (self.moves and moves)
 
@@ -331,9 +334,11 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
             found += row_kinds(device, "height is off", "m", (20.0,), 1.0, ("",))
     if slips:
         found += row_kinds("non_holonomic", "the vehicle slips", "m/s", (0.5,), 1.0, ("",))
-    receivers = [device for device, kind in aiding.items() if kind == "gnss"]
+    receivers = tuple(device for device, kind in aiding.items() if kind == "gnss")
     if len(receivers) > 1:
-        found += carried_kinds(TOGETHER)
+        # One spoofer carries all off; one line, hub or clock of the host delays all.
+        of_all = *carried_kinds(TOGETHER), *delay_kinds(TOGETHER)[: len(LAGS_S)]
+        found += [replace(kind, devices=receivers) for kind in of_all]
     found.append(over_kind())
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
     of_ground = "zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY

@@ -20,9 +20,10 @@ from fusiond.live.operator import Operator
 from fusiond.live.sources import Sources
 from fusiond.live.tick import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.checkpoints import Key
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.timeline import Entry, Key
+from fusiond.navigator.timeline import Entry
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.innovations import Innovation
 

@@ -18,17 +18,16 @@ import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement, Feedback
 from fusiond.aiding.initialisation import Candidate
-from fusiond.estimators.base import Estimator, Outcome, Snapshot
+from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.row_kernels import JUDGE, KEEP
 from fusiond.integrity.catalogue import Kind
-from fusiond.integrity.diagnosis import Diagnosis, Memory
+from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
+from fusiond.navigator.checkpoints import Checkpoint, Key, Spacing
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.measurement_rows import MeasurementRows, Span, raw_of
 from fusiond.navigator.ungated_innovation import RawInnovation, raw_innovation
-
-Key = tuple[int, str, int]
 
 # Outcomes that say something of a source.
 JUDGED = frozenset({"fused", "gated", "isolated"})
@@ -54,13 +53,6 @@ class Entry:
     judged: bool = False
     error: str = ""
     raw: RawInnovation | None = None
-
-
-@dataclass(slots=True)
-class _Checkpoint:
-    snapshot: Snapshot
-    last_key: Key | None
-    memory: Memory
 
 
 @dataclass(slots=True)
@@ -97,12 +89,12 @@ class Timeline:
         """True after any decision since the last reset to False, beyond fusing measurements in
         service."""
         self._keep_ns = round(keep_s * 1e9)
-        self._checkpoint_ns = round(checkpoint_s * 1e9)
+        self._spacing = Spacing(round(checkpoint_s * 1e9), self._keep_ns)
         self._on_outcome = on_outcome
         self._entries: list[Entry] = []
         self._keys: list[Key] = []
         self._next = 0
-        self._checkpoints: list[_Checkpoint] = []
+        self._checkpoints: list[Checkpoint] = []
         self.diagnosis = Diagnosis(kinds)
         self._isolates = estimator.isolates
         self._rows = MeasurementRows(estimator)
@@ -112,9 +104,7 @@ class Timeline:
         contains, `used`, are not applied again."""
         self._next = 0
         self.diagnosis.reset()
-        self._checkpoints = [
-            _Checkpoint(self.estimator.snapshot(), None, self.diagnosis.snapshot())
-        ]
+        self._checkpoints = [Checkpoint(self.estimator.snapshot(), None, self.diagnosis.snapshot())]
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
         for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
@@ -157,7 +147,7 @@ class Timeline:
         )
         entry = Entry(key, measurement, feedback, *self._rows.packed(measurement))
         oldest = self._checkpoints[0] if self._checkpoints else None
-        if oldest and key[0] <= oldest.snapshot.t_ns and not self._precedes(oldest, key):
+        if oldest and key[0] <= oldest.snapshot.t_ns and not oldest.precedes(key):
             self._count(entry, Outcome("too_old"))
             return entry
         last = len(self._keys)
@@ -188,13 +178,11 @@ class Timeline:
             entry = self._entries[self._next]
             if (t_ns := entry.key[0]) > estimator.t_ns or estimator.passing:
                 estimator.propagate(imu, t_ns, record)
-                if estimator.t_ns - kept[-1].snapshot.t_ns >= self._checkpoint_ns:
-                    self._checkpoint()
+                self._checkpoint_if_due()
             self._count(entry, self._apply(entry))
             self._next += 1
         estimator.propagate(imu, latest, record, passing=True)
-        if estimator.t_ns - kept[-1].snapshot.t_ns >= self._checkpoint_ns:
-            self._checkpoint()
+        self._checkpoint_if_due()
         horizon = latest - self._keep_ns
         if len(kept) > 1 and kept[1].snapshot.t_ns <= horizon:
             self._forget(horizon)
@@ -233,11 +221,11 @@ class Timeline:
         estimator, kept_ns = self.estimator, self._checkpoints[-1].snapshot.t_ns
         if not estimator.runs:
             return False
-        which, until_ns = range(self._next, end), kept_ns + self._checkpoint_ns
-        batch = self._rows.batch(self._entries, which, self.diagnosis, until_ns)
+        which, every_ns = range(self._next, end), self._spacing.after(kept_ns, self.imu.latest_ns)
+        batch = self._rows.batch(self._entries, which, self.diagnosis, kept_ns + every_ns)
         if batch is None:
             return False
-        ran = estimator.run(self.imu, *batch, record, (kept_ns, self._checkpoint_ns))
+        ran = estimator.run(self.imu, *batch, record, (kept_ns, every_ns))
         entries = self._entries[self._next : self._next + ran.done]
         outcomes = self._rows.went_on(entries, ran.results[: ran.done])
         for k, (entry, outcome) in enumerate(zip(entries, outcomes, strict=True)):
@@ -319,16 +307,22 @@ class Timeline:
         if self._on_outcome is not None:
             self._on_outcome(entry)
 
+    def _checkpoint_if_due(self) -> None:
+        kept_ns = self._checkpoints[-1].snapshot.t_ns
+        if self.estimator.t_ns - kept_ns >= self._spacing.after(kept_ns, self.imu.latest_ns):
+            self._checkpoint()
+
     def _checkpoint(self) -> None:
         last_key = self._keys[self._next - 1] if self._next else self._checkpoints[-1].last_key
         self._checkpoints.append(
-            _Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
+            Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
         )
 
     def _rewind(self, key: Key) -> None:
         """Rewind to the last checkpoint before `key`."""
         before = self.estimator.t_ns
-        while len(self._checkpoints) > 1 and not self._precedes(self._checkpoints[-1], key):
+        self._spacing.rewound(self.imu.latest_ns)
+        while len(self._checkpoints) > 1 and not self._checkpoints[-1].precedes(key):
             self._checkpoints.pop()
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
@@ -337,16 +331,10 @@ class Timeline:
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])
 
-    def _following(self, checkpoint: _Checkpoint) -> int:
+    def _following(self, checkpoint: Checkpoint) -> int:
         """Row of the first entry after the checkpoint."""
         last_key = checkpoint.last_key
         return 0 if last_key is None else bisect_left(self._keys, last_key) + 1
-
-    @staticmethod
-    def _precedes(checkpoint: _Checkpoint, key: Key) -> bool:
-        if checkpoint.snapshot.t_ns > key[0]:
-            return False
-        return checkpoint.last_key is None or checkpoint.last_key < key
 
     def _forget(self, horizon_ns: int) -> None:
         """Drop checkpoints and entries that are no longer needed."""
@@ -358,6 +346,7 @@ class Timeline:
             drop += 1
         if drop:
             del self._checkpoints[:drop]
+        self._spacing.thin(self._checkpoints, self.imu.latest_ns)
         oldest = self._checkpoints[0]
         self.imu.needed = oldest.snapshot.sample
         if oldest.last_key is None:

@@ -4,7 +4,8 @@
     .asc   Vector, text                                          .mf4   ASAM MDF 4 (asammdf)
     .trc   PEAK, versions 1.0 to 2.1
 
-Each but the last may end in .gz as well. Dates without a zone are taken as python-can does.
+Each but the last may end in .gz as well. The content counts before the name. Dates without a zone
+are taken as python-can does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import importlib.util
 import logging
 import sys
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +27,7 @@ from drivers.can.python_can_import import can, with_mf4
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
 from fusiond.files.install_extra import install_command
 from fusiond.offline.blf_repair import DAY_S, Containers
+from fusiond.offline.can_log_kind import FORMATS, LOOKED_AT, foreign_kind, kind_of
 from fusiond.offline.can_text_repair import (
     HEADER_ENDS,
     TRC_VERSIONS,
@@ -38,7 +41,6 @@ from fusiond.offline.can_text_repair import (
     stamp_s,
 )
 
-FORMATS = (".log", ".asc", ".blf", ".trc", ".mf4")
 _GZIP = b"\x1f\x8b"
 _MOST_NAMED = 20
 """Refusals that are kept in words; of the others the number."""
@@ -136,10 +138,16 @@ class _Log(NamedTuple):
 
 
 def _format(path: Path) -> _Log:
-    """Format by the name. Raises `TableError`."""
+    """Format by the content, or else by the name. Raises `TableError`."""
     suffixes = [s.lower() for s in path.suffixes]
     zipped = suffixes[-1:] == [".gz"]
     suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
+    head = b""
+    with contextlib.suppress(EOFError, zlib.error, gzip.BadGzipFile), _Log(path, "").open() as log:
+        head = log.read(LOOKED_AT)
+    if foreign := foreign_kind(head):
+        raise TableError(f"{path}: {foreign}")
+    suffix = kind_of(head) or suffix
     if suffix not in FORMATS or (zipped and suffix == ".mf4"):
         raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
     return _Log(path, suffix)

@@ -39,8 +39,8 @@ Plain = Callable[[str], str | None]
 class TextLines:
     """Lines of a log, as a file for a reader of python-can.
 
-    `plain(line)` converts a line to a form that the reader knows; None: no frame. `refused(line,
-    text)` receives each lost line.
+    `plain(line)` converts a line to a form that the reader knows, two lines at most; None: no
+    frame. `refused(line, text)` receives each lost line.
     """
 
     def __init__(self, stream: BinaryIO, plain: Plain, refused: Callable[[int, str], None]) -> None:
@@ -68,7 +68,9 @@ class TextLines:
             if not text or text.isspace():
                 continue
             if (plain := self._plain(text)) is not None:
-                return plain
+                first, _, second = plain.rstrip("\r\n").partition("\n")
+                self._again = second or None
+                return first
         raise StopIteration
 
     def close(self) -> None:
@@ -163,6 +165,8 @@ class Candump:
             line = _COLOUR.sub("", line)
         if "[" not in line:
             hash_at = line.find("#")
+            if hash_at >= 0 and "." in line[hash_at:]:  # 123#11.22.33, which canplayer reads
+                line = line[:hash_at] + line[hash_at:].replace(".", "")
             if hash_at >= 8 and line[hash_at - 8 : hash_at - 7] in "2367":
                 return _with_error_flag(line, hash_at)
             return line
@@ -256,10 +260,18 @@ class Asc:
         """Time (s) of the last line before the start of the measurement."""
         self._relative = False
         self._sum_ns = 0
+        self._header_ended = False
 
     def plain(self, line: str) -> str | None:
         """Line with its stamp counted from the beginning, without sign; None for an event without
-        channel."""
+        channel. Before the first frame the line that ends a header is added where there is none."""
+        said = self._plain(line)
+        if said is None or self._header_ended or not self.in_frames:
+            return said
+        self._header_ended = True
+        return said if _HEADER_OVER.match(line) else f"{HEADER_ENDS}\n{said}"
+
+    def _plain(self, line: str) -> str | None:
         self.before_trigger_s = 0.0
         found = _STAMPED.match(line)
         if found is None:

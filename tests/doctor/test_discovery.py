@@ -125,6 +125,7 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
     assert done.exit_code == 0, done.output
     assert "No supported device found on: " in done.stdout
     assert f"found nothing: {gone}: cannot be opened" in done.stdout
+    assert f"found nothing: virtual {tmp_path}: no frames: check power" in done.stdout
     assert "! sources: none; `run` needs an IMU" in done.stdout
     assert "# [sources.imu]" in out.read_text()
     uncommented = out.read_text().replace("# [sources.imu]", "[sources.imu]")
@@ -275,6 +276,20 @@ async def test_a_quickstarts_set_and_receivers_with_logs_become_a_file_that_chec
     assert doubts(config) == []
 
 
+async def test_a_bus_without_a_known_unit_is_told_with_the_reason(tmp_path: Path) -> None:
+    channel = str(tmp_path)
+    looking = asyncio.create_task(device_on_bus("virtual", channel, 0.3))
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        while not looking.done():
+            bus.send(can.Message(arbitration_id=0x7FF, data=b"\x01"))
+            await asyncio.sleep(0.01)
+    (foreign,) = looking.result()
+    assert isinstance(foreign, SilentPort)
+    assert re.search(r": [1-9]\d* frames, of no unit with a shipped DBC file: ", foreign.text)
+    (absent,) = await device_on_bus("socketcan", "can-of-nobody", 0.1)
+    assert absent == SilentPort("socketcan can-of-nobody: there is no interface can-of-nobody")
+
+
 @pytest.mark.parametrize("page", ["can-imu.md", "can-gnss.md"])
 def test_known_devices_are_those_of_the_pages(page: str) -> None:
     blocks = re.findall(r"```toml\n(.*?)```", (REPOSITORY / "docs" / page).read_text(), re.S)
@@ -303,6 +318,7 @@ async def test_a_device_is_told_from_the_others(tmp_path: Path, title: str) -> N
             number += 1
             await asyncio.sleep(0.01)
     (found,) = looking.result()
+    assert isinstance(found, Found)
     assert title in found.text
     assert found.options == {"interface": "virtual", "channel": channel, **known.options}
 

@@ -202,6 +202,16 @@ def test_each_kind_says_what_it_is() -> None:
     assert table.threes == RESTARTS * sum(kind.size == 3 for kind in kinds)
 
 
+def test_what_all_receivers_do_is_none_of_another_device() -> None:
+    """RDSS has a line of its own: its fixes go on when those of all receivers are left out."""
+    devices = {"gnss": "gnss", "second": "gnss", "rdss": "rdss"}
+    together = [k for k in kinds_of(MODEL, devices, slips=False) if k.devices]
+    assert {k.name for k in together} == {"carried_off", "delay"}
+    for kind in together:
+        spoiled = [device for device in devices if kind.spoils(device, locates=True, moves=True)]
+        assert spoiled == ["gnss", "second"]
+
+
 def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
     """Fixes that are stamped too late from the start on, against ones that are not."""
     tau_s = 0.02

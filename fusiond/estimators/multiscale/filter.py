@@ -162,6 +162,10 @@ class MultiscaleEstimator(Estimator):
             return Outcome("not_finite", nis, degrees)
         return Outcome("gated", nis, degrees)
 
+    def _linearise(self, measurement: Linearised) -> Innovation | NotApplicable:
+        """The innovation of a measurement, which sees P and not Q alone."""
+        return self._weighed(measurement, measurement.innovation(self.state))
+
     def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
         """Update; NIS and whitened innovation (m,). Beyond `threshold` nothing changes."""
         z, h, r = rows

@@ -207,6 +207,7 @@ FAULTS: dict[str, Fault] = {
     "two_step_500m": _of_two(measurement.position_step, 20.0),
     "two_frozen": _of_two(measurement.frozen_fix, 20.0),
     "two_carried_off_0.5_m_s": _of_two(measurement.spoofed_drift, 60.0, phases=("navigating",)),
+    "two_late_0.8s": _of_two(measurement.stamped_too_new, 60.0, phases=("navigating",)),
     # The IMU and the wheels alone can say so.
     "carried_off_1_m_s_wheels": _under_way(_carried_off, 60.0, drive=Drive(wheels=True)),
     "two_carried_off_1_m_s_wheels": _under_way(
