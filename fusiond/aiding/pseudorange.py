@@ -202,7 +202,7 @@ class PseudorangeMeasurement(AidingMeasurement):
 
     @property
     def ranges(self) -> Array:
-        """(n,), m."""
+        """Ranges (n,), m."""
         return self.values[RANGE, :]
 
     @property

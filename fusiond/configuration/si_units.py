@@ -81,8 +81,8 @@ def sensor_to_body(imu: Imu) -> NDArray[np.float64]:
 
 
 def quiet_limits(zero_velocity: ZeroVelocity, noise: ImuNoise) -> QuietLimits:
-    """Thresholds of the standstill detector. A gyro's bias, which its mean rate at rest is, takes
-    nothing from the rate below which it is quiet."""
+    """Thresholds of the standstill detector. A gyro's bias, its mean rate at rest, does not reduce
+    the limit of the rate."""
     bias = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     return QuietLimits(
         window_ns=round(zero_velocity.window_s * 1e9),

@@ -76,7 +76,7 @@ class Corrections:
         return orbit.issue if all(holds) else None
 
     def applied(self, ephemeris: Ephemeris, week: int, tow_s: float) -> CorrectedEphemeris:
-        """The correction that has an `issue`, to that ephemeris."""
+        """Correction for the ephemeris of an `issue`."""
         parts = self._parts[ephemeris.system, ephemeris.prn]
         orbit, clock, bias = parts["orbit"], parts["clock"], parts["bias"]
         c0, c1, c2 = clock.values

@@ -80,10 +80,11 @@ FLICKERS_S = 3.0
 
 @compiled("i8(f8[:, ::1], i8[::1], b1[::1])")
 def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[np.bool_]) -> int:
-    """Mark satellites (n,) that fit to others of their clock; the number of those that do not.
+    """Mark satellites (n,) whose ranges agree with others of their clock; return the number of the
+    rest.
 
-    One does not that is `INCONSISTENT_M` from more than half of them. Its range is gated, and what
-    is left displaces by itself."""
+    A range disagrees if it differs by `INCONSISTENT_M` from more than half of them. Its range is
+    gated, and what is left displaces by itself."""
     n, odd = clock.shape[0], 0
     for k in range(n):
         own = values[rk.CORRECTED, k] - values[rk.RANGE, k]

@@ -43,7 +43,7 @@ AHEAD_NS = 60 * SECOND_NS
 
 
 class Messaging:
-    """See the module. `revision` grows with whatever has to be kept."""
+    """Messaging of one vehicle. `revision` increases with every change that must be saved."""
 
     def __init__(
         self,

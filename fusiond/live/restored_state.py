@@ -1,4 +1,4 @@
-"""Data loaded from earlier runs: a replay starts from the same."""
+"""Data loaded from earlier runs; a replay starts from the same data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The fixed-rate tick: absolute deadlines on the monotonic clock, no backlog, garbage out of ticks.
+"""Fixed-rate tick: absolute deadlines on the monotonic clock, no backlog, garbage collected
+between.
 
     deadline_k = t_0 + k * period
 

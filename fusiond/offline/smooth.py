@@ -154,7 +154,7 @@ class SmoothedRows:
         return {"rows": self.rows, "starts": self.starts, "nodes": self.nodes}
 
     def close(self) -> None:
-        """No more rows come."""
+        """End the rows."""
         self._estimator.end()
 
 

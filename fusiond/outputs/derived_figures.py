@@ -21,7 +21,7 @@ TWO_SIDED_95 = 1.959964
 
 
 class Motion(NamedTuple):
-    """Over the ground: m/s, degrees from true north (None: too slow to have a direction), 95 %
+    """Motion over the ground: m/s, degrees from true north (None: too slow for a direction), 95 %
     errors of both."""
 
     speed_m_s: float

@@ -57,7 +57,7 @@ class Session(Protocol):
     """State of one client."""
 
     def receive(self, data: bytes) -> None:
-        """Some bytes came; at most a KiB at once."""
+        """Receive bytes, at most a KiB at once."""
 
     def end(self) -> None:
         """The connection is no more."""
