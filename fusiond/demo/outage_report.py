@@ -19,7 +19,7 @@ def outage_report(
     sigma (root of the sum of both variances). `outages` begin and end on the same clock.
     """
     if not len(t_s):
-        yield "No solution: the car had not driven off yet"
+        yield "No solution: the vehicle had not driven off yet"
         return
     for begin_s, end_s in outages:
         inside = np.flatnonzero((t_s >= begin_s) & (t_s <= end_s))
@@ -33,6 +33,6 @@ def outage_report(
         )
     inside_two = float(np.mean(error_m <= 2.0 * sigma_m))
     yield (
-        f"the car was within two sigma for {100.0 * inside_two:.0f} % of the "
+        f"the vehicle was within two sigma for {100.0 * inside_two:.0f} % of the "
         f"{t_s[-1] - t_s[0]:.0f} s that it was navigated"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import sys
 import time
 from collections import deque
@@ -160,7 +161,8 @@ def line(live: Live) -> str:
         parts.append(
             f"error {(north**2 + east**2) ** 0.5:6.2f} m (sigma {(n * n + e * e) ** 0.5:.2f})"
         )
-        parts.append(f"yaw {live.errors[8]:+.2f} deg")
+        known = math.isfinite(live.errors[8])
+        parts.append(f"yaw {live.errors[8]:+.2f} deg" if known else "no heading")
     fused = [
         f"{name} {live.health['sources'][name]['fused']}"
         for name in ("gnss", "rdss")

@@ -81,6 +81,13 @@ def _fixes(model: str) -> dict[str, Any]:
     return {**_filter(model), "aiding": {"gnss": {"kind": "gnss", **WHITE}}}
 
 
+UNCORRELATED = {
+    "estimator": {
+        "model": "ins21",
+        "filter": "federated",
+        "federated": {"fusion": "uncorrelated"},
+    }
+}
 CASES: dict[str, Case] = {
     "000 planar15": Case("000", "RDSS, optimal prediction", seconds=200.0),
     "001 planar10": Case("001", "fixes, star tracker, kalman", _filter("planar10"), 200.0),
@@ -95,6 +102,7 @@ CASES: dict[str, Case] = {
     "003 ins20": Case("003", "BeiDou ranges", raw=True),
     "003 ins20 fixes": Case("003", "fixes", _fixes("ins20")),
     "004 ins21 correlated": Case("004", "fixes and RDSS, federated, correlated"),
+    "004 ins21 uncorrelated": Case("004", "the same, uncorrelated", UNCORRELATED),
     "004 ins21": Case("004", "the same, kalman", _filter("ins21")),
     "004 ins15": Case("004", "the same, kalman", {**_filter("ins15"), "imu": NO_SCALES}),
     **{

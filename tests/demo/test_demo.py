@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -177,11 +178,11 @@ def test_story_tells_the_outages_that_were_lived_through() -> None:
     assert angles_deg == [
         "12 s without GNSS: the error grew from 0.50 to 3.49 m at most, and sigma said "
         "1.00 m there",
-        "the car was within two sigma for 88 % of the 50 s that it was navigated",
+        "the vehicle was within two sigma for 88 % of the 50 s that it was navigated",
     ]
     none = np.zeros(0)
     assert list(outage_report(none, none, none, [(1.0, 2.0)])) == [
-        "No solution: the car had not driven off yet"
+        "No solution: the vehicle had not driven off yet"
     ]
 
 
@@ -272,6 +273,11 @@ def test_line() -> None:
     text = line(_live())
     assert "error   0.50 m (sigma 0.71)" in text
     assert "navigating" in text
+    assert "yaw +0.10 deg" in text
+    live = _live()
+    live.errors = [*live.errors[:8], math.nan]  # without an inertial unit
+    assert "no heading" in line(live)
+    assert "nan" not in line(live)
 
 
 def test_before_the_first_message() -> None:

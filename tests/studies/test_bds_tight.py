@@ -143,6 +143,8 @@ def test_tables_and_picture(tmp_path: Path) -> None:
     assert [len(t[2]) for t in (every, few, orbits, own)] == [27, 21, 8, 6]
     for _, header, rows in (every, few, orbits, own):
         assert {len(row) for row in rows} == {len(header)}
+    # Millimetres a second are told.
+    assert not {"0.00", "-0.00"} & {cell for row in own[2] for cell in row}
     pytest.importorskip("matplotlib")
     bds_tight.plot(result(), tmp_path / "tight.png")
     assert (tmp_path / "tight.png").stat().st_size > 10_000

@@ -334,7 +334,9 @@ def _by_case(cases: dict[str, Any]) -> tuple[list[list[str]], list[list[str]]]:
 
 
 def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
+    if value is None:
+        return ""
+    return f"{value:.2f}" if abs(value) >= 0.1 or value == 0.0 else f"{value:.2g}"
 
 
 TITLES = {
