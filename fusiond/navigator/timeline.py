@@ -183,7 +183,8 @@ class Timeline:
             self._count(entry, self._apply(entry))
             self._next += 1
         estimator.propagate(imu, latest, record, passing=True)
-        self._checkpoint_if_due()
+        if self._checkpoint_if_due():
+            self._spacing.thin(kept, latest)
         horizon = latest - self._keep_ns
         if len(kept) > 1 and kept[1].snapshot.t_ns <= horizon:
             self._forget(horizon)
@@ -308,10 +309,13 @@ class Timeline:
         if self._on_outcome is not None:
             self._on_outcome(entry)
 
-    def _checkpoint_if_due(self) -> None:
+    def _checkpoint_if_due(self) -> bool:
+        """True if a checkpoint was due, and taken."""
         kept_ns = self._checkpoints[-1].snapshot.t_ns
-        if self.estimator.t_ns - kept_ns >= self._spacing.after(kept_ns, self.imu.latest_ns):
+        due = self.estimator.t_ns - kept_ns >= self._spacing.after(kept_ns, self.imu.latest_ns)
+        if due:
             self._checkpoint()
+        return due
 
     def _checkpoint(self) -> None:
         last_key = self._keys[self._next - 1] if self._next else self._checkpoints[-1].last_key
@@ -347,7 +351,6 @@ class Timeline:
             drop += 1
         if drop:
             del self._checkpoints[:drop]
-        self._spacing.thin(self._checkpoints, self.imu.latest_ns)
         oldest = self._checkpoints[0]
         self.imu.needed = oldest.snapshot.sample
         if oldest.last_key is None:
