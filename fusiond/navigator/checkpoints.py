@@ -38,7 +38,7 @@ class Spacing:
 
     def __init__(self, longest_ns: int, keep_ns: int) -> None:
         self._longest_ns, self._keep_ns = longest_ns, keep_ns
-        self._rewound_ns = -keep_ns
+        self._rewound_ns = -(2**62)  # never
 
     def rewound(self, latest_ns: int) -> None:
         """A rewind with the last sample at `latest_ns`."""
