@@ -38,20 +38,25 @@ class Spacing:
 
     def __init__(self, longest_ns: int, keep_ns: int) -> None:
         self._longest_ns, self._keep_ns = longest_ns, keep_ns
-        self._rewound_ns = -keep_ns
+        self._rewound_ns = -(2**62)  # never
 
     def rewound(self, latest_ns: int) -> None:
         """A rewind with the last sample at `latest_ns`."""
         self._rewound_ns = latest_ns
 
+    def _lie_close(self, latest_ns: int) -> bool:
+        return latest_ns - self._rewound_ns <= self._keep_ns
+
     def after(self, t_ns: int, latest_ns: int) -> int:
         """Interval from a checkpoint at `t_ns` to the next."""
-        if latest_ns - self._rewound_ns > self._keep_ns:
+        if not self._lie_close(latest_ns):
             return self._longest_ns
         return min(self._longest_ns, max(CLOSEST_NS, (latest_ns - t_ns) // SHARE_OF_AGE))
 
     def thin(self, checkpoints: list[Checkpoint], latest_ns: int) -> None:
         """Drop those that lie closer than their age asks, but the first and the last."""
+        if not self._lie_close(latest_ns):
+            return
         found = checkpoints[:1]
         for one, later in pairwise(checkpoints[1:]):
             before_ns = found[-1].snapshot.t_ns

@@ -90,6 +90,8 @@ class Timeline:
         service."""
         self._keep_ns = round(keep_s * 1e9)
         self._spacing = Spacing(round(checkpoint_s * 1e9), self._keep_ns)
+        self._due_ns = 0
+        """Instant of the next checkpoint."""
         self._on_outcome = on_outcome
         self._entries: list[Entry] = []
         self._keys: list[Key] = []
@@ -105,6 +107,7 @@ class Timeline:
         self._next = 0
         self.diagnosis.reset()
         self._checkpoints = [Checkpoint(self.estimator.snapshot(), None, self.diagnosis.snapshot())]
+        self._space()
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
         for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
@@ -178,11 +181,14 @@ class Timeline:
             entry = self._entries[self._next]
             if (t_ns := entry.key[0]) > estimator.t_ns or estimator.passing:
                 estimator.propagate(imu, t_ns, record)
-                self._checkpoint_if_due()
+                if estimator.t_ns >= self._due_ns:
+                    self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
         estimator.propagate(imu, latest, record, passing=True)
-        self._checkpoint_if_due()
+        if estimator.t_ns >= self._due_ns:
+            self._checkpoint()
+            self._spacing.thin(kept, latest)
         horizon = latest - self._keep_ns
         if len(kept) > 1 and kept[1].snapshot.t_ns <= horizon:
             self._forget(horizon)
@@ -221,8 +227,8 @@ class Timeline:
         estimator, kept_ns = self.estimator, self._checkpoints[-1].snapshot.t_ns
         if not estimator.runs:
             return False
-        which, every_ns = range(self._next, end), self._spacing.after(kept_ns, self.imu.latest_ns)
-        batch = self._rows.batch(self._entries, which, self.diagnosis, kept_ns + every_ns)
+        which, every_ns = range(self._next, end), self._due_ns - kept_ns
+        batch = self._rows.batch(self._entries, which, self.diagnosis, self._due_ns)
         if batch is None:
             return False
         ran = estimator.run(self.imu, *batch, record, (kept_ns, every_ns))
@@ -307,16 +313,17 @@ class Timeline:
         if self._on_outcome is not None:
             self._on_outcome(entry)
 
-    def _checkpoint_if_due(self) -> None:
-        kept_ns = self._checkpoints[-1].snapshot.t_ns
-        if self.estimator.t_ns - kept_ns >= self._spacing.after(kept_ns, self.imu.latest_ns):
-            self._checkpoint()
-
     def _checkpoint(self) -> None:
         last_key = self._keys[self._next - 1] if self._next else self._checkpoints[-1].last_key
         self._checkpoints.append(
             Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
         )
+        self._space()
+
+    def _space(self) -> None:
+        """Find the instant of the next checkpoint."""
+        t_ns = self._checkpoints[-1].snapshot.t_ns
+        self._due_ns = t_ns + self._spacing.after(t_ns, self.imu.latest_ns)
 
     def _rewind(self, key: Key) -> None:
         """Rewind to the last checkpoint before `key`."""
@@ -325,6 +332,7 @@ class Timeline:
         while len(self._checkpoints) > 1 and not self._checkpoints[-1].precedes(key):
             self._checkpoints.pop()
         checkpoint = self._checkpoints[-1]
+        self._space()
         self.estimator.restore(checkpoint.snapshot)
         self.diagnosis.restore(checkpoint.memory)
         self._next, self.decided = self._following(checkpoint), True
@@ -346,7 +354,6 @@ class Timeline:
             drop += 1
         if drop:
             del self._checkpoints[:drop]
-        self._spacing.thin(self._checkpoints, self.imu.latest_ns)
         oldest = self._checkpoints[0]
         self.imu.needed = oldest.snapshot.sample
         if oldest.last_key is None:
