@@ -1,1 +1,1 @@
-"""Batch: many drives, each a row of figures, on as many processes as there are."""
+"""Batch: many drives, each a row of figures, on several processes."""

@@ -2,8 +2,8 @@
 
 A row is named by its log, the digest of the configuration and the version of fusiond: a batch with
 another configuration adds rows to the same file, and one that has its rows already does nothing.
-`ended` is that of `fusiond.workers.runner_interface`, or `not navigated`; `reason` says more. Rows
-hold nothing that depends on how many workers there were or how long they took.
+`ended` is an outcome of `fusiond.workers.runner_interface`, or `not navigated`; `reason` explains
+it. Rows do not depend on the number of workers or on their speed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def run_batch(
     runner: Runner,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, int]:
-    """Write a row for each log; the counts of rows by outcome.
+    """Write a row for each log and return the number of rows by outcome.
 
     Raises `ConfigError`, `MissingPackageError`, OSError, and `TableError` for an `out` without
     rows; failures of logs are rows.

@@ -40,7 +40,7 @@ _NOT_OF_THE_DRIVE = frozenset(
 def drive_row(config_path: Path, log: Path) -> Row:
     """Figures of one log, flat; parts of a name are joined by dots.
 
-    `not_navigated` says why there is no solution. Raises what the readers raise.
+    `not_navigated` says why there is no solution. Errors of the readers pass.
     """
     if not log.exists():
         raise FileNotFoundError(f"{log}: there is none")

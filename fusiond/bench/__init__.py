@@ -1,1 +1,1 @@
-"""Cost of the numerics, as ratios to one numpy product."""
+"""Cost of the numerics, as ratios to the cost of one numpy product."""

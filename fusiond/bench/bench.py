@@ -1,4 +1,4 @@
-"""`fusiond bench`: what the filter costs, as ratios to one numpy covariance product.
+"""`fusiond bench`: cost of the filter, as ratios to one numpy covariance product.
 
     Phi @ P @ Phi.T + Q,   21x21, float64
 
@@ -100,13 +100,13 @@ LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
 
 
 def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[str, Any]:
-    """Run the benchmarks; figures with versions and processor."""
+    """Run the benchmarks and return their figures, with versions and processor."""
     product = _product()
     figures: dict[str, Any] = {}
     products: list[float] = []
 
     def ratio(make: Callable[[int], Callable[[], int]], count: int) -> float:
-        """Median over runs of (seconds a unit of work) / (seconds a product)."""
+        """Median over runs of the time per unit of work, divided by the time per product."""
         ratios = []
         for number in range(count):
             work = make(number)
@@ -242,7 +242,7 @@ def _rewind(number: int) -> Callable[[], int]:
 
 
 def _one_source() -> list[Linearised]:
-    """A position and a velocity each second."""
+    """Fixes of one source: a position and a velocity each second."""
     lever, rest, sd = (0.3, 0.0, -1.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)
     measurements: list[Linearised] = []
     for second in range(1, STEP_SECONDS + 1):

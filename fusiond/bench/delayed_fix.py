@@ -1,8 +1,8 @@
-"""Worst tick: a fix that is 10 s late, with much to process again after the rewind.
+"""Cost of the worst tick: a fix arrives 10 s late, and the filter repeats these 10 s.
 
-IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at
-100 Hz. The tick in which the late fix comes takes it in, runs the last 10 s again with 2000 samples
-and 300 measurements, and reads the solution. It has 10 ms for that and all else.
+IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at 100
+Hz. The tick in which the late fix arrives inserts it, repeats the last 10 s with 2000 samples and
+300 measurements, and reads the solution. A tick has 10 ms for all its work.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Drive:
         self._row = 0
 
     def delayed(self, number: int) -> Callable[[], int]:
-        """Drive on to the next late fix; the work is the tick in which it comes."""
+        """Drive on to the next late fix and return the tick of its arrival as the work to time."""
         self.go_on(AT_S + number * EVERY_S)
         row = self._row - round(DELAY_S * RATE_HZ)
         lat, lon, height = self._truth.at(self._truth.t_s[1 + row : 2 + row]).position[0].tolist()
@@ -86,7 +86,7 @@ class Drive:
         self.navigator.add_imu(self._times[rows], self._samples[rows])
 
     def take_fix(self) -> None:
-        """Insert the fix of that epoch, run the filter, read the solution."""
+        """Insert the fix of the next epoch, run the filter, read the solution."""
         self.fix()
         self._row += TICK_SAMPLES
         self.navigator.advance()
@@ -110,7 +110,7 @@ class Drive:
         self.navigator.add(fix, t_ns)
 
     def _wheel(self) -> None:
-        """Wheel measurement at that epoch."""
+        """Add the wheel's speed at an epoch."""
         r, epoch = self.receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         n, e, _ = r.v_ned[epoch].tolist()
@@ -119,6 +119,7 @@ class Drive:
 
 
 def delayed_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:
-    """Works of one drive, each the tick of a late fix; asked for in turn."""
+    """Function that returns, at each call, the tick of the next late fix on one drive, to be
+    timed."""
     drive, numbers = Drive(repetitions), count()
     return lambda _: drive.delayed(next(numbers))

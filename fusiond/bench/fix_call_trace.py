@@ -1,9 +1,9 @@
-"""The way of an ordinary fix through the code: from its arrival to the sigma that is published.
+"""Functions and modules that an ordinary fix passes, from its arrival to the published sigma.
 
-A vehicle that navigates, its samples there: a fix with its velocity is handed over, the filter
-runs, the solution is read. The Python functions and modules of the package that it passes through
-are what somebody has to read who asks why a sigma is what it is. Compiled kernels are none of them;
-what is done seldom (a checkpoint, a verdict) the one in the middle of five fixes has not.
+A navigating vehicle has its IMU samples; a fix with velocity arrives, the filter runs, the solution
+is read. To explain a published sigma, a person has to read the Python functions that are counted
+here. Compiled kernels are not counted. The fix with the median count of five is taken: it has none
+of the rare work (a checkpoint, a verdict).
 """
 
 from __future__ import annotations

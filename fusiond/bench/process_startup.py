@@ -1,12 +1,12 @@
 """Cost of `fusiond process` before its first row, in a new process with cached kernels.
 
-From the start of the interpreter over imports, kernels linked, files read and a vehicle that stands
-until it is aligned, to the first rows; the few hundred rows of the file are a hundredth of that.
+The time spans the interpreter's start, imports, linking of kernels, reading of files and alignment
+at rest, up to the first rows; the few hundred rows of the file take a hundredth of it.
 
-Modules come of bytecode, as in any installation after its first start: a folder of the benchmark's
-own keeps it, which a first run fills that is not timed. Where Python is told to write none
-(`PYTHONDONTWRITEBYTECODE`, as in many containers) and none was installed, each start compiles some
-thousand modules, which takes longer than all else.
+Modules are loaded from bytecode, as in any installation after its first start: a first run, which
+is not timed, fills a folder of the benchmark with it. An installation without bytecode where Python
+may write none (`PYTHONDONTWRITEBYTECODE`, as in many containers) compiles some thousand modules at
+each start, which takes longer than everything else.
 """
 
 from __future__ import annotations

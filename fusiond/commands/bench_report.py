@@ -1,4 +1,4 @@
-"""The figures of `fusiond bench` for people."""
+"""Printed report of `fusiond bench`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ROWS = {
 
 
 def print_bench(figures: dict[str, Any], console: Console | None = None) -> None:
-    """Print to standard output, or to the console given."""
+    """Print the figures to `console` or standard output."""
     console = console or Console()
     versions = ", ".join(
         f"{name} {figures[name]}" for name in ("fusiond", "python", "numpy", "numba")

@@ -1,4 +1,4 @@
-"""The report of `fusiond compare` for people: a rich table on a terminal, plain text in a pipe."""
+"""Printed report of `fusiond compare`: a rich table on a terminal, plain text in a pipe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _UNITS = {"m": "m", "m_s": "m/s", "deg": "deg"}
 
 
 def print_report(report: Report, console: Console | None = None) -> None:
-    """Print to standard output, or to the console given."""
+    """Print the report to `console` or standard output."""
     console = console or Console()
     heading = (
         f"{report['epochs']} epochs, {report['t_first_s']:.3f} to {report['t_last_s']:.3f} s; "

@@ -1,4 +1,4 @@
-"""Command config: a first configuration, from what is plugged in and what is answered."""
+"""Command config: a first configuration from devices found and questions answered."""
 
 from __future__ import annotations
 

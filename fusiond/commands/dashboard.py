@@ -1,4 +1,4 @@
-"""Command dashboard: what a vehicle says, in a browser."""
+"""Command dashboard: messages of a vehicle in a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An error-state model for people: its states with their units, noise and initial sigma."""
+"""Printed report of an error-state model: states with units, noise and initial sigma."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
 
 @contextmanager
 def stored_rows(out: Path | None, name: str, seed: int) -> Iterator[StoredRuns | None]:
-    """Rows of a study in `out`; prints at the end how many there are."""
+    """Context with the stored rows of a study in `out`; prints their number at the end."""
     if out is None:
         yield None
         return
@@ -128,8 +128,8 @@ def _runs(
     timeout_s: float | None,
     kept: StoredRuns | None,
 ) -> Iterator[Sequence[LostRun]]:
-    """Choice where the runs go: here, if they are so few that workers would not be warm before
-    their end, and nobody asked for any."""
+    """Context of a study's runs, which yields the lost ones. Runs stay in this process where they
+    are too few to warm up workers and none are asked for."""
     few = runs < FEWEST_RUNS and kept is None
     if few and workers is None and cluster is None and timeout_s is None:
         yield ()

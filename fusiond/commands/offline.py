@@ -121,7 +121,7 @@ def _missing_packages() -> Iterator[None]:
 
 
 def _recording(logs: list[Path]) -> Pass:
-    """A pass through the daemon's recording."""
+    """Function that replays the daemon's recording once."""
     from fusiond.recording.reader import Log  # noqa: PLC0415
     from fusiond.replay.replay_for_calibration import replay_for_calibration  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Commands on recordings: replay, and the family `log`."""
+"""Commands on recordings: replay, and the group `log`."""
 
 from __future__ import annotations
 

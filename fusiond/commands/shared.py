@@ -44,7 +44,7 @@ def parse_mqtt(text: str) -> tuple[str, int]:
 
 @contextmanager
 def config_errors() -> Iterator[None]:
-    """Every mistake of a configuration on standard error, and exit 78."""
+    """Print every mistake of a configuration on standard error and exit 78."""
     from fusiond.configuration.load import EXIT_CONFIG, ConfigError  # noqa: PLC0415
 
     try:

@@ -1,7 +1,7 @@
-"""`fusiond status`: ask the running daemon, over MQTT, how it stands.
+"""`fusiond status`: state of the running daemon, asked over MQTT.
 
-Retained topics arrive at once; the solution arrives within a second from a working daemon. One that
-is `online` and silent has stopped, or hangs.
+Retained topics arrive at once; the solution of a working daemon arrives within a second. A daemon
+that is `online` and silent has stopped or hangs.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _SETTLE_S = 0.3
 """Time (s) in which the broker sends every vehicle's retained messages."""
 _LOOK_EVERY_S = 0.05
 _MOST_BYTES = 65_536
-"""`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
+"""Largest message: `health` of twenty sources with a full sky has some 20 kB."""
 _ASKED = ("status", "nav", "health")
-"""Topics of a working daemon within a second."""
+"""Topics that a working daemon sends within a second."""
 
 
 @dataclass(slots=True)
@@ -48,7 +48,7 @@ class VehicleMessages:
 
     @property
     def complete(self) -> bool:
-        """True if every topic that the daemon sends has come; before the first tick it sends
+        """True if every topic that the daemon sends has arrived; before the first tick it sends
         none."""
         compiling = self.topics.get("status", {}).get("ticks") == 0
         asked = ("status",) if compiling else _ASKED

@@ -1,4 +1,4 @@
-"""The page of `fusiond status`: what a daemon's retained messages and its solution say."""
+"""Printed page of `fusiond status`: retained messages and solution of a daemon."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _UNKNOWN = "-"
 
 
 def status_page(answer: dict[str, Any]) -> list[str]:
-    """Lines for people. `answer` has the messages by topic, `status` at least."""
+    """Lines of the page. `answer` has the messages by topic, `status` at least."""
     status = answer["status"]
     health, nav = answer.get("health"), answer.get("nav")
     lines = [
@@ -149,7 +149,7 @@ def _sources(
 
 
 def _state(source: dict[str, Any]) -> str:
-    """State of the device; of one that runs, its service where that is not as usual."""
+    """State of a device; for a running device its service, unless that is normal."""
     service = source["service"]
     if source["state"] == "running" and service not in (None, "nominal"):
         return f"running, {service}"
@@ -168,7 +168,7 @@ def _fault(source: dict[str, Any]) -> str:
 
 
 def _refused(reasons: dict[str, int]) -> str:
-    """The commonest reasons with their counts."""
+    """Most frequent reasons with their counts."""
     if not reasons:
         return ""
     first = sorted(reasons.items(), key=lambda item: -item[1])

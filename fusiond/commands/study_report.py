@@ -1,4 +1,4 @@
-"""A study's result for people: rich tables on a terminal, plain text in a pipe."""
+"""Printed result of a study: rich tables on a terminal, plain text in a pipe."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ Table = tuple[str, list[str], list[list[str]]]
 
 
 def print_study(study: ModuleType, result: dict[str, Any], console: Console | None = None) -> None:
-    """Print to standard output, or to the console given: the study's own tables, else every list
-    of records in its result; then its finding."""
+    """Print the result of a study to `console` or standard output: its own tables, or every list of
+    records in the result, then its finding."""
     console = console or Console()
     if hasattr(study, "table"):
         console.print(study.table(result), highlight=False, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Tables for people: rich on a terminal, aligned plain text in a pipe."""
+"""Printed tables: rich on a terminal, aligned plain text in a pipe."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A simulated vehicle on virtual devices, served by the real daemon, with a view on a terminal."""
+"""Demo: a simulated vehicle with virtual devices, the real daemon, and a view on a terminal."""

@@ -2,8 +2,8 @@
 
     with DemoBroker() as broker: broker.port
 
-As a process (`python -m fusiond.demo.broker`): prints the port that it serves on the loopback
-interface, and ends when its standard input does, so it never outlives the demo.
+The process (`python -m fusiond.demo.broker`) prints its port on the loopback interface and ends
+when its standard input ends, so that it never outlives the demo.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class DemoError(Exception):
 
 
 class DemoBroker:
-    """A broker process, as a context. Raises `DemoError` if it cannot start."""
+    """Context manager of a broker process. Raises `DemoError` if it cannot start."""
 
     def __init__(self) -> None:
         if importlib.util.find_spec("amqtt") is None:

@@ -1,4 +1,4 @@
-"""The demo's dashboard: `fusiond dashboard` on the demo's broker, in a process of its own."""
+"""Dashboard of the demo: a process `fusiond dashboard` on the demo's broker."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def _free(port: int) -> bool:
 
 
 class DemoPage:
-    """A dashboard process, as a context; `address` is where a browser finds it.
+    """Context manager of a dashboard process; `address` is the page's URL.
 
-    Raises `DemoError` if it cannot start; why stands on standard error.
+    Raises `DemoError` if it cannot start; standard error has the reason.
     """
 
     def __init__(self, broker_port: int) -> None:

@@ -65,9 +65,9 @@ def demo(
     dashboard: bool = False,
     paper: str | None = None,
 ) -> dict[str, Any]:
-    """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`; with
-    `dashboard` there is a page to open, whose address the view says. `paper`: of
-    `fusiond.simulation.papers`, whose number, filter and model the summary then begins with.
+    """Run for `duration_s` or until Ctrl-C and return a summary. The folder `record` receives a
+    recording. With `dashboard` the view shows the address of a page. `paper` is a number of
+    `fusiond.simulation.papers`; the summary then begins with its number, filter and model.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
@@ -90,8 +90,8 @@ def demo(
 
 
 def demo_setup(paper: str | None = None) -> DemoSetup:
-    """Demo of the shipped car in town streets, whose receiver is unplugged once a minute, or of a
-    paper's vehicle by its number in `fusiond.simulation.papers`."""
+    """Set up the shipped car in town streets, with its receiver unplugged once a minute, or the
+    vehicle of a `paper` of `fusiond.simulation.papers`."""
     if paper is not None:
         return paper_setup(paper)
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
@@ -133,7 +133,7 @@ class _Run:
         self._view = view
 
     async def drive(self) -> dict[str, Any]:
-        """Drive until the end, Ctrl-C or SIGTERM; then the summary."""
+        """Drive until the end, Ctrl-C or SIGTERM and return the summary."""
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -170,7 +170,7 @@ class _Run:
         self._score.add(solution, self._daemon.navigator.active_filter.covariance)
 
     async def _subscribe(self) -> None:
-        """Listen as a dashboard does."""
+        """Subscribe to the vehicle's topics as a dashboard does."""
         base = f"fusiond/{VEHICLE}/"
         async with aiomqtt.Client(
             "127.0.0.1", self._port, identifier="fusiond-demo-view"
@@ -203,7 +203,7 @@ class _Run:
         ]
 
     async def _outages(self) -> None:
-        """Unplug a device, and plug it in again."""
+        """Unplug the scenario's device and plug it in again at its times."""
         loop = asyncio.get_running_loop()
         started = loop.time()
         pulled = self._play.pulled
@@ -275,7 +275,7 @@ class Score:
         return t_s, np.linalg.norm(error, axis=1), np.sqrt(rows[:, 4] + rows[:, 6])
 
     def against(self, vehicle: SimulatedVehicle) -> dict[str, float | None]:
-        """`horizontal_rms_m`, `yaw_rms_deg`, `nees`."""
+        """Score against the truth: `horizontal_rms_m`, `yaw_rms_deg`, `nees`."""
         if not self._rows:
             return {"horizontal_rms_m": None, "yaw_rms_deg": None, "nees": None}
         rows = np.array([r[1:] for r in self._rows])

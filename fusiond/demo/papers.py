@@ -7,7 +7,7 @@ from fusiond.simulation.papers import PAPERS, configured
 
 
 def paper_setup(number: str) -> DemoSetup:
-    """The demo of a paper, of `PAPERS`."""
+    """Demo setup of one of `PAPERS`."""
     paper = PAPERS[number]
     config, scenario = configured(number)
     estimator = config.estimator

@@ -1,4 +1,4 @@
-"""Scenario of a demo: the daemon's configuration, the vehicle, and whose plug is pulled when."""
+"""Scenario of a demo: configuration of the daemon, vehicle, and times of unplugged devices."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fusiond.simulation.scenarios import Scenario
 
 
 class Unplugged(NamedTuple):
-    """Unplugged device, s since the start; repeated each `every_s` (0: once)."""
+    """Device that is unplugged at `start_s` for `length_s`, again each `every_s` (0: once)."""
 
     device: Device
     start_s: float
@@ -25,7 +25,7 @@ class Unplugged(NamedTuple):
     every_s: float = 0.0
 
     def times(self, duration_s: float) -> Iterator[tuple[float, float]]:
-        """Begin and end, within `duration_s`."""
+        """Begin and end (s) of each time without the device that begins before `duration_s`."""
         starts = count(self.start_s, self.every_s) if self.every_s else iter([self.start_s])
         for start_s in takewhile(lambda at: at < duration_s, starts):
             yield start_s, start_s + self.length_s
@@ -33,7 +33,8 @@ class Unplugged(NamedTuple):
 
 @dataclass(frozen=True)
 class DemoSetup:
-    """A demo. `config` has all but devices and broker; `scenario` fits it; `paper`: of which."""
+    """Setup of a demo. `config` lacks devices and broker; `scenario` is its vehicle; `paper`
+    describes the paper it follows."""
 
     config: Config
     scenario: Scenario
@@ -63,7 +64,7 @@ class DemoSetup:
         return self.config.model_copy(update={"sources": self.sources(folder), "mqtt": mqtt})
 
     def vehicle(self, duration_s: float, folder: Path) -> SimulatedVehicle:
-        """The devices, in real time."""
+        """Simulated vehicle whose devices run in real time."""
         link = {name: folder / name if name in self.devices else None for name in ("gnss", "rdss")}
         return SimulatedVehicle(
             self.scenario,

@@ -77,7 +77,7 @@ class Live:
         self._arrivals: deque[float] = deque(maxlen=4096)
 
     def message(self, topic: str, payload: bytes) -> None:
-        """Take one message in."""
+        """Store a message from the broker."""
         self.received += 1
         self._arrivals.append(time.monotonic())
         if topic == "nav":
@@ -118,7 +118,7 @@ class Live:
 
 
 class HeadlessView:
-    """A line every five seconds."""
+    """View without a terminal: a line every five seconds."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -296,7 +296,8 @@ class Screen:
 
 
 def _rejected(reasons: dict[str, int]) -> Text:
-    """The commonest reason and how many; what came before the start was never wanted."""
+    """Most frequent reason of rejection and its count, without measurements from before the
+    start."""
     if not reasons:
         return Text("-")
     reason, count = max(reasons.items(), key=lambda item: item[1])

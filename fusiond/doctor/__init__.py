@@ -1,1 +1,1 @@
-"""Opens every port for some seconds and says what arrives and what is wrong."""
+"""Diagnosis of every port: what arrives within some seconds, and what is wrong."""

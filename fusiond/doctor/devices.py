@@ -69,7 +69,7 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
 
 
 def absent_port(name: str, path: str, detail: str) -> str:
-    """A port that cannot be opened: it is not there, not allowed, or taken."""
+    """Finding on a port that cannot be opened: missing, forbidden, or in use."""
     if on_network(path):
         return finding("server_missing", detail=detail, name=name)
     try:
@@ -89,7 +89,7 @@ def absent_port(name: str, path: str, detail: str) -> str:
 
 
 def absent_interface(name: str, options: Any, detail: str) -> str:
-    """A CAN interface that is down or does not exist."""
+    """Finding on a CAN interface that is down or does not exist."""
     channel = options.channel
     if options.interface != "socketcan":
         return finding("bus_interface", detail=detail, name=name)

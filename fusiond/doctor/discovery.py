@@ -1,8 +1,8 @@
 """Discovery of devices on ports and buses, for `fusiond config init`.
 
-It only listens, but for an RDSS terminal, which is silent unless asked for its identity; the
-question does not make it transmit, and is sent only on request. On a bus every known device's own
-decoder gets every frame: the one that completes most samples fits.
+Discovery only listens. The one exception is an RDSS terminal, which is silent until asked for its
+identity: that question is sent only on request and does not make it transmit. On a bus the decoder
+of each known device receives every frame; the device whose decoder completes most samples fits.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ GRAVITY_TOLERANCE = 0.1
 factor."""
 RATES_HZ = (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 80, 100, 125, 160, 200, 250, 400, 500, 800, 1000)
 RATE_TOLERANCE = 0.08
-"""Devices offer steps of a quarter and more; what is counted in 3 s is off by a frame or two."""
+"""Rates of devices differ by a quarter and more; a count over 3 s is off by a frame or two."""
 _DRIVERS: dict[str, Any] = {"can_imu": CanImuDriver, "can_gnss": CanGnssDriver}
 # RTCM 10403.3, table 3.5-78: MSM1 to MSM7 of GPS to BeiDou are 1071 to 1127.
 _MSM = range(1071, 1128)
@@ -80,7 +80,7 @@ class Device:
     text: str
     rate_hz: float | None = None
     aiding: str | None = None
-    """The kind of `[aiding]`, of a driver that may give several."""
+    """Kind of `[aiding]`, for a driver with several kinds."""
     down: str | None = None
     """Sensor axis that points down, if gravity showed it."""
 
@@ -193,7 +193,7 @@ def _description(port: str, baud: int, received: list[str]) -> str:
 
 
 async def _terminal(port: str) -> Device | None:
-    """Ask an RDSS terminal for its identity, and nothing else."""
+    """Ask an RDSS terminal for its identity alone."""
     options = RdssOptions(port=port, transmit=False)
     driver = RdssDriver("rdss", options, lambda _: None, monotonic_ns)
     async with _running(driver.run()):
@@ -283,7 +283,7 @@ def _on_bus(
 
 
 def round_rate(rate_hz: float) -> float:
-    """Usual rate of devices that is nearest to a counted one."""
+    """Usual rate of devices nearest to a counted rate."""
     nearest = min(RATES_HZ, key=lambda r: abs(r - rate_hz))
     return float(nearest if abs(nearest - rate_hz) <= RATE_TOLERANCE * nearest else round(rate_hz))
 

@@ -1,4 +1,4 @@
-"""`fusiond doctor`: opens every port through its own driver for some seconds; what is wrong.
+"""`fusiond doctor`: diagnosis of each port, opened by its own driver for some seconds.
 
 Each finding names symptom and remedy; the exit status is 0 without findings. Nothing is sent beyond
 the daemon's own bytes: an RDSS terminal is asked for identity and beams, and for fixes, which make
@@ -55,8 +55,7 @@ _CHECKSUMS = "wrong checksums against"
 
 @dataclass(slots=True)
 class Arrivals:
-    """Arrivals of one kind of measurement: monotonic ns, s from validity to arrival, and what they
-    say."""
+    """Arrivals of one kind of measurement: monotonic ns, delay since validity (s), and values."""
 
     values: MeasurementStatistics
     seen_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
@@ -65,8 +64,7 @@ class Arrivals:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate between the first and the last arrival that are remembered; a burst has
-        none."""
+        """Mean rate (Hz) between the first and the last remembered arrival; None for a burst."""
         span_s = (self.seen_ns[-1] - self.seen_ns[0]) * 1e-9
         return (len(self.seen_ns) - 1) / span_s if span_s > BURST_S else None
 
@@ -118,7 +116,8 @@ class Report:
 
 
 def doctor(config: Config, seconds: float, transmit: bool = False) -> int:
-    """Listen for `seconds`, print the report; 0 when all is well, 1 otherwise.
+    """Listen for `seconds`, print the report and return the exit status: 0 without findings, else
+    1.
 
     With `transmit` it also requests fixes from an RDSS terminal.
     """
@@ -126,7 +125,7 @@ def doctor(config: Config, seconds: float, transmit: bool = False) -> int:
 
 
 async def examine(config: Config, seconds: float, out: TextIO, transmit: bool = False) -> int:
-    """`doctor` inside a running loop."""
+    """Listen to all sources at once, write a report of each to `out` and return the exit status."""
     clock = Clock(config.clock)
     sources: list[ObservedSource] = []
     for name, section in config.sources.items():
@@ -234,7 +233,7 @@ def _damage(counters: Counter[str], said: list[str]) -> list[str]:
 
 
 def _imu(observed: ObservedSource, config: Config, report: Report) -> None:
-    """Rate, gravity, axes and turn rate, the latter three only at rest."""
+    """Findings on an IMU: its rate and, at rest, gravity, axes and turn rate."""
     rate = observed.kinds["ImuSample"].rate_hz
     wanted = config.imu.rate_hz
     if rate is not None and abs(rate - wanted) > RATE_TOLERANCE * wanted:

@@ -1,6 +1,6 @@
 """Catalogue of the findings of `fusiond doctor`: symptom, then what to do.
 
-`finding(code, ...)` is the text with its figures. What a receiver's bytes lack is named by its
+`finding(code, ...)` is the text with its figures. Findings on a receiver's bytes come from its
 driver (`drivers.nmea.reasons`). docs/troubleshooting.md lists all.
 """
 

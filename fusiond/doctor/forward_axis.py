@@ -37,7 +37,7 @@ MOST_TURN_RAD = np.radians(15.0)
 MOST_ASIDE_RAD = np.radians(30.0)
 """Largest angle to the nearest axis; beyond it the unit is not parallel to the vehicle."""
 _REST_SPEED_M_S = 0.5
-"""Somebody got in: shaken, and no faster than this when it is quiet again."""
+"""Largest speed after somebody got in: the vehicle was shaken, and is quiet again."""
 
 DRIVE_S = 90.0
 """Time to get in, start the engine and drive off."""
@@ -46,8 +46,7 @@ Phase = Literal["unquiet", "standing", "moving", "found", "failed"]
 
 
 class ForwardAxis:
-    """Detector of the forward axis, fed with samples; `phase`, `axis` once found, `reason` where it
-    cannot be.
+    """Detector of the forward axis from samples; `phase`, then `axis`, or `reason` of a failure.
 
     `down` is the axis that gravity showed, such as `-z`.
     """
@@ -131,7 +130,7 @@ def _unit(axis: str) -> Array:
 async def watch_departure(
     options: CanImuOptions, down: str, seconds: float, on_phase: Callable[[Phase], None]
 ) -> ForwardAxis:
-    """Listen to the unit until its forward axis is found, or cannot be, for at most `seconds`.
+    """Listen to the IMU until the detection of its forward axis ends, for at most `seconds`.
     `on_phase` is called with each new phase."""
     decoder, found = CanImuDecoder("imu", options), ForwardAxis(down)
     done = asyncio.Event()

@@ -1,7 +1,7 @@
 """Mean and spread of a device's measurements: scale and byte order show in them.
 
-A wrong scale is a |f| at rest that is not 9.8 m/s^2, a wrong byte order a spread of the order of
-the range, a slipped field a value that jumps.
+A wrong scale shows as |f| other than 9.8 m/s^2 at rest, a wrong byte order as a spread as large as
+the range, a shifted field as a value that jumps.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class MeasurementStatistics:
         }
 
     def add(self, measurement: Emitted) -> None:
-        """Remember one."""
+        """Add a measurement."""
         for quantity in self._quantities:
             values = quantity.of(measurement)
             if values is not None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 
 class KnownDevice(NamedTuple):
-    """A device on a CAN bus: its name, its driver, and that driver's options but for the bus."""
+    """Device on a CAN bus: its name, its driver, and the driver's options without the bus."""
 
     title: str
     driver: str

@@ -1,1 +1,1 @@
-"""A recording through the daemon's own parts once more, with the same bits or another filter."""
+"""Replay of a recording by the daemon's own code: bit by bit the same, or with another filter."""

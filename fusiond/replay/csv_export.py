@@ -1,8 +1,8 @@
 """Conversion of a log's measurements to CSV tables for `fusiond process` (docs/files.md).
 
-The recorded bytes go through the drivers and the clock as they did live; each measurement is
-written at the instant that the clock gave it. t_s is the log's time: POSIX seconds where the daemon
-knew the date at its start.
+The recorded bytes pass drivers and clock as they did live; each measurement is written with the
+instant that the clock assigns. t_s is the log's time: POSIX seconds where the daemon knew the date
+at its start.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def replay_measurements(
 
 
 def write_tables(recording: Log, config: Config, folder: Path) -> dict[str, int]:
-    """`SOURCE.csv` of each source that has a table; the rows of each file."""
+    """Write `SOURCE.csv` for each source that has a table and return the number of rows by file."""
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as files:
         tables = _Tables(folder, recording.about.epoch_ns, files)

@@ -1,4 +1,4 @@
-"""Recorded clocks of the host."""
+"""Host clocks of a replay: they read what was recorded."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class RecordedTime:
 class RecordedReadings(Readings):
     """Clock readings of the daemon, in the same order.
 
-    A filter with other events makes another number of readings: missing readings repeat the last
-    one, and surplus ones are ignored (`pending`).
+    A filter with other events reads the clocks more or less often: a reading that is missing in the
+    log repeats the last one, a surplus one is ignored (`pending`).
     """
 
     def __init__(self, time: RecordedTime, system_clock: Mapping[str, int | None]) -> None:
@@ -57,7 +57,7 @@ class RecordedReadings(Readings):
         return self._next(BOOTTIME)
 
     def slewed(self) -> tuple[int, int]:
-        """It stands where it is asked for, but in logs of CLOCK_MONOTONIC, which hold none."""
+        """CLOCK_MONOTONIC: the recorded reading, or the last one in logs without such readings."""
         if self._readings and self._readings[0][0] == SLEWED:
             return self._next(SLEWED)
         return self._time.t_ns, self._last[SLEWED]

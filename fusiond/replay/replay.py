@@ -1,9 +1,9 @@
-"""A recording through the daemon's chain: drivers, clock, navigator, tick by tick.
+"""Replay of a recording through the daemon's chain: drivers, clock, navigator, tick by tick.
 
-From a recording's beginning, with its own configuration, every tick must end in the same bits: the
-log holds their digests, and the first that differs is named. From the middle of a drive (a cut log,
-a recording that was started on the way) it goes on from a state that the log holds, as a restarted
-daemon would: then nothing can be compared.
+A replay from the beginning, with the log's own configuration, must end every tick in the same bits:
+the log holds digests, and the first difference is named. A replay from the middle of a drive (a cut
+log, a recording started during a drive) begins at a state that the log holds, as a restarted daemon
+would; it cannot be compared.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Replay:
         self.chain: Chain | None = None
 
     def ticks(self) -> Iterator[ReplayedTick]:
-        """Run the replay once; yields each tick after its end."""
+        """Run the replay once and yield each tick after its end."""
         after_ns = 0
         for record in self._log.records():
             if self.chain is None:
@@ -119,7 +119,7 @@ class Replay:
     # ------------------------------------------------------------------ start
 
     def _start(self, record: Record) -> int:
-        """Put the chain together; inputs up to the instant that is returned (ns) come too early."""
+        """Assemble the chain and return the instant (ns) up to which inputs are too early."""
         start: dict[str, Any] = json.loads(record.payload) if record.kind is Kind.START else {}
         from_start = bool(start.get("from_start"))
         system_clock = start.get("system_clock") or _system_clock(record, self._log)
@@ -259,7 +259,7 @@ class Replay:
 
 
 def _system_clock(record: Record, recording: Log) -> dict[str, int | None]:
-    """Fallback where the log is silent: the system clock as the log's own dates have it."""
+    """System clock by the log's own dates, for a log that holds no readings of it."""
     t_ns, ahead_ns = record.t_ns, recording.about.epoch_ns
     return {
         **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), t_ns),

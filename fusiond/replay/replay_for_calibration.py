@@ -1,4 +1,4 @@
-"""Replay of a recording under observation, for `fusiond calibrate LOG.mcap`."""
+"""Replay of a recording with an observer, for `fusiond calibrate LOG.mcap`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fusiond.replay.replay import Replay
 def replay_for_calibration(
     recording: Log, config: Config, look: Callable[[Navigator], None]
 ) -> dict[str, Any]:
-    """Run a replay; the summary of its solution in the terms of `process`.
+    """Run a replay and return the summary of its solution in the terms of `process`.
 
     The navigator starts without saved calibration, which this drive would count twice. `look`
     receives the navigator once a second. Raises `LogError`.

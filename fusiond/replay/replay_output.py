@@ -1,4 +1,4 @@
-"""`fusiond replay`: a log through the filter, its solution into a file or over MQTT."""
+"""`fusiond replay`: solution of a replayed log as files or over MQTT."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SOLUTION, EVENTS = "solution.csv", "events.csv"
 ROWS = 4096
 """Most solutions that wait to be written together."""
 FAREWELL_S = 1.0
-"""Given to the last messages of a published replay."""
+"""Time (s) for the last messages of a published replay."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """Options of a replay: another configuration, single settings, files, the speed at which it is
-    published (None: not at all, as fast as it goes)."""
+    """Options of a replay: configuration, single settings, output files, and the speed at which it
+    is published (None: not published, at full speed)."""
 
     config: Path | None = None
     settings: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ class ReplayOptions:
 
 
 def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
-    """Replay a recording; the summary. `times_real_time` is by CPU time.
+    """Replay a recording and return its summary. `times_real_time` is by CPU time.
 
     `identical` is None without digests to compare. Raises `LogError`, `ConfigError`, OSError.
     """
@@ -68,7 +68,8 @@ def replay(paths: Sequence[Path], wish: ReplayOptions) -> dict[str, Any]:
 
 
 class _Files:
-    """`solution.csv` with a row a tick and `events.csv`, in a folder; t_s is POSIX by the log."""
+    """Output files in a folder: `solution.csv` with a row a tick, and `events.csv`; t_s is POSIX
+    time by the log."""
 
     def __init__(self, folder: Path, recording: Log) -> None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
-"""A log as a rosbag2 with MCAP storage: `sensor_msgs/NavSatFix` of the solution, `Imu` of the
-sensor. It needs the package rosbags (extra `ros`), and no ROS.
+"""Export of a log as a rosbag2: `sensor_msgs/NavSatFix` of the solution, `Imu` of the sensor.
+Storage is MCAP. It needs the package rosbags (extra `ros`), and no ROS.
 
 Frames are ROS's own (REP 103): covariance east, north, up; the sensor's rates and forces turned
-from forward, right, down to forward, left, up. Orientation stands in no message of a sensor: -1 in
-its covariance says so.
+from forward, right, down to forward, left, up. A sensor's message has no orientation, which -1 in
+its covariance states.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _TO_ROS = np.array([1.0, -1.0, -1.0])
 
 
 def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]:
-    """Write a bag into `folder`, which must not exist; the messages by topic. Raises
-    `MissingPackageError`, OSError."""
+    """Write a bag into `folder`, which must not exist, and return the number of messages by topic.
+    Raises `MissingPackageError`, OSError."""
     if importlib.util.find_spec("rosbags") is None:
         raise MissingPackageError(f"rosbag2 needs the package rosbags: {install_command('ros')}")
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an extra
@@ -61,7 +61,7 @@ def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]
 
 
 class _Messages:
-    """ROS messages of the types of a store."""
+    """Converter of messages to the ROS types of a store."""
 
     fix_type = "sensor_msgs/msg/NavSatFix"
     imu_type = "sensor_msgs/msg/Imu"
@@ -89,7 +89,7 @@ class _Messages:
         )
 
     def imu(self, t_ns: int, rate: Any, force: Any) -> Any:
-        """Imu of rates (rad/s) and specific forces (m/s^2), (3,) in ROS's axes."""
+        """Make an Imu message of rates (rad/s) and specific forces (m/s^2), (3,) in ROS's axes."""
         vector = self._types["geometry_msgs/msg/Vector3"]
         quaternion = self._types["geometry_msgs/msg/Quaternion"]
         unknown = np.zeros(9)

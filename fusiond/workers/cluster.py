@@ -1,10 +1,10 @@
 """Runner on the workers of a Dask scheduler (extra `[cluster]`).
 
-Each thread of a Dask worker has a process of a `Pool` of its own: what a run does to its process,
-or that it never ends, is an outcome here, too, and no Dask worker is lost by it. A Dask worker that
-dies is Dask's business: its chunks are given to another one, and only a chunk that has brought down
-several (`distributed.scheduler.allowed-failures`) is given up. Every worker needs fusiond in the
-same version, and finds the same files under the same paths.
+Each thread of a Dask worker has a `Pool` of one process: a run that kills its process or never ends
+is an outcome here, too, and no Dask worker is lost. Dask handles the death of its workers: their
+chunks go to another one, and only a chunk that has brought down several
+(`distributed.scheduler.allowed-failures`) is given up. Every worker needs the same version of
+fusiond and the same files under the same paths.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from fusiond.workers.pool import Pool
 from fusiond.workers.runner_interface import Outcome, R, T
 
 CONNECT_S = 10.0
-"""Dask's own default is as long."""
+"""Time (s) for the connection: Dask's own default."""
 _THIS_THREAD = threading.local()
 
 
 class ClusterError(Exception):
-    """No scheduler answers, or Dask is not installed."""
+    """Error: no scheduler answers, or Dask is not installed."""
 
 
 class Cluster:
-    """The workers of the scheduler at `address`; an item may take `timeout_s`.
+    """Runner on the workers of the scheduler at `address`; an item may take `timeout_s`.
 
     Raises `ClusterError`.
     """

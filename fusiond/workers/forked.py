@@ -6,7 +6,7 @@ event loop and never forks in it. Children work in parallel, each on one job; on
 share of memory is replaced. A job whose child dies is given to a child alone, once more; a second
 failure is left to the caller, who can report the reason.
 
-They run by normal priority, and go before the caller does where memory ends.
+Children run with normal priority, and the kernel ends them before the caller where memory runs out.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _DONE, _LAST = b".", b"!"
 
 
 class ForkedJobs:
-    """`jobs` at work in other processes; iterate for the number that is done, to the end. `prepare`
-    loads what all jobs need, once."""
+    """Jobs that run in child processes; iteration gives the number of finished ones, to the end.
+    `prepare` runs once, before all jobs, in their common parent."""
 
     def __init__(
         self, jobs: Sequence[Job], prepare: Job = lambda: None, share: int = SHARE
@@ -75,13 +75,13 @@ class ForkedJobs:
         return self._read
 
     def read(self) -> bool:
-        """Wait until one more is done; False when all is over."""
+        """Wait until another job is finished; False after the end of all."""
         news = os.read(self._read, 1)
         self.done += len(news)
         return bool(news)
 
     def end(self) -> None:
-        """The children end, in the middle of a job too."""
+        """End the children, also in the middle of a job."""
         if self._pid:
             with suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGTERM)
@@ -152,15 +152,15 @@ class _Jobs:
 
 
 def _work(jobs: Sequence[Job], share: int, connection: socket.socket) -> None:
-    """A child: does the jobs that it is given until it holds too much."""
+    """Run, in a child, the jobs that it is given until it holds too much memory."""
     while number := connection.recv(4):
         jobs[int.from_bytes(number, "big")]()
         connection.send(_LAST if _own_bytes() > share else _DONE)
 
 
 def _available_bytes() -> float:
-    """Memory that can be had without swapping (proc(5), MemAvailable); infinite where the kernel
-    does not say."""
+    """Memory available without swapping (proc(5), MemAvailable); infinite where the kernel does not
+    state it."""
     try:
         lines = MEMORY.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -179,7 +179,7 @@ def _own_bytes() -> int:
 
 
 def _fork(work: Callable[[], None]) -> int:
-    """Fork a child that does `work`; its pid. It ends with its parent, too."""
+    """Fork a child that does `work` and return its pid. The child also ends with its parent."""
     sys.stdout.flush()
     sys.stderr.flush()
     parent = os.getpid()
@@ -208,7 +208,7 @@ def _child(work: Callable[[], None], parent: int) -> NoReturn:
 
 
 def _step_back() -> None:
-    """Normal priority and badness, where the caller's are better."""
+    """Give up a priority or an OOM score that is better than normal."""
     with suppress(OSError):
         if os.getpriority(os.PRIO_PROCESS, 0) < 0:
             os.setpriority(os.PRIO_PROCESS, 0, 0)

@@ -1,9 +1,9 @@
-"""A pool of warm worker processes that no run can bring down.
+"""Pool of warm worker processes that survives the failure of any run.
 
-Each worker is a new interpreter (nothing is forked: threads and locks of this process stay here)
-that loads the kernels once, with one thread for linear algebra, and is used again. It answers item
-by item, so that a worker that dies, or is killed because an item takes too long, costs this one
-item: the others of its chunk go to another worker.
+Each worker is a new interpreter (a fork would copy threads and locks) that loads the kernels once,
+has one thread for linear algebra, and is used again. It answers item by item: a worker that dies,
+or is killed because an item takes too long, costs this one item, and the others of its chunk go to
+another worker.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _START = (
 
 
 class PoolError(Exception):
-    """No worker can be started."""
+    """Error: no worker can be started."""
 
 
 def processor_count() -> int:

@@ -26,7 +26,7 @@ class Outcome(Generic[R]):
 
 
 class Runner(Protocol):
-    """Runner of a function of each item on other processes; `workers` at a time."""
+    """Runner that applies a function to each item on other processes, `workers` at a time."""
 
     @property
     def workers(self) -> int: ...
@@ -34,7 +34,7 @@ class Runner(Protocol):
     def outcomes(
         self, work: Callable[[T], R], items: Sequence[T], chunk: int = 1
     ) -> Iterator[Outcome[R]]:
-        """Run each item; yields outcomes in order of completion.
+        """Run each item and yield outcomes in order of completion.
 
         `work` is a function of a module, or a partial of one; `chunk` items are handed over at
         once. No failure of a run is raised.
