@@ -1,8 +1,8 @@
 """Channels of a log with their schemas, and messages for other tools.
 
-`/fusiond/input` is what a replay needs (`fusiond.recording.records`); all other channels are
-derived from it, JSON, and there so that a log opens in Foxglove, Lichtblick and PlotJuggler as it
-is. Those named like a topic of MQTT carry the same message.
+A replay needs `/fusiond/input` alone (`fusiond.recording.records`). All other channels are derived
+from it, as JSON, so that Foxglove, Lichtblick and PlotJuggler open a log as it is. A channel with
+the name of an MQTT topic carries the same message.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class InnovationMessage:
     outcome: str
     """`fused`, `gated`, `too_old`, ... as counted in `health`."""
     nis: float | None
-    """nu^T S^-1 nu; null where there was none."""
+    """nu^T S^-1 nu; null without an innovation."""
     degrees: int
     whitened: tuple[float, ...]
     """L^-1 nu with S = L L^T: each is N(0, 1) while filter and measurement agree."""
@@ -94,7 +94,7 @@ CHANNELS: dict[str, Channel] = {
 
 
 def innovation(entry: Entry, outcome: Outcome) -> InnovationMessage:
-    """`/innovation` of a measurement that has ended so."""
+    """Message `/innovation` of a measurement with this outcome."""
     nis = outcome.nis if math.isfinite(outcome.nis) else None
     whitened = tuple(float(v) for v in outcome.whitened)
     raw = entry.raw

@@ -1,4 +1,4 @@
-"""Logs made of logs: a part cut out, parts joined, what can be had of a damaged one.
+"""Edits of logs: cut out a part, join parts, recover a damaged log.
 
 The result is an ordinary log with index, metadata and attachments.
 """
@@ -23,8 +23,7 @@ _TYPES = {".json": "application/json"}
 
 @dataclass(frozen=True, slots=True)
 class Edited:
-    """Result of an edit: the file, its messages, and what was wrong with the logs it was made
-    of."""
+    """Result of an edit: the file, its number of messages, and the defects of the source logs."""
 
     path: Path
     messages: int
@@ -40,16 +39,15 @@ def merge(paths: Sequence[Path], out: Path) -> Edited:
 
 
 def recover(path: Path, out: Path) -> Edited:
-    """Readable part of a log that was cut off or damaged. Raises `LogError`, OSError."""
+    """Write the readable part of a truncated or damaged log. Raises `LogError`, OSError."""
     return merge([path], out)
 
 
 def trim(paths: Sequence[Path], from_s: float, to_s: float, out: Path) -> Edited:
-    """Cut out `from_s` to `to_s`, s after the recording's first tick, as a log that can be
-    replayed.
+    """Write `from_s` to `to_s` (s after the recording's first tick) as a log that can be replayed.
 
-    It begins with the last state before `from_s` that the log holds (every 10 s), so that a replay
-    goes on from there; with the recording itself where `from_s` is before its first state.
+    The part begins with the last stored state before `from_s` (one each 10 s), from which a replay
+    continues, or with the recording's begin if `from_s` is before its first state.
     """
     recording = Log(paths)
     first_ns = _first_tick_ns(recording)
@@ -76,7 +74,7 @@ def _first_tick_ns(recording: Log) -> int:
 
 
 def _head(recording: Log, t_log_ns: int) -> LogMessage:
-    """A start on the way: what was known of the host's clocks there."""
+    """Metadata of a start in the middle of a drive: the state of the host's clocks."""
     t_ns = t_log_ns - recording.about.epoch_ns
     ahead = [recording.about.epoch_ns, 0, 0]
     unslewed_ns = ahead[0]
@@ -113,7 +111,7 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
 def write_log(
     out: Path, about: Described, more: dict[str, str], messages: Iterable[LogMessage]
 ) -> int:
-    """Write messages as a new log with `more` in its metadata; their number."""
+    """Write messages as a new log with `more` in its metadata and return their number."""
     attachments = tuple(
         Attachment(name, _TYPES.get(Path(name).suffix, "text/plain"), data)
         for name, data in about.attachments.items()

@@ -56,7 +56,7 @@ class _Inputs:
         self._bytes = [0] * len(self._counts)
         self._ahead_ns: int | None = None
         self._unslewed_ns: int | None = None
-        """The system clock less CLOCK_MONOTONIC, which is slewed with it, at the last look."""
+        """System clock minus CLOCK_MONOTONIC at the last reading; both are slewed alike."""
         self._tick_ns: int | None = None
         self.from_start = False
         self.first_ns: int | None = None
@@ -96,7 +96,7 @@ class _Inputs:
             self.steps.append({"t_utc": self.utc(t_ns), "step_s": round(step_s, 6)})
 
     def _look_at_slews(self, unslewed_ns: int) -> None:
-        """A reading of CLOCK_MONOTONIC follows one that leapt: to tell a step from a slew."""
+        """Tell a step from a slew by the reading of CLOCK_MONOTONIC after a jump."""
         before, self._unslewed_ns = self._unslewed_ns, unslewed_ns
         if before is None or not self.steps:
             return

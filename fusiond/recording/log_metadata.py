@@ -61,7 +61,7 @@ def processor() -> str:
 
 
 def dbc_name(source: str) -> str:
-    """The attachment that holds the DBC file of a source."""
+    """Name of the attachment that holds a source's DBC file."""
     return f"dbc/{source}.dbc"
 
 

@@ -1,4 +1,4 @@
-"""A thread that writes logs: no tick ever waits for a disk.
+"""Thread that writes logs, so that no tick waits for a disk.
 
 Messages go into a bounded queue; when a slow disk fills it, messages are lost and counted, and
 their sequence shows the gap. Twice a second the thread writes the queue, closes the chunk and
@@ -30,9 +30,10 @@ from fusiond.recording.mcap_writer import SUFFIX, About, LogFile
 log = logging.getLogger("fusiond")
 
 WRITE_S = 0.5
-"""Between two writes with sync: with the disk's own time still below the 2 s that may be lost."""
+"""Interval (s) of writes with sync: with the disk's delay still below the 2 s that may be lost."""
 QUEUE = 20_000
-"""Messages that may wait: over a minute of 200 a second, 15 MB; a disk that hangs longer loses."""
+"""Most waiting messages: over a minute at 200 a second, 15 MB; a longer stall of the disk loses
+messages."""
 KEEP_EVERY_NS = 10 * SECOND_NS
 """Interval of the check for surplus logs: at most 10 MB are written in it."""
 MB = 1_000_000
@@ -41,7 +42,7 @@ _INNOVATION = TypeAdapter(InnovationMessage)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A message for a channel, at `t_log_ns`. Models are worded by the thread."""
+    """Message for a channel, at `t_log_ns`. The thread encodes models as JSON."""
 
     topic: str
     t_log_ns: int
@@ -84,7 +85,7 @@ class LogWriter:
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Hand a message over; it is counted and lost when too many wait."""
+        """Queue a message; beyond the limit of the queue it is counted as lost."""
         if len(self._queue) >= QUEUE:
             self.dropped += 1
             return
@@ -160,7 +161,7 @@ class LogWriter:
         return size > o.split_mb * MB or age_min > o.split_min
 
     def _look_at_the_disk(self) -> None:
-        """Stop while there is room for the index. Raises `_DiskFullError`."""
+        """Stop recording while the disk still has room for the index. Raises `_DiskFullError`."""
         free_mb, least_mb = _free_mb(self._folder), self._options.min_free_mb
         self.free_mb = free_mb
         if free_mb < least_mb:
@@ -196,7 +197,8 @@ class _DiskFullError(Exception):
 
 
 def _worded(item: Item) -> list[tuple[str, bytes]]:
-    """The messages of an item, as topic and bytes: some have one for other tools beside them."""
+    """Messages of an item as topic and bytes: its own, and one for other tools where there is
+    one."""
     payload = item.payload
     match payload:
         case bytes():
@@ -212,13 +214,13 @@ def _worded(item: Item) -> list[tuple[str, bytes]]:
 
 
 def log_stem(vehicle: str, utc_ns: int, run: str) -> str:
-    """Name of a recording without part and suffix: vehicle, when it began, a number of its own."""
+    """Name of a recording without part and suffix: vehicle, time of its begin, unique number."""
     return f"{vehicle}_{datetime.fromtimestamp(utc_ns / SECOND_NS, UTC):%Y%m%dT%H%M%SZ}_{run[:8]}"
 
 
 def logs_of(folder: Path, vehicle: str) -> list[Path]:
-    """The logs of one vehicle in a folder: those alone are ever counted and removed, and no link
-    or folder of such a name, which is none that was written here."""
+    """Logs of one vehicle in a folder: only these are counted and removed. Links and folders of
+    such a name are left out, since this program writes none."""
     named = re.compile(rf"{re.escape(vehicle)}_\d{{8}}T\d{{6}}Z_[0-9a-f]{{8}}_\d{{4}}{SUFFIX}")
     return [
         path

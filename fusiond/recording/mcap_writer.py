@@ -1,7 +1,7 @@
-"""Writer of one MCAP file: its description first, then messages in chunks.
+"""Writer of one MCAP file: first the description of the log, then messages in chunks.
 
 Every file carries configuration, DBC files, version and host, so that it can be read alone. Synced
-data survive a power cut; only an open chunk is lost.
+data survive a power cut, which loses an open chunk alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Metadata of a log. `metadata` is told in docs/recording.md."""
+    """Description of a log; docs/recording.md lists `metadata`."""
 
     metadata: Mapping[str, str]
     attachments: tuple[Attachment, ...] = ()
@@ -45,7 +45,7 @@ class About:
 
 
 class LogFile:
-    """A file that is being written. OSError passes, from every method."""
+    """MCAP file while it is written. OSError passes, from every method."""
 
     def __init__(self, path: Path, about: About, t_log_ns: int) -> None:
         self.path = path
@@ -63,7 +63,7 @@ class LogFile:
 
     @property
     def size(self) -> int:
-        """Bytes written, those since the last sync before compression."""
+        """Bytes written; those since the last sync count before compression."""
         return self._synced + self._unflushed
 
     def write(self, channel: Channel, t_log_ns: int, data: bytes, sequence: int = 0) -> None:

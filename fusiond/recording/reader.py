@@ -1,8 +1,8 @@
-"""Reading logs: whole, cut off, damaged, and several parts of one recording as one.
+"""Reader of logs: whole, truncated or damaged ones, and the parts of a recording as one log.
 
 A file is read from its beginning and needs no index: after a power cut it is readable up to its
-last whole chunk. Damaged chunks are skipped, as are those that decompress to more than ours can: 57
-kB of such a file became 3.3 GB. `problems` lists the defects.
+last whole chunk. Damaged chunks are skipped, and so are chunks that would decompress to more than
+the recorder's can (57 kB of such a file became 3.3 GB). `problems` lists the defects.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ chunks."""
 WINDOW_LIMIT = 1 << 23
 """Largest window of a zstd decompressor (RFC 8878, section 3.1.1.1.2)."""
 LATEST_NS = 253_402_300_800 * 1_000_000_000
-"""The end of 9999, POSIX: what is told of a log has four digits for a year."""
+"""POSIX time (ns) of the end of 9999: reports on a log have four digits for a year."""
 MOST_PROBLEMS = 100
-"""Most problems listed for a log; damage can cause one for each byte."""
+"""Most problems listed for a log; a damaged log can have one for each byte."""
 _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, RuntimeError)
 
 
@@ -66,7 +66,7 @@ class LogMessage(NamedTuple):
     sequence: int
 
     def json(self) -> Any:
-        """Message, of a channel other than the input. Raises ValueError."""
+        """Decoded message of a channel other than the input. Raises ValueError."""
         try:
             return json.loads(self.data)
         except RecursionError:
@@ -93,8 +93,8 @@ class About:
 
 
 class Log:
-    """A recording in one or several files, in order. Raises `LogError`, and OSError for what cannot
-    be read.
+    """Recording in one or several files, in order. Raises `LogError`, and OSError for an unreadable
+    file.
 
     `problems` fills while messages are read: the defects of the files, each sentence once.
     """
@@ -122,8 +122,8 @@ class Log:
             yield from _messages(path, wanted, self._problem)
 
     def records(self) -> Iterator[Record]:
-        """The input, record by record; a gap in it ends up in `problems`, and so does a record that
-        none of this log's is, which is left out."""
+        """Records of the input. A gap is listed in `problems`, and so is a record that cannot
+        belong to this log, which is left out."""
         last, sources = 0, len(self.about.sources)
         first_ns, end_ns = -self.about.epoch_ns, LATEST_NS - self.about.epoch_ns
         for message in self.messages(INPUT):
@@ -206,8 +206,8 @@ def _opened(
 ) -> Iterator[LogMessage]:
     """Messages of a decompressed chunk whose channel has a topic; `name` receives its channels.
 
-    A chunk is read by its bytes: an object of each message, of which most are of no interest, costs
-    more than all else of reading a log. Raises one of `_DAMAGED`.
+    The bytes of a chunk are read directly: an object for each message, most of them unwanted, would
+    cost more than the rest of reading a log. Raises one of `_DAMAGED`.
     """
     length = len(data)
     at = 0
@@ -231,8 +231,7 @@ def _opened(
 def _decompressed(chunk: Chunk) -> bytes:
     """Decompressed bytes of a chunk, checked against the stated length. Raises one of `_DAMAGED`.
 
-    Neither that number nor what a frame says of itself is believed before it is looked at: no more
-    is decompressed than a chunk may have.
+    Decompression stops at the limit of a chunk, whatever length the record and the frame state.
     """
     said = chunk.uncompressed_size
     most = min(CHUNK_LIMIT, RATIO_FREE + RATIO_LIMIT * len(chunk.data))
@@ -258,7 +257,7 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 class _Bounded:
-    """File whose reads are limited to a record's size, since mcap trusts lengths inside a
+    """File whose reads are limited to a record's size: the package mcap trusts lengths inside a
     record."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -278,7 +277,7 @@ class _Unindexed(StreamReader):
 
 
 def _records(path: Path, problem: Callable[[str], None]) -> Iterator[McapRecord]:
-    """Records up to the summary, chunks unopened; what is cut off goes to `problem`."""
+    """Records up to the summary, with unopened chunks; `problem` receives a truncation."""
     with path.open("rb") as file:
         bounded = cast(IO[bytes], _Bounded(file))
         records = _Unindexed(bounded, emit_chunks=True, record_size_limit=RECORD_LIMIT).records

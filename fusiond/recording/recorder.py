@@ -1,8 +1,8 @@
 """Daemon side of a recording: every input is written in the order of handling.
 
-A record begins when its input is about to be handled, and is complete when the next begins: the
-readings of the host's clocks in between are its own. A tick closes a message, so that the log grows
-by one message of inputs a tick and a few derived ones, at whatever rate the devices send.
+A record begins before its input is handled and is complete when the next one begins: it owns the
+readings of the host's clocks in between. A tick closes a message. So the log grows by one message
+of inputs and a few derived ones a tick, at any rate of the devices.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ from fusiond.recording.retry import Retry
 MESSAGE_BYTES = 64 * 1024
 """Size at which inputs without a tick form a message of their own."""
 STATE_EVERY_NS = 10 * SECOND_NS
-"""Largest early begin of a cut; a state has 6 kB."""
+"""Interval of stored states, by which a cut may begin early; a state has 6 kB."""
 
 
 class RecordingRefusedError(Exception):
-    """The recording cannot be started or stopped now: the text says why."""
+    """Error: the recording cannot be started or stopped now; the text has the reason."""
 
 
 class Recorder:
-    """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
+    """Recorder of one daemon, as an output (`fusiond.outputs.base`) with commands of its own.
 
     `on_event(code, text)` receives `recording_started`, `recording_stopped` and `recording_failed`;
     a failed recording resumes by itself (`fusiond.recording.retry`). `begin` and `end` may be
@@ -115,7 +115,7 @@ class Recorder:
             self.state = "waiting"
 
     def begin(self, restored: Mapping[str, Any] | None = None) -> str:
-        """Start recording; the file's name. Raises `RecordingRefusedError`.
+        """Start recording and return the file's name. Raises `RecordingRefusedError`.
 
         `restored` is None for a recording that starts during a run.
         """
@@ -164,7 +164,8 @@ class Recorder:
         return path.name
 
     def close(self) -> None:
-        """The daemon ends: returns when everything is on the disk. Call it from a thread."""
+        """Finish at the daemon's end and return when everything is on the disk. Call it from a
+        thread."""
         self._again.give_up()
         if self._writer is not None:
             self.end("the daemon ends")
@@ -208,8 +209,8 @@ class Recorder:
         return DriverStatus("failed" if self.state == "failed" else "running", detail)
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """A message of a topic goes into the log; an event of `recording.events` starts it where
-        that is wanted. `innovations` does not: the log has each of them by itself."""
+        """Write a topic's message to the log; an event of `recording.events` starts a recording if
+        configured. `innovations` is left out: the log has each innovation by itself."""
         t_ns = self._clock.now_ns()
         if self.active and topic is not INNOVATIONS:
             self._put(Item(f"/{topic.name}", t_ns + self._epoch_ns, message))
@@ -226,7 +227,7 @@ class Recorder:
     # ------------------------------------------------------------------ what happens
 
     def command(self, t_ns: int, name: str, command: BaseModel) -> None:
-        """An operator's command is about to be carried out."""
+        """Begin the record of an operator's command, before its execution."""
         if self.active:
             text = json.dumps({"name": name, **command.model_dump(mode="json")})
             self._begin(Record(Kind.COMMAND, NO_SOURCE, t_ns, text.encode()))
@@ -239,7 +240,7 @@ class Recorder:
             self._begin(Record(Kind.TICK, NO_SOURCE, t_ns, b""))
 
     def tick_ended(self, t_ns: int, delay_ns: int, overruns: int, digest: bytes) -> None:
-        """And has ended; what follows until the next input is still its own."""
+        """End the tick; clock readings until the next input still belong to its record."""
         if self._writer is not None and self._writer.stopped is not None:
             self.end(self._writer.stopped)
         if self._started is None or self._started.kind is not Kind.TICK:
@@ -256,13 +257,14 @@ class Recorder:
             self._put(Item(INNOVATION, t_log_ns, innovation(entry, entry.outcome)))
 
     def state_due(self, t_ns: int) -> bool:
-        """True if `keep_state` should be called: now and then, and first of all in each file."""
+        """True if `keep_state` is due: at the begin of each file, then at intervals."""
         old = self._state_ns is None or t_ns - self._state_ns >= STATE_EVERY_NS
         parts = 0 if self._writer is None else self._writer.parts
         return self.active and (old or parts != self._state_part)
 
     def keep_state(self, t_ns: int, kept: bytes) -> None:
-        """Keep a navigation state in the warm start's format (JSON): where a cut log can begin."""
+        """Store a navigation state in the warm start's format (JSON), at which a cut log can
+        begin."""
         self._state_ns = t_ns
         self._state_part = 0 if self._writer is None else self._writer.parts
         self._put(Item(STATE, t_ns + self._epoch_ns, kept))
@@ -340,7 +342,8 @@ class Recorder:
     def record_input(
         self, source: int, kind: str, t_ns: int, payload: bytes | str | CanFrame | None
     ) -> None:
-        """A driver is about to handle an input, or has sent something."""
+        """Begin the record of a driver's input, before it is handled; bytes that a driver sends
+        form a record after it."""
         record = input_record(source, kind, t_ns, payload)
         if record.kind is Kind.SENT:
             self._after.append(record)

@@ -1,4 +1,4 @@
-"""Input records, as bytes: the records of the channel `/fusiond/input`.
+"""Encoding of input records, the contents of the channel `/fusiond/input`.
 
     record  = kind u8 | source u8 | readings u16 | length u32 | t_ns i64 | payload | reading ...
     reading = clock u8 | t_ns i64 | ahead_ns i64
@@ -93,7 +93,7 @@ class Tick(NamedTuple):
 
 
 class DamagedRecordError(ValueError):
-    """Bytes that are no records."""
+    """Error: bytes that are not records."""
 
 
 def reading(clock: ReadClock, t_ns: int, ahead_ns: int) -> Reading:
@@ -101,7 +101,7 @@ def reading(clock: ReadClock, t_ns: int, ahead_ns: int) -> Reading:
 
 
 def pack(record: Record) -> bytes:
-    """A record's bytes."""
+    """Encode a record."""
     readings = record.readings[:_MOST_READINGS]
     head = _HEAD.pack(record.kind, record.source, len(readings), len(record.payload), record.t_ns)
     if not readings:
@@ -110,7 +110,7 @@ def pack(record: Record) -> bytes:
 
 
 def unpack(data: bytes) -> Iterator[Record]:
-    """The records of a message. Raises `DamagedRecordError`."""
+    """Decode the records of a message. Raises `DamagedRecordError`."""
     at, end = 0, len(data)
     try:
         while at < end:

@@ -1,7 +1,7 @@
-"""A recording that failed is tried again: at first soon, then once a minute, until it writes.
+"""Retries of a failed recording: at first soon, then once a minute, until the disk accepts it.
 
-An attempt is an empty log; once it is on the disk, recording resumes in it. Input meanwhile is not
-kept, since it might not fit.
+An attempt is an empty log; once it is on the disk, recording resumes in it. Input in between is
+lost.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LONGEST_S = 60.0
 
 
 class Retry:
-    """The attempts of one recorder; time is the tick's."""
+    """Attempts of one recorder, timed by ticks."""
 
     def __init__(self) -> None:
         self._backoff = Backoff(FIRST_S, LONGEST_S)
@@ -28,7 +28,7 @@ class Retry:
         self._attempt: LogWriter | None = None
 
     def ready(self, t_ns: int, open_log: Callable[[], LogWriter]) -> LogWriter | None:
-        """Log on a writable disk, once there is one; called every tick until then."""
+        """Log on a writable disk, or None until there is one; to be called every tick."""
         if self._due_ns is None:
             self._wait(t_ns)
         elif self._attempt is None and t_ns >= self._due_ns:

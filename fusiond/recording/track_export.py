@@ -1,4 +1,4 @@
-"""A log's track for other programs: GPX 1.1, KML 2.2, GeoJSON (RFC 7946).
+"""Export of a log's track: GPX 1.1, KML 2.2, GeoJSON (RFC 7946).
 
 From `/location`'s own source, `/nav`: points that are navigated, ten a second or what
 `mqtt.nav_rate_hz` was, thinned to `interval_s`. Heights are above the ellipsoid; GPX and KML expect
@@ -17,7 +17,7 @@ from fusiond.recording.reader import Log
 
 _NAVIGATED = ("navigating", "coasting")
 _ANTIMERIDIAN = "180.000000000"
-"""No longitude of GPX 1.1 (longitudeType: below 180)."""
+"""Longitude that GPX 1.1 excludes (longitudeType: below 180)."""
 _HEIGHTS = "heights above the ellipsoid WGS 84"
 
 
@@ -58,7 +58,8 @@ def track(recording: Log, interval_s: float) -> Iterator[Point]:
 
 
 def export(recording: Log, out: Path, kind: str, interval_s: float) -> int:
-    """Write the track as `gpx`, `kml` or `geojson`; the number of points. OSError passes."""
+    """Write the track as `gpx`, `kml` or `geojson` and return the number of points. OSError
+    passes."""
     points = list(track(recording, interval_s))
     with out.open("w", encoding="utf-8") as file:
         WRITERS[kind](file, recording.about.metadata["vehicle"], points)

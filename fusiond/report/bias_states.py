@@ -1,4 +1,4 @@
-"""Biases of the inertial unit with sigma, from the filter's states that a log holds each 30 s."""
+"""Biases of the inertial unit with sigma, from the filter's states in a log (one each 30 s)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _NUMBERS = TypeAdapter(tuple[float, ...])
 
 
 class Biases:
-    """Biases from `/fusiond/state`. An axis' bias is the sum of the model's terms for it: turn-on,
-    Markov. Blocks of measurements follow in the state."""
+    """Biases from `/fusiond/state`. The bias of an axis is the sum of the model's terms (turn-on,
+    Markov). Blocks of measurements follow in the state."""
 
     def __init__(self, config: bytes | None) -> None:
         self._slots = _bias_slots(config)

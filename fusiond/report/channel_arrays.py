@@ -1,4 +1,4 @@
-"""Channels of a log, as arrays. Values that are no numbers become NaN."""
+"""Channels of a log as arrays. A value that is not a number becomes NaN."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from fusiond.report.run import Estimated, Fault, Innovations, Sky, Verdicts
 
 
 def number(value: object) -> float:
-    """A JSON value as a float; NaN for null and for what is no number."""
+    """Convert a JSON value to a float; NaN for null and for a value that is not a number."""
     return float(value) if isinstance(value, int | float) and isfinite(value) else nan
 
 
 def _objects(said: dict[str, Any], key: str) -> dict[str, dict[str, Any]]:
-    """The objects in the object `key`."""
+    """Values of the object `key` that are objects."""
     found = said.get(key)
     if not isinstance(found, dict):
         return {}
@@ -55,8 +55,8 @@ class _Ended(NamedTuple):
 
 
 class InnovationLists:
-    """Rows of `/innovation`. A delayed measurement rewinds the filter, and later measurements come
-    again: the last outcome counts, with the first time of arrival."""
+    """Rows of `/innovation`. A delayed measurement rewinds the filter, which repeats later
+    measurements: the last outcome counts, with the first time of arrival."""
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns
@@ -201,7 +201,7 @@ class Healths:
 
 
 class FaultLists:
-    """`faults` of `/status`: each from the first message that tells it to the last in a row."""
+    """Faults from `/status`: each lasts from its first message to the last one in a row."""
 
     def __init__(self) -> None:
         self.found: list[Fault] = []

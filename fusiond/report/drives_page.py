@@ -1,7 +1,7 @@
-"""Many drives as one page: rows of `fusiond batch` or of `fusiond study --out`.
+"""Page of many drives: rows of `fusiond batch` or of `fusiond study --out`.
 
-Rows that differ in configuration, version or part of a study are groups, which stand beside each
-other in every plot: what a change did to the whole of a fleet is seen there.
+Rows of one configuration, version and part of a study form a group. Every plot shows the groups
+side by side, and so the effect of a change on a fleet.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Group(NamedTuple):
 
 
 def report_drives(path: Path, out: Path) -> int:
-    """Write the page `out`; how many drives are on it. Raises `TableError`,
+    """Write the page `out` and return its number of drives. Raises `TableError`,
     `MissingPackageError`, OSError."""
     rows = read_rows(path, without=("result",))
     if not rows:

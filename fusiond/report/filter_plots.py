@@ -1,4 +1,4 @@
-"""Plots of innovations, verdicts, delays and satellites: agreement of inputs and filter."""
+"""Plots of the filter's agreement with its inputs: innovations, verdicts, delays, satellites."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _raw(source: str, found: Innovations) -> list[tuple[str, Item]]:
 
 
 def _by_row(values: Floats, fused: np.ndarray[Any, Any], names: Sequence[str]) -> list[Series]:
-    """Accepted and rejected measurements, in the same colour."""
+    """Series of accepted and rejected measurements in one colour."""
     series: list[Series] = []
     for k, name in enumerate(names):
         series.append(Series(name, np.where(fused, values[:, k], np.nan), "points"))

@@ -1,4 +1,4 @@
-"""The inertial unit before the filter, and the computer."""
+"""Sections on the inertial unit's samples and on the computer."""
 
 from __future__ import annotations
 

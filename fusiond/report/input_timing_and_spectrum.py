@@ -1,8 +1,7 @@
-"""Look at a log's input, host and inertial unit: lateness of ticks, regularity of the samples,
-their spectrum.
+"""Statistics of a log's input: lateness of ticks, regularity and spectrum of inertial samples.
 
-The samples are decoded by the driver that decoded them live: those of the first minute, and of ten
-seconds in each minute after it.
+The driver that decoded the samples live decodes them again: the first minute, then ten seconds of
+each minute.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ class InputStatistics:
         return (table[:, 0] + self._epoch_ns) / SECOND_NS, table[:, 1] / MILLISECOND_NS
 
     def imu(self) -> ImuStatistics | None:
-        """The source with the most inertial samples; None where there is none."""
+        """Source with the most inertial samples; None without any."""
         return self._units.look(self._epoch_ns)
 
 

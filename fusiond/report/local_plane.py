@@ -1,4 +1,4 @@
-"""Latitude and longitude as metres on a plane, for pictures."""
+"""Projection of latitude and longitude to metres on a plane, for plots."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def origin_of(table: TrajectoryTable) -> Origin | None:
 
 
 def metres_from(origin: Origin, table: TrajectoryTable) -> Floats:
-    """(n, 3): north, east along the parallel of each point, and up. A map of tens of kilometres: at
-    100 km the plane is off by the 800 m that the earth's surface curves away below it, not along
-    it."""
+    """North, east along the parallel of each point, and up (n, 3), in m. For maps of tens of
+    kilometres: at 100 km the surface lies 800 m below the plane, and distances along it stay
+    right."""
     lat, lon, height = origin
     turn = (table.lon_rad - lon + np.pi) % (2.0 * np.pi) - np.pi
     north = (table.lat_rad - lat) * (meridian_radius(lat) + height)

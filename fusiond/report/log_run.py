@@ -1,4 +1,4 @@
-"""A run from a log: what its channels say, and what its input shows of the devices and the host."""
+"""Run from a log: data of its channels, and statistics of its input."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ _MOST_NAMED = 5
 
 
 class _TappedLog(Log):
-    """A log that is read by somebody else: each message and record is heard on the way."""
+    """Log whose messages and records are also passed to a listener while another reader reads
+    it."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         super().__init__(paths)

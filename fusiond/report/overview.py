@@ -17,7 +17,7 @@ from fusiond.report.run import Run
 MODES = tuple(str(mode) for mode in Mode)
 SERVICES = tuple(str(state) for state in Service)
 MARKED_FROM = 0.05
-"""Share of refusals that catches the eye: a gate alone refuses 1e-4 by its default."""
+"""Share of rejections that is marked: a gate rejects 1e-4 by its default."""
 _NO_FAULT = frozenset(
     (
         *("start", "no_alignment", "no_imu", "moving", "turning", "turns_at_rest"),
@@ -73,8 +73,8 @@ def track(run: Run, truth: TrajectoryTable | None) -> Section:
 
 
 def _distance(solution: TrajectoryTable) -> str:
-    """Distance by the integrated speed over ground; positions of a vehicle at rest wander, its
-    speed does not."""
+    """Distance by integrated speed over ground: positions of a vehicle at rest drift, its speed
+    stays zero."""
     speed = np.hypot(solution.v[:, 0], solution.v[:, 1])
     known = np.isfinite(speed)
     if known.sum() < 2:

@@ -1,4 +1,4 @@
-"""The page: everything in one file, which asks nothing of a network.
+"""HTML page of a report: one file, which fetches nothing.
 
 uPlot 1.6.32 (MIT, `assets/uplot/LICENSE`) is included unchanged. A policy in the page forbids the
 browser to fetch anything, and content of files is only shown as text.

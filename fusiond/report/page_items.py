@@ -1,5 +1,5 @@
-"""Items of a page: plots, tables, the track, sentences. `as_json(zero_s)` is what the page reads,
-with times counted from there."""
+"""Items of a page: plots, tables, track, sentences. The page reads `as_json(zero_s)`, with times
+counted from `zero_s`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves over one abscissa (n,): time in s of the page's axis, or what `x_label` says.
+    """Curves over one abscissa (n,): time (s) on the page's axis, or the quantity of `x_label`.
 
-    `good`: one sentence on what it looks like when all is well. `levels` are horizontal lines.
+    `good`: one sentence on the look of a good plot. `levels` are horizontal lines.
     """
 
     title: str
@@ -88,8 +88,8 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Rows of texts and numbers that a reader sorts and searches; the first cell leads to `links`
-    where there is one. There may be a hundred thousand."""
+    """Table that a reader sorts and searches, of up to a hundred thousand rows; `links` are the
+    targets of the first cells."""
 
     title: str
     head: Sequence[str]
@@ -113,7 +113,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """The way from above: metres north and east of its beginning, (n,) each.
+    """Track seen from above: metres north and east of its beginning, (n,) each.
 
     `mode` are indices into the modes' names, `sigma` the horizontal one (m), `sd_n` and `sd_e` its
     parts. `truth` (m, 2) is north and east of another track, if there is one.

@@ -1,4 +1,4 @@
-"""Series in the page's format: no more points than it can show, four bytes each."""
+"""Series in the page's format: thinned to the points that it can show, four bytes each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fusiond report`: one or two runs, a truth, a page."""
+"""`fusiond report`: page of one or two runs, with errors against a truth."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from fusiond.report.solution_run import run_from_solution
 def report(
     paths: Sequence[Path], out: Path, truth: Path | None = None, beside: Sequence[Path] = ()
 ) -> list[Run]:
-    """Write the page `out`; the runs that are in it. `paths` and `beside`: the files of a log, or
-    one solution file. Raises `LogError`, `TableError`, OSError."""
+    """Write the page `out` and return its runs. `paths` and `beside`: the files of a log, or one
+    solution file. Raises `LogError`, `TableError`, OSError."""
     runs = [_read(paths), *([_read(beside)] if beside else [])]
     table = None if truth is None else read_truth(truth)
     title = " and ".join(run.name for run in runs)

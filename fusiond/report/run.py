@@ -119,8 +119,7 @@ class ImuStatistics:
 
 @dataclass(slots=True)
 class Fault:
-    """Fault that the daemon identified: its begin, its last report, and its last size on the
-    largest axis."""
+    """Fault that the daemon identified: begin, last report, and last size on the largest axis."""
 
     source: str
     kind: str
@@ -136,7 +135,7 @@ class Fault:
 
 @dataclass(slots=True)
 class LogParts:
-    """Data of a log beyond the solution; empty where it does not."""
+    """Data of a log beyond the solution; a part that the log lacks is empty."""
 
     outcomes: dict[str, dict[str, int]] = field(default_factory=dict)
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -157,8 +156,8 @@ class LogParts:
 
 @dataclass(slots=True)
 class Run:
-    """A run. `t_s` of the solution is the axis of everything; `posix` says whether it is seconds of
-    POSIX time. `truth_offset_s` is what a truth's times are ahead of it."""
+    """A run. `t_s` of the solution is the axis of everything; `posix` is True for POSIX seconds.
+    `truth_offset_s` is the lead of a truth's times over this axis."""
 
     name: str
     solution: TrajectoryTable
@@ -172,7 +171,7 @@ class Run:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """First and last instant of the solution, or of the events without a solution."""
+        """First and last instant of the solution, or of the events in a run without one."""
         times = self.solution.t_s if len(self.solution.t_s) else [e.t_s for e in self.events]
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 

@@ -18,7 +18,7 @@ _AIDING: TypeAdapter[AnyAiding] = TypeAdapter(AnyAiding)
 
 
 def changed_settings(config: bytes | None) -> list[Difference] | None:
-    """The values that are not the default, dotted, in the file's order; None where the log holds no
+    """Values other than the defaults, by dotted key, in the file's order; None for a log without a
     configuration. An inertial unit's defaults are those of its `sensor_class`."""
     try:
         data = json.loads(config or b"")
@@ -59,7 +59,7 @@ def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _aiding(section: object) -> dict[str, Any]:
-    """Defaults of a measurement's kind; the kind itself is always told."""
+    """Defaults of a section of `aiding`; its kind is always shown."""
     kind = section.get("kind") if isinstance(section, dict) else None
     try:
         default = _AIDING.validate_python({"kind": kind}).model_dump(mode="json")

@@ -1,4 +1,4 @@
-"""A run from a solution file: position, velocity, attitude, sigma, mode; nothing else is in it."""
+"""Run from a solution file, which holds position, velocity, attitude, sigma and mode."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from fusiond.files.measurement_csv import read_solution
 from fusiond.report.run import Problem, Run
 
 POSIX_FROM_S = 1e9
-"""Least POSIX time (s), in 2001; smaller values are a second of the week or a time since start."""
+"""Least POSIX time (s), in 2001; a smaller value is a second of the week or a time since start."""
 _GAP_S = 1.0
 
 
 def run_from_solution(path: Path) -> Run:
-    """Raises `TableError`."""
+    """Read a run from a solution file. Raises `TableError`."""
     table = read_solution(path)
     posix = bool(len(table.t_s)) and float(table.t_s[0]) > POSIX_FROM_S
     run = Run(path.name, table, posix)

@@ -1,4 +1,4 @@
-"""Plots of position, velocity and attitude with sigma, errors against a truth, biases and
+"""Plots of states with sigma: position, velocity, attitude, errors against a truth, biases,
 calibration."""
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _plot(
     good: str,
     log: bool = False,
 ) -> tuple[str, Item]:
-    """The columns that are known at all."""
+    """Plot of the columns with any known value."""
     series = [
         Series(name, column)
         for name, column in zip(names, columns.T, strict=True)
