@@ -42,8 +42,8 @@ _VERDICTS: dict[str, str] = {
 
 
 def advice(status: Said, health: Said) -> list[Advice]:
-    """Steps to take, the most urgent first; nothing where all is well. Counters are those of the
-    last minute."""
+    """Steps to take, the most urgent first; none if all is well. Counters are of the last
+    minute."""
     found = [*_of_status(status), *_of_sources(health), *_of_the_host(status, health)]
     found.sort(key=lambda each: _ORDER[each.level])
     return list(dict.fromkeys(found))

@@ -1,4 +1,4 @@
-"""The link to an MQTT broker: listens to every vehicle, comes back by itself, sends commands."""
+"""Link of the dashboard to an MQTT broker: receives all vehicles, reconnects, sends commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fusiond.outputs.oversized_packets import SOCKET_OPTIONS, limit
 
 BASE = "fusiond"
 RETRY_S = 1.0
-"""Between attempts: a person is waiting, and the broker is on this computer or near."""
+"""Interval of attempts: a person is waiting, and the broker is on this computer or near."""
 KEEPALIVE_S = 5
 """MQTT keepalive; a silent broker is noticed after one and a half of it."""
 MOST_WAITING = 1000
@@ -38,8 +38,8 @@ class Access:
 
 
 class Broker:
-    """Feeds a hub from a broker. `send_command` queues a command; more than
-    `COMMANDS_WAITING` that could not be sent yet are forgotten."""
+    """Source of a hub: messages of a broker. `send_command` queues a command; beyond
+    `COMMANDS_WAITING` waiting ones are dropped."""
 
     def __init__(self, access: Access, hub: Hub) -> None:
         self._access = access
@@ -54,7 +54,7 @@ class Broker:
         self._commands.put_nowait((f"{BASE}/{vehicle}/cmd/{name}", payload))
 
     async def listen(self) -> None:
-        """Listen until cancelled."""
+        """Receive messages until cancelled."""
         while True:
             try:
                 async with self._client() as client:

@@ -1,7 +1,7 @@
 """WebSocket connection of one browser: at most ten frames a second, each with all changes.
 
-A frame that the browser does not read holds up this viewer alone; newer data replace older, so that
-the next frame is the newest.
+An unread frame delays this viewer alone; newer data replace older ones, so that the next frame is
+up to date.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fusiond.outputs.json_requests import NotUnderstoodError, parsed
 
 FRAME_S = 0.1
 BEAT_S = 1.0
-"""Longest time without a frame; after it a page knows that the connection is lost."""
+"""Longest time without a frame, after which a page reports a lost connection."""
 SEND_TIMEOUT_S = 20.0
 """Time after which a browser that accepts nothing is disconnected; it reconnects by itself."""
 MOST_VIEWERS = 16
@@ -32,7 +32,7 @@ COMMANDS = ("request_fix", "start_recording", "stop_recording", "reset_filter")
 
 
 class BrowserConnection:
-    """Server of one browser until it leaves."""
+    """Connection to one browser, until it leaves."""
 
     def __init__(self, hub: Hub, socket: WebSocket, token: str | None) -> None:
         self._hub = hub
@@ -43,7 +43,7 @@ class BrowserConnection:
         self._replies: list[dict[str, Any]] = []
 
     async def serve(self) -> None:
-        """Send and receive; returns when the browser has left or has been given up."""
+        """Send and receive, and return when the browser has left or has been given up."""
         tasks = [asyncio.create_task(self._send()), asyncio.create_task(self._receive())]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""Connections of the dashboard's web server: how many there may be, and what each may wait for.
+"""Limits of the dashboard's web server: number of connections, and deadlines of each.
 
 uvicorn waits indefinitely for a request, and for a browser to read its reply: a thousand slow
 clients would hold all descriptors of the process. A connection therefore has a deadline for its
@@ -27,7 +27,7 @@ LOOK_S = 0.5
 
 
 class BoundedConnection(H11Protocol):
-    """A connection that is looked after. Idle ones between two requests are uvicorn's to close."""
+    """Connection with deadlines. uvicorn closes idle connections between two requests."""
 
     _since_s = _moved_s = 0.0
     _held_bytes = 0

@@ -1,4 +1,4 @@
-"""Counters of the last minute, from counters since the daemon's start, so that an alarm ends with
+"""Counts of the last minute, from counters since the daemon's start. With them an alarm ends with
 its cause."""
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from typing import Any
 
 WINDOW_S = 60.0
-"""Length of the window; six ticks in a thousand at 100 Hz are more than an accident in it."""
+"""Length of the window (s): it has 6000 ticks at 100 Hz, so that six late ones in a thousand are no
+accident."""
 
 
 class CounterWindow:
-    """Counters `names` of one topic over the last minute. A counter that falls shows a restart of
-    the daemon."""
+    """Counts of `names`, counters of one topic, over the last minute. A decreasing counter shows a
+    restart of the daemon."""
 
     def __init__(self, *names: str) -> None:
         self._names = names

@@ -1,4 +1,4 @@
-"""Rows of history by column: numbers as eight bytes each, each text once.
+"""History as columns: a number takes eight bytes, each different text is stored once.
 
 A row of five figures takes 500 bytes as a list, including its share of texts, and 50 as columns.
 The rows of ten minutes are most of the dashboard's memory.
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class _Columns:
-    """Rows in slots: a new one at the end, another in the place of one that is there."""
+    """Rows in slots: a row is appended or replaces another."""
 
     def __init__(self, kinds: str) -> None:
         self._numbers = array("q")
@@ -86,7 +86,7 @@ class LatestRows(_Columns):
 
 
 class LatestRowsByKey(_Columns):
-    """The last `most` rows, of each key the last one."""
+    """The last row of each key, for the `most` latest keys."""
 
     def __init__(self, most: int, kinds: str) -> None:
         super().__init__(kinds)

@@ -1,15 +1,15 @@
 """Parser of messages by the published schemas of `fusiond schema`.
 
-`topics.json` holds the schemas of the topics that are shown, made of the daemon's own models by
-`python -m tools.topic_schemas`: the models themselves bring 250 MB of numerics along. A message is
-read field by field into a copy:
+`topics.json` holds the schemas of the topics that are shown. `python -m tools.topic_schemas` makes
+them from the daemon's models, whose import would load 250 MB of numerics. A message is read field
+by field into a copy:
 
     present    as the schema says, else the whole message is refused
     absent     left absent: a daemon of an earlier version does not say it
     unknown    left out: one of a later version says more
 
-Of the keywords of JSON Schema (draft 2020-12) those are known that pydantic writes for our models;
-another one is an error when the file is read, so that none is passed over.
+The parser knows the keywords of JSON Schema (draft 2020-12) that pydantic writes for these models;
+any other keyword is an error when the file is read.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from importlib.resources import files
 from typing import Any
 
 Read = Callable[[Any], Any]
-"""The part of a message that a schema describes, as a copy. Raises `RefusedError`."""
+"""Reader of a message: copies the part that a schema describes. Raises `RefusedError`."""
 
 _SHOWN = 40
-"""Letters of a name from a message that are repeated: ours have 29 at most."""
+"""Letters repeated of a name in a message: known names have 29 at most."""
 _TYPES: dict[str, tuple[type, ...]] = {
     "null": (type(None),),
     "boolean": (bool,),
@@ -54,7 +54,7 @@ class RefusedError(ValueError):
 
 @cache
 def topic_parsers() -> dict[str, Read]:
-    """The reader of each topic's messages."""
+    """Readers of messages by topic."""
     published = json.loads(files("fusiond.dashboard").joinpath("topics.json").read_bytes())
     shared: dict[str, Read] = {}
     shared |= {name: _later(shared, name) for name in published["$defs"]}
@@ -88,8 +88,8 @@ def _message(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
 
 
 def parser_of_schema(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
-    """Reader for a schema; `shared` are the readers of those it refers to. Raises ValueError for a
-    keyword that is not known."""
+    """Make the reader of a schema; `shared` has the readers of the schemas it refers to. Raises
+    ValueError for an unknown keyword."""
     unknown = schema.keys() - _WORDS
     if unknown:
         raise ValueError(f"keywords of JSON Schema that are not known here: {sorted(unknown)}")

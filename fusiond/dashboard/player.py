@@ -1,4 +1,4 @@
-"""Player of a log's messages, at their own pace or a multiple of it."""
+"""Player of a log's messages, in real time or faster."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TOPICS = (
 )
 SECOND = 1_000_000_000
 AT_ONCE = 64
-"""Messages in a row before the browsers get their turn, in a fast replay."""
+"""Messages played in a row, in a fast replay, before browsers are served."""
 
 
 class Player:
-    """A log as the source of a hub. Raises `LogError` and OSError for what cannot be read."""
+    """Source of a hub: messages of a log. Raises `LogError` and OSError for an unreadable file."""
 
     def __init__(self, paths: Sequence[Path], speed: float) -> None:
         self._log = Log(paths)
@@ -31,7 +31,7 @@ class Player:
         self._next_s = 0.0
 
     def now_s(self) -> float:
-        """Seconds of the log that have been played: never beyond the message that is next."""
+        """Seconds of the log played so far, at most up to the next message."""
         return min(self._elapsed_s, self._next_s)
 
     @property

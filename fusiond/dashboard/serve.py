@@ -1,4 +1,4 @@
-"""`fusiond dashboard`: the hub, its source and the web server in one event loop."""
+"""`fusiond dashboard`: hub, source and web server in one event loop."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from fusiond.files.install_extra import install_command
 PMTILES = b"PMTiles\x03"
 """Header of a file of version 3."""
 SEND_BUFFER = 128 * 1024
-"""Bytes that the kernel holds for a browser: some frames, not minutes of them."""
+"""Send buffer of a browser's socket (bytes): room for some frames, not for minutes of them."""
 
 
 Source = Callable[[], Coroutine[Any, Any, None]]
-"""Feeds a hub until cancelled."""
+"""Coroutine that feeds a hub until cancelled."""
 
 
 class DashboardError(Exception):
-    """The dashboard cannot start; the text says what to do."""
+    """Error: the dashboard cannot start; the text says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class PageAddress:
-    """Address of the server. `token`: whoever has it may send commands; None: nobody. `base_map`: a
-    PMTiles file to draw below the track."""
+    """Address of the server. `token` permits commands; None permits none. `base_map`: a PMTiles
+    file to draw below the track."""
 
     host: str = "127.0.0.1"
     port: int = 8770
@@ -54,7 +54,7 @@ def is_loopback(host: str) -> bool:
 
 
 def serve_broker(access: Access, page_address: PageAddress, report: Callable[[str], None]) -> None:
-    """Show the vehicles of a broker until a signal. `report` hears the page's address."""
+    """Show the vehicles of a broker until a signal. `report` receives the page's address."""
     hub = Hub(time.monotonic, f"{access.host}:{access.port}")
     broker = Broker(access, hub)
     if page_address.token is not None:
@@ -65,7 +65,7 @@ def serve_broker(access: Access, page_address: PageAddress, report: Callable[[st
 def serve_log(
     paths: Sequence[Path], speed: float, page_address: PageAddress, report: Callable[[str], None]
 ) -> None:
-    """Play a log. Raises `LogError` for what is none."""
+    """Show a log as it plays. Raises `LogError` for a file that is not a log."""
     from fusiond.dashboard.player import Player  # noqa: PLC0415 - 150 MB of numerics behind it
 
     player = Player(paths, speed)

@@ -1,7 +1,7 @@
-"""State of one vehicle: the latest of each topic, when it came, and ten minutes of history.
+"""State of one vehicle: latest message of each topic with its arrival, and ten minutes of history.
 
-Every stored item has a number of one growing count, by which viewers ask for newer items: a slow
-viewer gets the newest and never a queue of old ones.
+Every stored item has a number of one growing count. Viewers ask for items after a number: a slow
+viewer gets the newest ones and never a queue of old ones.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CARRIED = ("nav", "status", "health", "consistency", "calibration")
 
 @dataclass
 class LatestMessage:
-    """The last message of a topic. `at_s` is when it came, None where the broker had kept it."""
+    """Last message of a topic. `at_s` is its arrival, None for a retained message."""
 
     number: int
     at_s: float | None
@@ -70,7 +70,7 @@ class Vehicle:
         self._lately: dict[str, Said] = {}
 
     def receive(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
-        """A message of `topic`. `kept`: the broker had it, nobody knows here for how long."""
+        """Store a message of `topic`. `kept` marks a retained one, whose age is unknown."""
         if topic == "online":
             if said in ("online", "offline"):
                 self._put(topic, said, None if kept else at_s)
@@ -136,7 +136,7 @@ class Vehicle:
         self._latest[topic] = latest
 
     def _other(self, said: Said, at_s: float | None) -> None:
-        """Position of another vehicle: a message of its own for each card."""
+        """Store the position of another vehicle, which has a message for each card."""
         topic = f"fleet/{said.get('card')}"
         others = sum(name.startswith("fleet/") for name in self._latest)
         if topic in self._latest or others < MOST_CARDS:
@@ -173,7 +173,7 @@ class Vehicle:
                 self._put("advice", said_now, at_s)
 
     def _delays(self, said: Said, at_s: float | None) -> None:
-        """The delay of each fix that was asked for: who counts requests is a terminal."""
+        """Store the delay of each requested fix. A source that counts requests is a terminal."""
         for source, health in _mappings(said, "sources"):
             counters = health.get("counters")
             if not isinstance(counters, Mapping) or "requested" not in counters:
@@ -196,8 +196,8 @@ class Vehicle:
                 self._innovation(one, t_ms, at_s - (now_ms - t_ms) / 1000.0)
 
     def _innovation(self, said: Said, key: float | None, at_s: float) -> None:
-        """A rewind applies a measurement again: the last one counts, in its old place. `key` is the
-        instant of its validity."""
+        """Store an innovation. After a rewind it replaces the earlier one of its instant of
+        validity, `key`."""
         source, outcome = said.get("source"), said.get("outcome")
         if not (isinstance(source, str) and isinstance(outcome, str) and key is not None):
             return
@@ -215,7 +215,7 @@ NAV_COLUMNS = (
 
 
 def nav_row(said: Said, at_s: float) -> list[Any]:
-    """A row of history: arrival, the instant of validity, mode, then `NAV_COLUMNS`."""
+    """Row of history: arrival, instant of validity, mode, then `NAV_COLUMNS`."""
     mode = said.get("mode")
     head = [at_s, number(said, "t_ms"), mode if isinstance(mode, str) else None]
     return [*head, *(number(said, name) for name in NAV_COLUMNS)]

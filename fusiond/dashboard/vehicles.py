@@ -1,4 +1,4 @@
-"""Vehicles of a broker or a log, and the state of the link: the model behind all viewers."""
+"""Model shared by all viewers: vehicles of a broker or a log, and state of the link."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from fusiond.dashboard.message_parser import RefusedError, topic_parsers
 from fusiond.dashboard.vehicle import Vehicle
 
 LARGEST_BYTES = 65536
-"""`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
+"""Largest message: `health` of twenty sources with a full sky has some 20 kB."""
 MOST_VEHICLES = 32
 GIVES_WAY_S = 60.0
 """Age from which a silent vehicle gives way to a new one: a daemon sends its status every second.
-Retained messages of vehicles that no longer exist thus keep nobody out."""
+So retained messages of former vehicles take no room."""
 MOST_NAME = 64
 """Longest name of a vehicle, as in the configuration."""
 
 LARGEST_INTEGER = 2**63 - 1
-"""Nanoseconds of a recording's clock; what a browser is sent has closer bounds in its schema."""
+"""Largest integer: nanoseconds of a recording's clock. Schemas of topics have closer bounds."""
 MOST_REASON = 160
 """Letters of the reason that is shown: two lines of the page."""
 
@@ -44,8 +44,8 @@ class Hub:
     """Model of all vehicles, fed with payloads by topic. `now_s` is the clock of the display: the
     host's, or that of the played log, `speed` times as fast.
 
-    A message is used when it is what its topic carries by the published schemas, and refused as a
-    whole when it is not: the last that was shown stays, and grows old.
+    A message is used if it fits the published schema of its topic. Otherwise it is refused as a
+    whole: the previous message stays and ages.
 
     Counters: `received`, `other_topic` (none that is shown); refused `too_large`, `malformed`
     (no JSON), `not_as_published`, `too_many_vehicles`.
@@ -64,7 +64,7 @@ class Hub:
         """Send a command (vehicle, name, id); None where commands are not possible."""
 
     def linked(self, state: LinkState, text: str = "") -> None:
-        """The link has changed; the same state again keeps its beginning."""
+        """Set the state of the link; the same state again keeps its begin."""
         since_s = self.link.since_s if state == self.link.state else self.now_s()
         self.link = Link(state, text, since_s)
 
@@ -75,7 +75,7 @@ class Hub:
         return {"count": sum(kinds.values()), "kinds": kinds, "last": self._refused_last}
 
     def receive(self, vehicle: str, topic: str, payload: bytes, kept: bool = False) -> None:
-        """A message of `topic` below a vehicle's base; what cannot be used is counted."""
+        """Store a message of `topic` below a vehicle's base; an unusable one is counted."""
         if topic.startswith("fleet/"):  # of each card one
             topic = "fleet"
         if topic not in self._topics and topic != "online":
@@ -137,9 +137,8 @@ class _NotTakenError(Exception):
 
 
 def _parsed(payload: bytes) -> Any:
-    """JSON that can be written again for a browser: no NaN, nothing infinite, which 1e999 would be
-    read as, no integer without end. Raises ValueError, and RecursionError where it
-    is far too deep."""
+    """Parse JSON that can be sent to a browser: without NaN, infinities (1e999 is read as one) and
+    integers beyond bounds. Raises ValueError, and RecursionError where it is far too deep."""
 
     def refuse(name: str) -> None:
         raise ValueError(name)

@@ -1,7 +1,7 @@
-"""HTTP server of the page and its WebSocket; every file is local.
+"""HTTP application of the page and its WebSocket, from local files alone.
 
-A page of another site must not read where the vehicle is: its browser names the site in `Origin`,
-and a name that was made to point here (DNS rebinding) stands in `Host`. Both are refused.
+Pages of other sites must not read the vehicle's position: the browser names the site in `Origin`,
+and a name that was made to point here (DNS rebinding) in `Host`. Both are refused.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ HEADERS = (
 def application(
     hub: Hub, token: str | None, loopback: bool, base_map: Path | None = None
 ) -> Starlette:
-    """The application. `loopback`: bound to it, so that no other name for us is right; `base_map`:
-    a PMTiles file, of which the page asks ranges."""
+    """Make the application. `loopback`: it is bound to loopback and accepts no other host name;
+    `base_map`: a PMTiles file, of which the page requests ranges."""
     static = str(files("fusiond.dashboard").joinpath("static"))
     viewers: set[BrowserConnection] = set()
 

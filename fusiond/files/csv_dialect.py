@@ -1,8 +1,8 @@
 """Normalisation of a CSV file: comma between cells, decimal points, uncompressed.
 
-Semicolons or tabs between the cells, and then commas in the numbers, are what spreadsheets write in
-half of the world. Each is one character for another, so that line numbers stay. `.gz` is opened.
-What cannot be told for certain is refused, with its name.
+Spreadsheets of half the world write semicolons or tabs between cells, and commas in numbers. Each
+is replaced by one character, so that line numbers stay. `.gz` is decompressed. An ambiguous file is
+refused, with its name.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ Text = NDArray[np.uint8]
 _GZIP = b"\x1f\x8b"
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _LOOKED_AT = 100
-"""Rows that show how numbers are written. Columns of whole numbers show nothing."""
+"""Rows by which the decimal sign is found; a column of whole numbers does not show it."""
 _COMMA_NUMBER = re.compile(rb"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _FIRST_LINE = re.compile(rb"[^\n]*")
 _POINT_NUMBER = re.compile(rb"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
 
 
 class DialectError(ValueError):
-    """A way of writing a table that is not read; the text names it and says what would do."""
+    """Error: an unsupported way of writing a table; the text names it and the remedy."""
 
 
 def plain_csv(path: Path) -> Text:
-    """The file's bytes (n,) with commas between cells and points in numbers.
+    """Read the file's bytes (n,) with commas between cells and points in numbers.
 
     Raises `DialectError`, and `OSError` for a file that cannot be read.
     """
@@ -43,7 +43,7 @@ def plain_csv(path: Path) -> Text:
 
 
 def first_line(data: Text) -> bytes:
-    """The bytes before the first newline."""
+    """Bytes before the first newline."""
     found = _FIRST_LINE.match(data.data)
     return found[0] if found else b""
 
@@ -101,7 +101,7 @@ def _with_commas(data: Text) -> Text:
 
 
 def _decimal(data: bytes, between: bytes) -> bytes:
-    """Decimal sign: a comma or a point."""
+    """Find the decimal sign: a comma or a point."""
     points = commas = False
     for row in data.split(b"\n", _LOOKED_AT + 1)[1 : _LOOKED_AT + 1]:
         for cell in row.split(between):

@@ -1,8 +1,8 @@
-"""Fast reader of numeric CSV tables with a header row; it names every implausible row.
+"""Fast reader of numeric CSV tables with a header row, which names every implausible row.
 
-`fusiond.files.csv_dialect` makes one dialect of several. Plain decimals are read by a compiled
-reader, other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank
-line), each row is read with care instead, so that what is refused carries its line and the reason.
+`fusiond.files.csv_dialect` makes one dialect of several. A compiled reader reads plain decimals,
+numpy's reader other numbers. Where both fail (an empty cell, a word, a truncated or blank line),
+rows are read one by one, so that each rejection has its line and reason.
 
 Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
 (empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
@@ -41,7 +41,7 @@ class TableError(Exception):
 
 
 class MissingPackageError(Exception):
-    """A format of files needs a package that is not installed; the text says which."""
+    """Error: a file format needs a package that is not installed; the text names it."""
 
 
 @immutable()
@@ -97,7 +97,8 @@ class RawTable:
 
 
 FEWEST_ZEROS = 10
-"""Rows from which a sigma that is always 0 means that none was written; a single 0 is implausible.
+"""Number of rows from which a sigma of 0 in all rows means that none was written; a single 0 is
+implausible.
 """
 
 
@@ -247,7 +248,7 @@ def _number(cell: str) -> float:
 def _read_with_care(
     data: Text, header: list[str], columns: Sequence[Column], text: Sequence[str]
 ) -> _Parsed:
-    """Row by row: what cannot be parsed is rejected, what is empty and may be so becomes NaN."""
+    """Parse row by row: an unreadable cell rejects its row, an optional empty cell becomes NaN."""
     present = [(header.index(c.name), c) for c in columns if c.name in header]
     places = [(header.index(name), name) for name in text if name in header]
     rejected: list[Rejection] = []
@@ -339,7 +340,7 @@ def _apply(
     keep: Flags,
     rejected: list[Rejection],
 ) -> None:
-    """Take the rows that a rule calls impossible out of `keep`; the first reason stands."""
+    """Remove the rows that a rule calls impossible from `keep`; the first reason stands."""
     for i in np.flatnonzero(rule.impossible(named) & keep):
         row = {name: float(column[i]) for name, column in named.items()}
         rejected.append(Rejection(int(lines[i]), rule.reason, rule.detail.format(**row)))

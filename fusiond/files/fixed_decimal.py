@@ -1,4 +1,4 @@
-"""Fixed-decimal text of a table of numbers, written and read compiled: tens of ns a number.
+"""Compiled writer and reader of fixed-decimal tables: tens of ns a number.
 
 A number v with d decimals is written as sign, floor(|v|), '.', and round(frac(|v|) 10^d). Both
 parts of the split are exact in binary, so only a fraction that lies on a rounding tie can differ
@@ -31,14 +31,15 @@ _FILL = np.array([10 ** (-k % 4) for k in range(MAX_DECIMALS + 1)], dtype=np.uin
 """Padding of a number of decimals to a multiple of four."""
 _DIGITS = _ZERO + np.arange(10**4)[:, np.newaxis] // (1000, 100, 10, 1) % 10
 _FOURS = _DIGITS.astype(np.uint8).view("<u4").ravel().astype(np.uint32)
-"""The digits of 0000 to 9999, the first in the lowest byte: one look instead of four divisions."""
+"""Digits of 0000 to 9999, the first in the lowest byte: one table access replaces four
+divisions."""
 
 
 @compiled("void(u1[::1], u8, u4)", forceinline=True)
 def _put(out: NDArray[np.uint8], at: np.uint64, four: np.uint32) -> None:
     """Write four bytes at `out[at:]`, the lowest first.
 
-    All is unsigned, since an index that may be negative is looked at before each use.
+    All indices are unsigned: numba checks a signed one for a negative value before each use.
     """
     for k in range(4):
         out[at + np.uint64(k)] = np.uint8(four >> np.uint32(8 * k))
@@ -156,7 +157,7 @@ _ONES = np.uint64(0x0101010101010101)
 
 @compiled("i8(u8[::1])", nogil=True)
 def _newlines(words: NDArray[np.uint64]) -> int:
-    """Bytes that are newlines: those of which nothing is left."""
+    """Count the newlines: bytes of which nothing is left after the exclusive or."""
     found = np.uint64(0)
     for i in range(words.shape[0]):
         rest = words[i] ^ _NEWLINES
@@ -183,7 +184,7 @@ def _eight(text: NDArray[np.uint8], at: np.uint64) -> np.uint64:
 
 @compiled("u8(u8)", forceinline=True)
 def _joined(digits: np.uint64) -> np.uint64:
-    """The number of eight digits, the first lowest: pairs, then fours, then all."""
+    """Number of eight digits, the first lowest: pairs are joined, then fours, then all."""
     pairs = np.uint64(10) * digits + (digits >> np.uint64(8))
     odd, even = pairs & np.uint64(0xFF000000FF), (pairs >> np.uint64(16)) & np.uint64(0xFF000000FF)
     odd *= np.uint64((1000000 << 32) + 100)
@@ -195,7 +196,8 @@ def _joined(digits: np.uint64) -> np.uint64:
 def _digits(
     text: NDArray[np.uint8], at: np.uint64, number: np.uint64
 ) -> tuple[np.uint64, np.uint64]:
-    """`number` with the digits from `at` on; and where they end, or it has become too large."""
+    """Append the digits from `at` on to `number`; return it and the place where they end or the
+    number is too large."""
     while at < np.uint64(text.shape[0]) and number <= np.uint64(_EXACT):
         digit = np.uint8(text[at] - np.uint8(_ZERO))
         if digit > np.uint8(9):

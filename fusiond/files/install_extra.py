@@ -1,5 +1,5 @@
-"""Installation of an extra into the running Python. fusiond is on no package index, so its packages
-are named."""
+"""Installation of an extra into the running Python. fusiond is on no package index, so that the
+command names the extra's packages."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from importlib.util import find_spec
 
 
 def install_command(extra: str) -> str:
-    """Command that installs `extra`, from fusiond's metadata. A Debian package lacks pip; the
-    system's is used."""
+    """Command that installs `extra`, from fusiond's metadata. The Debian package lacks pip and uses
+    the system's."""
     try:
         stated = requires("fusiond") or []
     except PackageNotFoundError:  # run from a folder, without an installation

@@ -1,8 +1,8 @@
 """Bytes of a receiver's log, unpacked from any compression.
 
-Unpacked where it is a gzip file, whatever it is called, as far as that goes: the last block of one
-whose writer lost its power is cut. Text that a shell of Windows has redirected (`>` of PowerShell)
-is UTF-16, with a mark at its start (RFC 2781, 3.2).
+A gzip file, whatever its name, is decompressed as far as possible: a power cut of its writer
+truncates the last block. Text redirected by PowerShell (`>`) is UTF-16 with a byte order mark (RFC
+2781, 3.2).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ANY_HEADER = 16 + zlib.MAX_WBITS
 
 
 class LogBytes(NamedTuple):
-    """Log's bytes; `cut` describes a truncation, "" without one."""
+    """Bytes of a log; `cut` describes a truncation, "" without one."""
 
     data: bytes
     cut: str = ""
@@ -35,7 +35,8 @@ class LogBytes(NamedTuple):
 
 
 def log_bytes(path: Path) -> LogBytes:
-    """Bytes of the file at `path`. Raises `OSError`, or `TableError`: nothing can be unpacked."""
+    """Read the bytes of the file at `path`. Raises `OSError`, or `TableError` if nothing can be
+    decompressed."""
     data = path.read_bytes()
     found = _unpacked(data) if data.startswith(_GZIP) else LogBytes(data)
     if found.cut and not found.data:
@@ -47,7 +48,7 @@ def log_bytes(path: Path) -> LogBytes:
 
 
 def _unpacked(data: bytes) -> LogBytes:
-    """Unpack all members in sequence; zeros behind the last are padding."""
+    """Decompress all members in sequence; zeros after the last are padding."""
     parts: list[bytes] = []
     while data.startswith(_GZIP):
         member = zlib.decompressobj(_ANY_HEADER)

@@ -1,11 +1,11 @@
-"""The CSV files of measurements and trajectories: SI units and degrees outside, radians inside.
+"""Readers of CSV files of measurements and trajectories: degrees in files, radians in tables.
 
 Each reader returns a table of arrays with one row an epoch, and the rows it rejected with line and
 reason (see `fusiond.files.csv_tables`). NaN stands for an empty cell of an optional column. Times
 are seconds on whatever timebase the file has; all files of one run share it.
 
-The ranges only refuse what no vehicle and no device can mean: 100 rad/s and 1000 m/s^2 (102 g) lie
-beyond the range of navigation-grade and MEMS inertial units, 10 km/s beyond orbital velocity.
+The ranges only reject values that no vehicle and no device has: 100 rad/s and 1000 m/s^2 (102 g)
+lie beyond the range of navigation-grade and MEMS inertial units, 10 km/s beyond orbital velocity.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ class ImuTable:
 
     @property
     def gyro(self) -> Floats:
-        """The rates."""
+        """Angular rates (n, 3), rad/s."""
         return self.samples[:, :3]
 
     @property
     def accel(self) -> Floats:
-        """The forces."""
+        """Specific forces (n, 3), m/s^2."""
         return self.samples[:, 3:]
 
 
@@ -277,7 +277,8 @@ def read_bearing(path: Path | str) -> BearingTable:
 class WheelTable:
     """Speed along the vehicle's forward axis and one sigma (m/s), (n,).
 
-    `step_m_s`: what it was rounded to. `unsigned` 1: it does not tell forward from backward.
+    `step_m_s` is the step to which the speed was rounded. `unsigned` 1: forward and backward look
+    alike.
     """
 
     t_s: Floats

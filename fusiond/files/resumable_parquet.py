@@ -1,11 +1,11 @@
 """Rows of figures in a Parquet file that survive an interruption.
 
-A Parquet file is written whole. Until then each row is a line of JSON in `F.parquet.journal`, put
-there as soon as it is known; `ResumableRows` finds rows in both, so that a batch that was killed
-goes on where it was. The journal is removed once its rows are in the file.
+A Parquet file is written whole. Until then each row is a line of JSON in `F.parquet.journal`,
+appended as soon as it is known; `ResumableRows` finds rows in both, so that a killed batch can
+resume. The journal is removed once its rows are in the file.
 
-A row is flat: numbers, texts and truth values by name; rows need not have the same names. Nan and
-infinities, which JSON does not have, are no values here.
+A row is flat: numbers, texts and truth values by name; rows need not have the same names. NaN and
+infinities, which JSON lacks, are left out.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ COMPRESSION = "zstd"
 
 
 class ResumableRows:
-    """Rows of `path` with additions, written on close.
+    """Rows of the file `path` and added ones, all written on close.
 
-    Raises `MissingPackageError` without pyarrow, `TableError` for what is no file of rows, OSError.
+    Raises `MissingPackageError` without pyarrow, `TableError` for a file without rows of figures,
+    OSError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +75,8 @@ def write_rows(path: Path, rows: list[Row]) -> None:
 
 
 def flattened(values: dict[str, Any], before: str = "") -> Row:
-    """Nested names joined by dots; left out is what is None, not finite, or no plain value."""
+    """Flatten nested names, joined by dots; values that are None, not finite or not plain are left
+    out."""
     row: Row = {}
     for name, value in values.items():
         if isinstance(value, dict):

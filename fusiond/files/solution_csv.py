@@ -1,4 +1,4 @@
-"""Writer of solution files: the columns of `truth.csv`, a sigma for each, and the mode."""
+"""Writer of solution files: the columns of `truth.csv`, one sigma of each, and the mode."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COLUMNS: tuple[str, ...] = (*(name for name, _ in _COLUMNS), "status")
 _DECIMALS = np.array([decimals for _, decimals in _COLUMNS], dtype=np.int64)
 _CHUNK_ROWS = 2048
 _BLOCK = 1 << 19
-"""Bytes that are handed to the system at once: of small pieces it makes small pages of its own."""
+"""Bytes written at once: the kernel caches small pieces in small pages."""
 _DEG = 180.0 / np.pi
 
 

@@ -1,4 +1,4 @@
-"""Navigator's solutions as the table of a solution file."""
+"""Conversion of a navigator's solutions to the table of a solution file."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ def trajectory_of(solutions: Iterable[Solution]) -> TrajectoryTable:
 
 
 def _columns(vectors: Sequence[tuple[float, float, float]]) -> Floats:
-    """(n, 3), also where n is 0."""
+    """Array (n, 3) of vectors, also for n = 0."""
     return np.array(vectors, dtype=np.float64).reshape(-1, 3)
