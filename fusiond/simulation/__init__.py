@@ -1,1 +1,1 @@
-"""A simulated vehicle: motion, what its sensors would say, and devices that say it on lines."""
+"""Simulated vehicle: its motion, the output of its sensors, and devices that send it on lines."""

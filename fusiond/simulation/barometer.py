@@ -1,10 +1,10 @@
-r"""Barometer of a simulated vehicle: the pressure of this height in the standard atmosphere:
+r"""Barometer of a simulated vehicle: pressure of the standard atmosphere at the height
 
     H = (1 + k) h + b + c v^2 / (2 g) + n
 
-h the true height of the IMU, b the weather's offset, a random walk from N(0, weather_sd), k by how
-much the air is colder than the standard, c the share of the dynamic pressure that is lacking, n
-white: the errors that `[aiding.barometer]` assumes (fusiond.aiding.height).
+with h the true height of the IMU, b the weather's offset (a random walk from N(0, weather_sd)), k
+the relative lack of the air's temperature, c the missing share of the dynamic pressure, and white
+noise n: the errors that `[aiding.barometer]` assumes (fusiond.aiding.height).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BAROMETER_COLUMNS = (("t_s", 6), ("t_arrival_s", 6), ("pressure_pa", 3), ("sd_m"
 
 @dataclass(frozen=True, slots=True)
 class BarometerOptions:
-    """One-sigma errors, as of `fusiond.configuration.aiding.BarometerAiding`."""
+    """One-sigma errors, named as in `fusiond.configuration.aiding.BarometerAiding`."""
 
     rate_hz: float = 2.0
     sd_m: float = 1.0
@@ -69,5 +69,5 @@ class Barometer:
 
 
 def barometer_stream(seed: int) -> np.random.Generator:
-    """Generator independent of the other devices'."""
+    """Random generator independent of the other devices' generators."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(102,)))

@@ -51,7 +51,7 @@ _TRUTH = (_TIME, *_PLACE, *_V, *((f"{angle}_deg", 7) for angle in ("roll", "pitc
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """Result of writing: the files, and their rows without the header (epochs of a raw stream)."""
+    """Files written, and the number of rows of each without the header (epochs of a raw stream)."""
 
     scenario: str
     seed: int
@@ -138,8 +138,8 @@ def _gnss_rows(receiver: GnssReceiver) -> Array:
 
 
 def _rdss_rows(truth: Truth, scenario: Scenario, rng: np.random.Generator) -> Array:
-    """Fixes asked for as a host may: as soon as the card allows and the last one is there, with a
-    command and its answer in between."""
+    """Rows of RDSS fixes, requested as a host may: as soon as the card allows, after the previous
+    fix, and after a command and its reply."""
     o = scenario.rdss
     centre = RdssCentre(truth, o, rng)
     spacing = o.service_frequency_s + 2.0 * o.reply_s

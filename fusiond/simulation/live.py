@@ -29,14 +29,14 @@ from fusiond.simulation.trajectories import drive
 
 VCAN, MULTICAST = "vcan0", "239.74.163.2"
 REST_S = 20.0
-"""Time at rest before the drive, to start a daemon and to level."""
+"""Time (s) at rest before the drive, to start a daemon and to level."""
 SERVICE_FREQUENCY_S = 10
 
 
 def bus_here() -> tuple[Interface, str]:
-    """The bus that both can use: a virtual CAN interface, or python-can's multicast.
+    """Bus that simulation and daemon can use: a virtual CAN interface, or python-can's multicast.
 
-    Raises `MissingPackageError` where there is neither.
+    Raises `MissingPackageError` if there is neither.
     """
     with suppress(OSError):
         state = Path(f"/sys/class/net/{VCAN}/operstate").read_text(encoding="ascii").strip()
@@ -75,7 +75,7 @@ def configuration(folder: Path, interface: Interface, channel: str) -> str:
 def live(
     folder: Path, duration_s: float | None, seed: int, report: Callable[[str], None]
 ) -> dict[str, int]:
-    """Drive until the end, Ctrl-C or SIGTERM; the counters of what was sent."""
+    """Drive until the end, Ctrl-C or SIGTERM and return counters of frames and bytes sent."""
     interface, channel = bus_here()
     folder.mkdir(parents=True, exist_ok=True)
     folder = folder.resolve()

@@ -1,9 +1,9 @@
-"""The simulated vehicle in real time: its devices on a CAN bus and on pseudo terminals.
+"""Simulated vehicle in real time: its devices on a CAN bus and on pseudo terminals.
 
     python -m fusiond.simulation.live_devices --scenario drive --can socketcan:vcan0 \\
         --gnss-link /run/x/gnss --rdss-link /run/x/rdss --truth truth.csv --start-file start.json
 
-Everything random is drawn before the start; while it runs, the vehicle only looks up, formats and
+All random numbers are drawn before the start; while the vehicle runs, it only looks up, formats and
 writes. Instant 0 of the trajectory is `start_ns` of the host's monotonic clock. Commands on
 standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss, star_tracker, sar);
 `suppress`, `silence`, `lift` for the RDSS terminal; `quit`. Each is answered; the last line is the
@@ -57,8 +57,8 @@ class SimulatedVehicle:
 
     `gnss` and `terminal` are the simulated devices; `counters` holds frames, epochs and bytes sent
     and lost. A link that is None leaves that device out. `can_imu` are the options of the driver
-    that will read the IMU: bus, DBC and signals. `lines` and `encoder` are what bytes and samples
-    pass through; whoever wants a fault on the wire puts one of his own there.
+    that will read the IMU: bus, DBC and signals. Bytes pass `lines`, samples pass `encoder`; a test
+    replaces them to put a fault on the wire.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class SimulatedVehicle:
     def _start_clock(self) -> None:
         """Start at the next full tenth of a UTC second, where receivers have their epochs.
 
-        The sky is that of `fusiond simulate`: a seed meets the same satellites at every hour."""
+        The sky is the one of `fusiond simulate`: a seed has the same satellites at any hour."""
         utc_ns, now_ns = time.time_ns(), monotonic_ns()
         wait_ns = -utc_ns % 100_000_000
         self.start_ns = now_ns + wait_ns
@@ -280,7 +280,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None:
-    """Read standard input in a thread and have the loop obey."""
+    """Read commands from standard input in a thread and execute them in the loop."""
     loop = asyncio.get_running_loop()
 
     def obey(line: str) -> None:

@@ -2,7 +2,8 @@ r"""First-order Gauss-Markov processes: time-correlated errors of sensors and me
 
     x' = -x / T + w,   x_k = x_(k-1) exp(-dt / T) + w_k,   var(w_k) = sigma^2 (1 - exp(-2 dt / T))
 
-and what follows one of sqrt(2) sigma, of which not the rate but its change is noise:
+and a second-order process, which follows a first-order one of sqrt(2) sigma and whose rate is
+continuous:
 
     s' = (x - s) / T,   var(s) = cov(s, x) = var(x) / 2
 
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 def _decaying(process: Array, decay: float) -> None:
     """Add to each row of the processes' input (n, columns) the decayed row before.
 
-    As scipy's `lfilter`, to the bit; its package takes a second to load."""
+    The result equals that of scipy's `lfilter` to the bit; scipy takes a second to load."""
     for k in range(1, process.shape[0]):
         for j in range(process.shape[1]):
             process[k, j] += decay * process[k - 1, j]
@@ -59,7 +60,7 @@ def smooth_markov(
     correlation_s: float,
     sigma: float,
 ) -> Array:
-    """Processes (n, columns) in steady state that follow first-order ones."""
+    """Second-order processes (n, columns) in steady state, which follow first-order ones."""
     wide = math.sqrt(2.0) * sigma
     rough = gauss_markov(rng, shape, step_s=step_s, correlation_s=correlation_s, sigma=wide)
     decay = math.exp(-step_s / correlation_s)

@@ -1,9 +1,9 @@
-"""The papers' vehicles: what each paper's model is configured as, and what it has on board.
+"""Vehicles of the papers: configuration and devices for the model of each paper.
 
-A paper is a configuration that ships with fusiond and the lines that make it the paper's
-(docs/papers.md prints them). The simulated vehicle has the paper's devices; what the paper leaves
-open is the shipped configuration's. `fusiond demo --paper` runs the daemon on one of them, `fusiond
-study papers` its models through the navigator.
+A paper is a shipped configuration with further lines (docs/papers.md prints them). The simulated
+vehicle has the paper's devices; the shipped configuration supplies what the paper leaves open.
+`fusiond demo --paper` runs the daemon on one of them, `fusiond study papers` its models through the
+navigator.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 REST_S = 8.0
 COURSE_DEG = 40.0
-"""Initial heading of the car, known to the start of paper 000 as in the paper."""
+"""Initial heading of the car, known at the start as in paper 000."""
 IMU_COMES_S = 25.0
 TOWN = (
     Leg(9, speed_m_s=14.0),
@@ -51,19 +51,20 @@ AS_TAKEN: dict[str, Any] = {
 }
 """Sky whose errors match the daemon's assumptions (`fusiond.gnss.signal_choice`): orbits, clocks,
 and residuals of ionosphere and troposphere models: half of what is broadcast, and 0.3 of that from
-satellite to satellite. That of `Scenario` is better, but for models that are a third off."""
+satellite to satellite. The sky of `Scenario` is better, except that its ionosphere models are a
+third off."""
 NO_SCALES = {"gyro_scale_ppm": 1e-9, "accel_scale_ppm": 1e-9}
 """Inertial unit without scale factor errors, for which the papers' models have no states."""
 
 
 def town(duration_s: float) -> Path:
-    """A short rest, then town streets over and over."""
+    """Path with a short rest, then repeated town streets."""
     legs = chain([Leg(REST_S)], cycle(TOWN))
     return follow(legs, duration_s, course_deg=COURSE_DEG, bank_ratio=-0.08)
 
 
 def level_town(duration_s: float) -> Path:
-    """Town without hills, for a filter that holds its height."""
+    """Path in a town without hills, for a filter that holds its height."""
     legs = chain([Leg(REST_S)], cycle(replace(leg, climb_deg=None) for leg in TOWN))
     return follow(legs, duration_s, course_deg=COURSE_DEG, bank_ratio=-0.08)
 
@@ -161,7 +162,7 @@ PAPERS: dict[str, Paper] = {
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the keys of `over`, section by section."""
+    """Merge the keys of `over` into `base`, section by section."""
     found = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(found.get(key), dict)

@@ -1,4 +1,4 @@
-"""A serial line of a simulated device: a pseudo terminal behind a symbolic link."""
+"""Serial line of a simulated device: a pseudo terminal behind a symbolic link."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _READ_BYTES = 4096
 
 
 class PtyLine:
-    """The device's end of a serial line: a pseudo terminal behind a symbolic link.
+    """Device's end of a serial line, a pseudo terminal behind a symbolic link.
 
-    What is written while nobody has the line open is lost, as on a real line.
+    Bytes written while no host has the line open are lost, as on a real line.
     """
 
     def __init__(self, link: Path) -> None:
@@ -45,7 +45,7 @@ class PtyLine:
         self._hangup.register(master, 0)
 
     def unplug(self) -> None:
-        """Make the port vanish; whoever has it open sees a hang-up."""
+        """Make the port vanish; a host that has it open sees a hang-up."""
         if self._master is None:
             return
         self.link.unlink(missing_ok=True)
@@ -64,7 +64,7 @@ class PtyLine:
         return b""
 
     def write(self, data: bytes) -> bool:
-        """Send; False if data was lost because nothing reads it."""
+        """Send bytes; False if some were lost because no host reads them."""
         if self._master is None or not self._open_by_host():
             return False
         try:

@@ -1,4 +1,4 @@
-"""Scenarios of the simulation: a motion, where it starts, and the sensors on board."""
+"""Scenarios of the simulation: motion, origin, and sensors on board."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ MICRO_IMU = Imu(
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A vehicle: `path` makes its motion for a time in s from `origin_deg_m`, lat, lon, height."""
+    """Scenario of a vehicle: `path` makes its motion over a time (s) from `origin_deg_m` (lat, lon,
+    height)."""
 
     name: str
     path: Callable[[float], Path]
@@ -159,7 +160,7 @@ SCENARIOS = {
 
 
 def random_streams(seed: int | np.random.SeedSequence) -> tuple[np.random.Generator, ...]:
-    """Independent generators for IMU, GNSS fixes, RDSS and raw GNSS: changing one device leaves
-    the others."""
+    """Independent random generators for IMU, GNSS fixes, RDSS and raw GNSS, so that a change of one
+    device leaves the others alone."""
     sequence = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     return tuple(np.random.default_rng(child) for child in sequence.spawn(4))

@@ -39,7 +39,7 @@ class Vibration:
 
 @dataclass(frozen=True, slots=True)
 class ImuOutput:
-    """Rows (n, 3) in sensor axes: what the IMU says, and the biases it had while saying it."""
+    """Output of the IMU and its true biases, rows (n, 3) in sensor axes."""
 
     gyro: Array
     accel: Array
@@ -61,8 +61,8 @@ def imu_output(
     """Convert ideal means in body axes (n, 3) at `imu.rate_hz` into this IMU's samples.
 
     `misalignment_deg` is one sigma of each small angle between a sensor's axes and its nominal
-    ones, None for that of `imu`, `*_step_*` the resolution of its output (0: none). The same `rng`
-    state, the same bytes.
+    ones, None for that of `imu`, `*_step_*` the resolution of its output (0: none). Equal states of
+    `rng` give equal bytes.
     """
     n, dt = len(gyro), 1.0 / imu.rate_hz
     misalignment = (imu.misalignment_deg if misalignment_deg is None else misalignment_deg) * DEG

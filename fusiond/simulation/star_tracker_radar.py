@@ -5,8 +5,8 @@ r"""Star tracker and radar (SAR) of a simulated vehicle: attitudes and bearings 
     white noise                                                                 radar
 
 m misalignment (rad, body axes): constant, or a first-order Gauss-Markov process, from its steady
-state; r the antenna, p a known point. The radar looks at the nearest point that is within its
-range and not too steep; where there is none it says nothing. Each keeps its latency exactly.
+state; r the antenna, p a known point. The radar observes the nearest point that is within its range
+and not too steep, or none. Latencies are constant.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class StarTrackerOptions:
 
 @dataclass(frozen=True, slots=True)
 class SarOptions:
-    """One-sigma errors of azimuth and elevation; the points by number: lat, lon (deg), height
+    """One-sigma errors of azimuth and elevation, and the points by number: lat, lon (deg), height
     (m)."""
 
     targets_deg_m: Mapping[str, Vector3] = field(default_factory=dict)
@@ -102,13 +102,14 @@ BEARING_COLUMNS = (
 
 
 def sensor_streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Generators for star tracker and radar, independent of the other devices'."""
+    """Random generators for star tracker and radar, independent of the other devices'
+    generators."""
     star, sar = (np.random.SeedSequence(seed, spawn_key=(100 + k,)) for k in range(2))
     return np.random.default_rng(star), np.random.default_rng(sar)
 
 
 def _misalignment(o: StarTrackerOptions | SarOptions, n: int, rng: np.random.Generator) -> Array:
-    """(n, 3) rad at the epochs of a sensor."""
+    """Misalignment (n, 3) in rad at the epochs of a sensor."""
     sd = o.misalignment_sd_arcsec * ARCSEC
     if o.misalignment_correlation_s is None:
         return np.tile(rng.standard_normal(3) * sd, (n, 1))
@@ -118,7 +119,7 @@ def _misalignment(o: StarTrackerOptions | SarOptions, n: int, rng: np.random.Gen
 
 class StarTracker:
     """Epochs over a whole trajectory, drawn at construction: `t_s`, `t_arrival_s` (n,), `rpy` (n,
-    3) in rad, and the `misalignment` (n, 3) that it had."""
+    3) in rad, and the true `misalignment` (n, 3)."""
 
     def __init__(self, truth: Truth, options: StarTrackerOptions, rng: np.random.Generator) -> None:
         o = self.options = options

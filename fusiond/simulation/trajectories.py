@@ -1,4 +1,4 @@
-r"""Motion as smooth functions of time: speed, course and climb angle of a vehicle on a path.
+r"""Trajectories: speed, course and climb angle of a vehicle as smooth functions of time.
 
     v_n = s [cos(gamma) cos(chi), cos(gamma) sin(chi), -sin(gamma)]
     roll = k atan(s chi' / g),   pitch = gamma + alpha,   yaw = chi + c |s| chi'
@@ -265,19 +265,20 @@ def _for_ever(legs: Sequence[Leg]) -> Iterable[Leg]:
 
 
 def static(duration_s: float) -> Path:
-    """Vehicle at rest, facing north-east."""
+    """Path of a vehicle at rest, facing north-east."""
     return follow([Leg(duration_s)], duration_s, course_deg=45.0)
 
 
 def drive(duration_s: float, rest_s: float = 60.0) -> Path:
-    """A car: at rest, then town, hill, roundabout and fast road with stops, over and over."""
+    """Path of a car: rest, then repeatedly town, hill, roundabout and fast road with stops."""
     return follow(
         chain([Leg(rest_s)], _for_ever(_BLOCK)), duration_s, course_deg=40.0, bank_ratio=-0.08
     )
 
 
 def flight(duration_s: float, rest_s: float = 150.0) -> Path:
-    """An aircraft: 150 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with turns."""
+    """Path of an aircraft: 150 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with
+    turns."""
     climb_out = (
         Leg(rest_s),  # time to gyrocompass
         Leg(40, speed_m_s=80.0),
@@ -298,8 +299,8 @@ def flight(duration_s: float, rest_s: float = 150.0) -> Path:
 
 
 def level_flight(duration_s: float, rest_s: float = 30.0) -> Path:
-    """A micro air vehicle, as paper 001 begins: level, due east; at rest for half a minute, then at
-    12 m/s."""
+    """Path of a micro air vehicle, level and due east as paper 001 begins: half a minute at rest,
+    then 12 m/s."""
     return follow(
         [Leg(rest_s), Leg(10, speed_m_s=12.0), Leg(duration_s)], duration_s, course_deg=90.0
     )

@@ -1,8 +1,8 @@
-"""Values of a device become the frames that a DBC file describes.
+"""Encoder of a device's values as the frames of a DBC file.
 
-The plan is that of the driver's decoder that will read the frames, so that any device which a
-configuration describes can be simulated. A value is rounded to the signal's resolution and
-saturates at its range, as a device's does.
+The encoder uses the plan of the decoder that will read the frames, so that it can simulate any
+device of a configuration. A value is rounded to the signal's resolution and saturates at its range,
+as in a device.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class CanEncoder:
         self._source_address = source_address
 
     def frames(self, number: int, t_ns: int, values: Sequence[float]) -> list[can.Message]:
-        """The frames of sample `number`, true at `t_ns` of the device's clock; SI by slot."""
+        """Frames of sample `number`, valid at `t_ns` of the device's clock; SI values by slot."""
         frames = []
         for plan in self._plans:
             message: Message = plan.message
@@ -55,7 +55,7 @@ class CanEncoder:
 
 
 def _in_range(signal: Signal, count: float) -> int | float:
-    """Rounded and saturated; a float signal takes everything."""
+    """Round and saturate a value; a float signal is unlimited."""
     if signal.is_float:
         return count
     low, high = 0, (1 << signal.length) - 1

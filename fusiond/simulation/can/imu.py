@@ -1,4 +1,4 @@
-"""IMU on a CAN bus, by the options of the driver that reads its frames."""
+"""Simulated IMU on a CAN bus, described by the options of the driver that reads it."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ class CanImu:
     def frames(
         self, number: int, t_ns: int, gyro: Sequence[float], accel: Sequence[float]
     ) -> list[can.Message]:
-        """The frames of sample `number`, true at `t_ns` of the device's clock; rad/s and m/s^2."""
+        """Frames of sample `number`, valid at `t_ns` of the device's clock; rad/s and m/s^2."""
         return self._encoder.frames(number, t_ns, (*gyro, *accel))

@@ -61,7 +61,7 @@ SIM_BAROMETER = CanHeightOptions(
 
 
 class CanSensor:
-    """Sender of one sensor's epochs on time, with a bus of its own."""
+    """Sensor that sends its epochs on time, over its own connection to the bus."""
 
     def __init__(
         self,

@@ -1,13 +1,13 @@
 r"""Sky masks: open country, a street between houses, a tunnel.
 
-Houses of height H along both sides of a street of width W hide, at azimuth A, what is lower than
+Houses of height H along both sides of a street of width W hide, at azimuth A, satellites below
 
     tan E_wall = H |sin(A - psi)| / (W / 2)
 
-psi azimuth of the street. A street runs where the vehicle heads when it enters, unless stated. With
-`satellites` set, exactly that many are let through (fewer if fewer are up): those that clear the
-walls by most, or are hidden by least, at the first epoch; a chosen one is kept while it stays above
-the open sky's limit, and then replaced.
+with psi the azimuth of the street: stated, or the vehicle's heading when it enters. With
+`satellites` set, exactly that many stay visible (fewer if fewer are up): at the first epoch those
+that clear the walls by most, or are hidden by least. A chosen satellite stays visible until it
+falls below the open sky's limit, and is then replaced.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Booleans = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """A stretch of the way, from `start_s` for `length_s` of the trajectory.
+    """Mask over a part of the trajectory, from `start_s` for `length_s`.
 
-    `wall_height` is H / (W / 2): 3 for 30 m on 20 m, all but an alley of the sky. `multipath` is by
-    what the houses multiply the multipath of the open.
+    `wall_height` is H / (W / 2): 3 for houses of 30 m on a street of 20 m. `multipath` is the
+    factor on the multipath under the open sky.
     """
 
     kind: Literal["canyon", "tunnel"]
@@ -46,7 +46,7 @@ class Mask:
 
 
 def canyon(satellites: int | None = None, start_s: float = 0.0, length_s: float = math.inf) -> Mask:
-    """A street canyon; `satellites` 2, 3, 4 are the studies' canyon2, canyon3, canyon4."""
+    """Mask of a street canyon; `satellites` 2, 3, 4 are the studies' canyon2, canyon3, canyon4."""
     return Mask("canyon", start_s, length_s, satellites)
 
 
@@ -56,7 +56,8 @@ def tunnel(start_s: float, length_s: float) -> Mask:
 
 
 def parse_mask(text: str) -> Mask:
-    """KIND:START:LENGTH in s, such as canyon3:100:60; canyon, canyon2 to canyon4, tunnel.
+    """Parse KIND:START:LENGTH (s), such as canyon3:100:60. Kinds: canyon, canyon2 to canyon4,
+    tunnel.
 
     Raises ValueError.
     """
@@ -72,7 +73,7 @@ def parse_mask(text: str) -> Mask:
 
 @dataclass(slots=True)
 class View:
-    """Visible satellites along the way. Asked in the order of time."""
+    """Visible satellites along the trajectory, to be asked in order of time."""
 
     elevation_deg: float = 10.0
     masks: Sequence[Mask] = ()
@@ -80,13 +81,13 @@ class View:
     _chosen: dict[int, list[int]] = field(default_factory=dict)
 
     def mask(self, t_s: float) -> int | None:
-        """Number of the mask that holds at `t_s`; the first of several."""
+        """Index of the mask in force at `t_s`, the first of several."""
         return next((k for k, mask in enumerate(self.masks) if mask.holds(t_s)), None)
 
     def visible(
         self, t_s: float, azimuth: Array, elevation: Array, heading_rad: float
     ) -> tuple[Booleans, float]:
-        """Mask of visible satellites (n,), angles in rad, and the multipath's factor."""
+        """Mask of visible satellites (n,) and the factor of multipath; angles in rad."""
         up: Booleans = elevation >= math.radians(self.elevation_deg)
         k = self.mask(t_s)
         if k is None:

@@ -38,7 +38,7 @@ class Field(NamedTuple):
         return raw & ((1 << self.bits) - 1)
 
     def decode(self, raw: int) -> float:
-        """The value of an integer of `encode`."""
+        """Value of an integer made by `encode`."""
         if self.signed and raw >> (self.bits - 1):
             raw -= 1 << self.bits
         return raw * self.scale
@@ -82,7 +82,7 @@ BETA = tuple(Field(8, 2.0**power) for power in (11, 14, 16, 16))
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """An ephemeris as integers: `raw` by field name of `Ephemeris`, the rest beside it."""
+    """Ephemeris as integers: `raw` by field name of `Ephemeris`, the other fields as attributes."""
 
     system: System
     prn: int
@@ -95,7 +95,8 @@ class Wire:
 
 
 def wire(ephemeris: Ephemeris) -> Wire:
-    """Integers of a GPS or BeiDou ephemeris. Raises ValueError for what no message can carry."""
+    """Integers of a GPS or BeiDou ephemeris. Raises ValueError for a value that no message can
+    carry."""
     system = ephemeris.system
     if system not in FIELDS:
         raise ValueError(f"no message for system {system}")
@@ -113,7 +114,7 @@ def wire(ephemeris: Ephemeris) -> Wire:
 
 
 def _accuracy_index(accuracy_m: float) -> int:
-    """The least index (URA, URAI) that does not state less; 15 states none."""
+    """Least index (URA, URAI) whose accuracy is not better than the true one; 15 states none."""
     for index in range(15):
         stated = ura_m(index)
         if stated is not None and accuracy_m <= stated:
@@ -132,7 +133,7 @@ def quantised(ephemeris: Ephemeris) -> Ephemeris:
 
 
 def klobuchar_wire(model: Klobuchar) -> tuple[int, ...]:
-    """The eight integers alpha 0 to 3, beta 0 to 3. Raises ValueError out of range."""
+    """Eight integers: alpha 0 to 3, beta 0 to 3. Raises ValueError out of range."""
     fields, values = (*ALPHA, *BETA), (*model.alpha, *model.beta)
     return tuple(f.encode(value) for f, value in zip(fields, values, strict=True))
 

@@ -194,7 +194,7 @@ def _split(w: Wire, name: str, upper: int, reserved: int) -> tuple[tuple[int, in
 
 
 class _Putter:
-    """Appends fields of one ephemeris by name."""
+    """Bit string to which fields of one ephemeris are appended by name."""
 
     def __init__(self, w: Wire) -> None:
         self.wire = w

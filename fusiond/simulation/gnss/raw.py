@@ -73,12 +73,12 @@ _MS_M = SPEED_OF_LIGHT_M_S * 1e-3
 
 TRUE_ALPHA = (2.0e-8, 1.5e-8, -6.0e-8, -6.0e-8)
 TRUE_BETA = (1.2e5, 6.5e4, -1.3e5, -1.3e5)
-"""The real ionosphere: a day of moderate solar activity, as GPS broadcast them in 2024."""
+"""True ionosphere: a day of moderate solar activity, as GPS broadcast it in 2024."""
 GPS_ALPHA = (1.4e-8, 1.5e-8, -6.0e-8, -1.2e-7)
 GPS_BETA = (1.05e5, 9.8e4, -6.5e4, -3.3e5)
 BEIDOU_ALPHA = (2.4e-8, 4.5e-8, -3.0e-7, 4.2e-7)
 BEIDOU_BETA = (1.25e5, -3.3e4, 1.3e5, 1.3e5)
-"""Broadcast ionosphere of the same sky, in error by about a third at noon."""
+"""Broadcast ionosphere of the same day, wrong by about a third at noon."""
 LEAST_IONOSPHERE = 0.1
 """Least ionosphere, as a share of an ordinary day's."""
 
@@ -104,10 +104,10 @@ class GnssRawOptions:
     ionosphere_sd: float = 0.0
     """One sigma of the day's ionosphere, as a share of an ordinary one: models leave half of it."""
     ionosphere_local_sd: float = 0.0
-    """Likewise of the part of it that each satellite's path meets by itself."""
+    """One sigma of the independent part of each satellite's path, likewise."""
     ionosphere_as_broadcast: bool = False
-    """True if an ordinary day is what both systems broadcast; their models miss it by a third
-    otherwise."""
+    """True if both systems broadcast an ordinary day exactly; else their models are wrong by a
+    third."""
     clock_offset_sd_m: float = 3000.0
     clock_drift_constant_sd_m_s: float = 20.0
     clock_drift_sd_m_s: float = 0.5
@@ -119,7 +119,7 @@ class GnssRawOptions:
     reflection_m: tuple[float, float] = (3.0, 60.0)
     """Additional path length of a reflection: uniform in the logarithm."""
     reflection_s: float = 20.0
-    """Duration, in the mean; exponential."""
+    """Mean duration of a loss, exponentially distributed."""
     latency_s: tuple[float, float] = (0.05, 0.1)
     """Delay from an epoch to its last byte, uniform."""
 
@@ -133,8 +133,8 @@ class GnssRaw:
     """Raw epochs of a whole trajectory, drawn from `rng`; epoch k is at `t_s[k]` of its clock.
 
     `clock_m` (n,) is the true offset of that clock without whole milliseconds, `clock_drift_m_s`
-    (n,) its rate, `inter_system_m` what a system's pseudoranges have more, `ionosphere` what the
-    satellites broadcast.
+    (n,) its rate, `inter_system_m` the excess of a system's pseudoranges, `ionosphere` the
+    broadcast model.
     """
 
     def __init__(
@@ -186,18 +186,18 @@ class GnssRaw:
             Klobuchar("simulation", 0, "C", *beidou),
         )
         self.reflected_m = self._draw_reflections(n, step)
-        """(n, satellites), m: what a satellite's ranges have more, satellites as `satellites`."""
+        """Excess of each satellite's ranges (n, satellites), m; satellites as in `satellites`."""
         # The last ones drawn: what has no such days is as before.
         more = float(rng.standard_normal()) * o.ionosphere_sd if o.ionosphere_sd else 0.0
         own = rng.standard_normal(len(self._slots)) if o.ionosphere_local_sd else 0.0
         factors = 1.0 + more + np.broadcast_to(own * o.ionosphere_local_sd, len(self._slots))
         self.ionosphere_factor: Array = np.maximum(factors, LEAST_IONOSPHERE)
-        """(satellites,), of an ordinary day's."""
+        """Ionosphere of each satellite (satellites,), as a share of an ordinary day's."""
         self.begin(*start)
 
     @property
     def satellites(self) -> tuple[str, ...]:
-        """Names of all, up or not."""
+        """Names of all satellites, above the horizon or not."""
         return tuple(f"{slot.system}{slot.prn:02d}" for slot in self._slots)
 
     def _draw_reflections(self, n: int, step: float) -> Array:
@@ -232,8 +232,8 @@ class GnssRaw:
         self._reset = np.diff(whole, prepend=whole[:1]) != 0.0
 
     def begin(self, week: int, tow_s: float, sky: tuple[int, float] | None = None) -> None:
-        """Set GPS time at the trajectory's 0, and the satellites' positions: those of GPS time
-        `sky`, if different."""
+        """Set GPS time at the trajectory's 0, and optionally another GPS time, `sky`, for the
+        satellites' positions."""
         o = self.options
         self.start = week, tow_s
         sky_week, sky_tow_s = sky or self.start
@@ -287,7 +287,7 @@ class GnssRaw:
         return np.arctan2(east, north) % (2.0 * math.pi), np.arcsin(-down), distance, rate, clock
 
     def _antenna(self, k: int) -> Array:
-        """Position at the true instant of epoch `k`, which is b / c before its clock shows it."""
+        """Antenna's position at the true instant of epoch `k`, b / c before its clock shows it."""
         lat, lon, height = self._position[k]
         early = -float(self.clock_m[k]) / SPEED_OF_LIGHT_M_S
         if abs(early) < 1e-9:
@@ -300,7 +300,8 @@ class GnssRaw:
         )
 
     def epoch(self, k: int) -> RawGnssEpoch:
-        """Epoch number `k` from 0. Asked in the order of time, for a mask keeps its choice."""
+        """Epoch number `k`, from 0. Epochs must be asked in order of time, since a mask keeps its
+        choice."""
         o, t = self.options, float(self.t_s[k])
         week, tow_s = self.gps_time(t)
         azimuth, elevation, distance, rate, clock = self.sky(k)

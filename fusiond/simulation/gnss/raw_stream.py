@@ -1,4 +1,4 @@
-r"""A GNSS receiver's raw stream as bytes: UBX (RXM-RAWX, RXM-SFRBX) or RTCM 3 (MSM7, 1019, 1042).
+r"""Raw stream of a GNSS receiver as bytes: UBX (RXM-RAWX, RXM-SFRBX) or RTCM 3 (MSM7, 1019, 1042).
 
 What is sent with an epoch:
 
@@ -41,7 +41,7 @@ FRAME_S = 30
 
 
 class GnssRawStream:
-    """The bytes of a receiver's epochs, asked in their order."""
+    """Encoder of a receiver's epochs, to be asked in their order."""
 
     def __init__(self, receiver: GnssRaw, raw_format: RawFormat, *, warm: bool = True) -> None:
         self.receiver = receiver
@@ -55,7 +55,7 @@ class GnssRawStream:
         self._models: dict[str, Klobuchar] = {model.system: model for model in receiver.ionosphere}
 
     def bytes_of(self, k: int) -> bytes:
-        """Everything that the receiver sends with epoch `k`."""
+        """Bytes that the receiver sends with epoch `k`."""
         epoch = self.receiver.epoch(k)
         self.counters["epochs"] += 1
         self.counters["signals"] += len(epoch.signals)
@@ -75,7 +75,7 @@ class GnssRawStream:
         return [round((now - self._locked_s[name]) * 1e3) for name in names]
 
     def _starts(self, epoch: RawGnssEpoch) -> bool:
-        """True if all messages are due at once; true one time at most."""
+        """True if all messages are due at once, which happens once at most."""
         if not self._warm or not epoch.signals:
             return False
         self._warm = False
@@ -99,7 +99,7 @@ class GnssRawStream:
         return b"".join(out)
 
     def _second_over(self, before: float, now: float) -> bool:
-        """True if a full second lies between: subframes of all systems end at such ones."""
+        """True if a full second lies in between: subframes of all systems end at full seconds."""
         second = self.receiver.start[1]
         return (now + second) // 1.0 > (before + second) // 1.0
 
@@ -126,7 +126,7 @@ class GnssRawStream:
     def _frame(self, satellite: Ephemeris, week: int, begin: int) -> tuple[tuple[int, ...], ...]:
         """Blocks of the frame that begins at second `begin` of the system's own week.
 
-        Made once, with the ephemeris of its first block: a frame holds no two.
+        A frame is made once, with the ephemeris of its first block: it holds one ephemeris.
         """
         if begin < 0:
             week, begin = week - 1, begin + int(WEEK_S)

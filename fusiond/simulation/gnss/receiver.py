@@ -1,4 +1,4 @@
-"""A GNSS receiver that speaks NMEA 0183: epochs of a true trajectory with errors, as bytes.
+"""Simulated GNSS receiver with NMEA 0183: epochs of a true trajectory with errors, as bytes.
 
 Each epoch's error is white noise plus a first-order Gauss-Markov part, in position and velocity;
 GST states the sum of both. Sentences leave the receiver 50 to 200 ms after their epoch.
@@ -34,7 +34,8 @@ _MODE = {1: "A", 2: "D", 4: "R", 5: "F"}
 class GnssOptions:
     """One sigma of each axis' error; sd pairs are (horizontal, vertical).
 
-    White by default, as filters assume; `correlated_sd_m` adds what a single receiver has besides.
+    Errors are white by default, as filters assume; `correlated_sd_m` adds correlated ones, as a
+    single receiver has.
     """
 
     rate_hz: float = 10.0
@@ -48,7 +49,7 @@ class GnssOptions:
     heading_sd_deg: float = 0.3
     latency_s: tuple[float, float] = (0.05, 0.2)
     outages: tuple[tuple[float, float], ...] = ()
-    """(start, length) in s of the trajectory: epochs without a fix."""
+    """Times without a fix: (start, length) in s of the trajectory."""
     quality: int = 1
     satellites: int = 14
     hdop: float = 0.8
@@ -71,7 +72,7 @@ class GnssFix:
 
 
 class GnssReceiver:
-    """The receiver's epochs over a whole trajectory, drawn at construction from `rng`."""
+    """Receiver whose epochs over a whole trajectory are drawn at construction from `rng`."""
 
     def __init__(self, truth: Truth, options: GnssOptions, rng: np.random.Generator) -> None:
         o = self.options = options
@@ -114,7 +115,7 @@ class GnssReceiver:
         return h, h, v
 
     def fix(self, k: int) -> GnssFix:
-        """Epoch number `k` from 0."""
+        """Fix of epoch number `k`, from 0."""
         lat, lon, height = (float(x) for x in self.position[k])
         north, east, down = (float(x) for x in self.v_ned[k])
         return GnssFix(
@@ -129,7 +130,7 @@ class GnssReceiver:
         )
 
     def nmea(self, k: int, utc_start_ns: int) -> bytes:
-        """The sentences of epoch `k`; `utc_start_ns` is UTC (POSIX ns) at the trajectory's 0."""
+        """Sentences of epoch `k`; `utc_start_ns` is UTC (POSIX ns) at the trajectory's 0."""
         fix = self.fix(k)
         # Receivers print the UTC of their epoch to a hundredth: carry the rounding into the date.
         hundredths = round((utc_start_ns + fix.t_s * 1e9) / 1e7)

@@ -56,7 +56,7 @@ _CRC = _crc_table()
 
 
 def crc24q(data: bytes) -> int:
-    """The check sum of a frame."""
+    """Checksum CRC-24Q of a frame."""
     rest = 0
     for byte in data:
         rest = (rest << 8 & 0xFFFFFF) ^ _CRC[rest >> 16 ^ byte]
@@ -162,7 +162,7 @@ def _msm7(
 
 
 def _signed(value: int | None, bits: int) -> int:
-    """Two's complement; the lowest number says "none", and stands for what does not fit."""
+    """Two's complement; the lowest number means "none" and replaces a value that does not fit."""
     limit = 1 << (bits - 1)
     if value is None or not -limit < value < limit:
         value = -limit

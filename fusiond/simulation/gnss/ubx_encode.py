@@ -98,7 +98,7 @@ def _measurement(s: RawSignal, lock_ms: int) -> bytes:
 
 
 def _power(sd: float | None, unit: float) -> int:
-    """The least n with unit * 2^n >= sd, 0 to 15; 15 for what is not stated."""
+    """Least n, 0 to 15, with unit * 2^n >= sd; 15 for an unstated sigma."""
     if sd is None:
         return 15
     return min(15, math.ceil(math.log2(sd / unit))) if sd > unit else 0

@@ -1,1 +1,1 @@
-"""A simulated double-star centre and terminal."""
+"""Simulated RDSS: ground centre and user terminal of a double-star system."""

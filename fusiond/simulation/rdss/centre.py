@@ -1,14 +1,13 @@
-r"""Simulated RDSS centre: the fix, its error and its delay, or nothing.
+r"""Simulated RDSS centre: fix, error and delay of each reply, or no reply.
 
 The error is that of eq. 4 of paper 000 at the place (`fusiond.aiding.rdss_fix_covariance`): slant
 ranges that are too long by d rho and a height that is too great by dH give
 
     [dN, dE]^T = G d rho + g dH + f
 
-so that north and east hang together, and the height's part of the fix is that of the very height
-that it states (with a height given in the request, of that). f is what a fix has beyond its
-geometry, up to the class, which is a floor. Where the geometry gives no fix the class is all that
-is known.
+so that north and east are correlated. dH is the error of the height that the fix states (of the
+height in the request, if given). f is the rest of the error up to the accuracy class, which is a
+lower bound. Where the geometry gives no fix, the error is that of the class.
 
 Source: delays and accuracy classes from the BeiDou RDSS literature (two geostationary hops up and
 down, 20 m and 100 m classes).
@@ -43,7 +42,7 @@ class RdssOptions:
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     precision_class_m: Literal[20, 100] = 20
     error_sd_m: float | None = None
-    """Horizontal error, alike and independent north and east; None: that of eq. 4."""
+    """Horizontal error (m), equal and independent north and east; None: by eq. 4."""
     satellites_deg: tuple[float, float] = LONGITUDES_DEG
     """Longitudes of the two geostationary satellites, east positive."""
     range_sd_m: float = 15.3
@@ -96,7 +95,7 @@ class SimulatedFix:
 
 
 class RdssCentre:
-    """The centre's side of a fix: the true position at the burst, its error, its delay."""
+    """Centre that draws a fix: true position at the burst, error, delay."""
 
     def __init__(self, truth: Truth, options: RdssOptions, rng: np.random.Generator) -> None:
         self._truth = truth
@@ -106,7 +105,7 @@ class RdssCentre:
         self._last_s = -math.inf
 
     def fix(self, burst_s: float, given_height_m: float | None) -> SimulatedFix:
-        """The fix for a burst at `burst_s`."""
+        """Fix for a burst at `burst_s`."""
         o, rng = self._options, self._rng
         age = burst_s - self._last_s
         kept = math.exp(-age / o.error_correlation_s) if o.error_correlation_s > 0 else 0.0

@@ -1,7 +1,7 @@
 """Simulated short messages between cards: delay, loss, damage, and another vehicle of a convoy.
 
-A terminal that joins has its messages carried to the card that they name; what is for a card that
-nobody has is counted and lost, as it is in the real network.
+The network carries messages of its terminals to the card that they name. A message to an unknown
+card is counted and lost, as in the real network.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from fusiond.simulation.rdss.terminal import RdssTerminal
 
 @dataclass
 class MessageNetwork:
-    """See the module. Probabilities are of each message; `delay_s` from burst to serial line.
+    """Network of terminals. Probabilities apply to each message; `delay_s` is from burst to serial
+    line.
 
     Counters: `envelope_to_text`, `lost`, `damaged` (handed over with a CRC that failed), `nobody`.
     """
@@ -49,7 +50,7 @@ class MessageNetwork:
         terminal.carry = self.carry
 
     def carry(self, sender: int, message: TextRequest, t_s: float) -> None:
-        """A message has left the sender's antenna at `t_s`."""
+        """Carry a message that left the sender's antenna at `t_s`."""
         receiver = self._terminals.get(message.receiver)
         if receiver is None:
             self.counters["nobody"] += 1
@@ -71,8 +72,8 @@ class MessageNetwork:
 
 
 class ConvoyVehicle:
-    """The vehicle behind, `behind_s` later on the same way: it reports its place, sends an order
-    now and then, and confirms texts that ask for it."""
+    """Second vehicle of a convoy, `behind_s` later on the same path: it reports its position, sends
+    orders at times, and confirms texts that request it."""
 
     CARD = 242407
     REPORT_S, ORDER_S = 10.0, 45.0

@@ -1,10 +1,10 @@
-"""RDSS user terminal as its host sees it, in both wire families; no I/O and no clock.
+"""Simulated RDSS user terminal, as seen by its host, in both wire families; no I/O and no clock.
 
-`receive` takes what the host wrote, `take` hands out what the terminal has said by an instant. A
-position request that is accepted is answered by a feedback and, 0.6 to 5 s later, by the position
-that the vehicle had when the terminal's burst left the antenna, with the time of day of that
-instant. What may go wrong is in `RdssOptions` (probabilities) and in the terminal's public
-attributes, which may be changed at any time.
+`receive` takes the host's bytes, `read` returns the terminal's bytes up to an instant. A position
+request that is accepted is answered by a feedback and, 0.6 to 5 s later, by the position that the
+vehicle had when the terminal's burst left the antenna, with the time of day of that instant.
+Failures are set by `RdssOptions` (probabilities) and by the terminal's public attributes, at any
+time.
 
 Source: the public interface documents as in `drivers.rdss`.
 """
@@ -54,7 +54,7 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions
 
 Carry = Callable[[int, TextRequest, float], None]
-"""Callback for a message that has left: the sender's card, the message, the instant (s)."""
+"""Callback for a message that has been sent: sender's card, message, instant (s)."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FOREIGN_USER = 242407
@@ -110,7 +110,7 @@ class RdssTerminal:
         return min([replies, *(due for due, _, _ in self._periodic.values())])
 
     def read(self, t_s: float) -> bytes:
-        """Everything said until `t_s`, in order."""
+        """Bytes sent by the terminal until `t_s`, in order."""
         for name, (first, period, action) in list(self._periodic.items()):
             due = first
             while due <= t_s:
@@ -123,7 +123,7 @@ class RdssTerminal:
         return said
 
     def lift(self, t_s: float) -> None:
-        """Suppression and silence end at `t_s`; the feedback that says so, unasked for.
+        """End suppression and silence at `t_s` and send the unsolicited feedback on it.
 
         Family 4.0: flag 8, as the one vendor has it that documents a notice. Family 2.1: inhibit 0.
         """
@@ -259,8 +259,8 @@ class RdssTerminal:
     def _transmit(
         self, command_4_0: str, command_2_1: str, t_s: float, wrong: Outcome | None = None
     ) -> bool:
-        """Say the feedback; whether a burst left the antenna. `wrong`: what is wrong with what is
-        to be sent."""
+        """Send the feedback and return True if a burst left the antenna. `wrong` is the defect of
+        the request, if any."""
         o = self.options
         if self._centre.mute():
             self.counters["muted"] += 1
