@@ -1,4 +1,4 @@
-"""Studies: the papers' experiments and those behind decisions, one module each.
+"""Studies: experiments of the papers and those behind design decisions, one module each.
 
 A study module has `run_study(runs, seed, progress) -> dict` and `plot(result, path)`; it may have
 `tables(result)` or `table(result)` for people. `runs` None is its own default.
@@ -33,7 +33,7 @@ class About(NamedTuple):
     text: str
     runs: int
     rows: bool = True
-    """True if a run can be a row: not where all are drawn at once."""
+    """True if each run can be stored as a row; False if all runs are drawn at once."""
 
 
 ABOUT = {

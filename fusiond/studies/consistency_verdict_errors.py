@@ -55,9 +55,9 @@ FAULTS = (
 
 
 def window_statistics(nu: Array, k: int) -> tuple[Array, Array]:
-    """Average (runs, w) and rho (runs, w, 8) of the w windows in nu (runs, K + 7 + w, m).
+    """Average NIS (runs, w) and rho (runs, w, 8) of the w windows in nu (runs, K + 7 + w, m).
 
-    The same figures as the monitor's, from cumulative sums.
+    They equal the monitor's figures and are computed from cumulative sums.
     """
     runs, epochs, m = nu.shape
 
@@ -97,7 +97,7 @@ def _largest_lag_p(rho: Array, k: int, m: int) -> Array:
 
 
 def verdicts_with_hysteresis(outside: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
-    """Verdict with hysteresis (runs, epochs), consistent at first, as in the monitor."""
+    """Verdicts with hysteresis (runs, epochs), consistent at first, as in the monitor."""
     state = np.zeros(len(outside), dtype=bool)
     count = np.zeros(len(outside), dtype=int)
     result = np.empty_like(outside)

@@ -1,4 +1,4 @@
-r"""Covariance analysis of a suboptimal filter: its true error beside what it believes.
+r"""Covariance analysis of a suboptimal filter: its true error covariance and its own.
 
 The truth has the full state x (n,), the filter a reduced estimate x^ (m,) of some of it; S (m, n)
 selects those states, so S^T x^ is the estimate in full size, zero where there is no state for it.

@@ -1,4 +1,4 @@
-"""Filter of a study, fed as in the daemon, and a drive for it.
+"""Filter of a study, fed through the daemon's timeline, and a drive for it.
 
 The vehicle is the drive of `fusiond simulate`, 500 s as in paper 003, on IMU samples at `RATE_HZ`.
 """
@@ -49,9 +49,9 @@ def drive_samples(imu: Imu, rng: np.random.Generator) -> Array:
 class DaemonFedFilter:
     """Estimator on the IMU samples (n, 6) of a run, through the daemon's timeline.
 
-    `gap_s` is the longest pause of the IMU that is none. The filter starts at 0 at the navigation
-    state `nav` (10,) with one sigma `sd` (states,). `entries` are the measurements in the order in
-    which they were applied, with their outcomes.
+    `gap_s` is the longest interval of IMU samples that is no gap. The filter starts at 0 at the
+    navigation state `nav` (10,) with one sigma `sd` (states,). `entries` are the measurements in
+    the order in which they were applied, with their outcomes.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class DaemonFedFilter:
         self._timeline.start()
 
     def advance(self, t_s: float, measurements: Iterable[AidingMeasurement] = ()) -> None:
-        """IMU samples up to `t_s` and then `measurements` arrive."""
+        """Add the IMU samples up to `t_s`, then `measurements`."""
         end = round(t_s * RATE_HZ)
         if end > self._given:
             self._buffer.append(self._times[self._given : end], self._samples[self._given : end])

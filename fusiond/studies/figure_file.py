@@ -1,4 +1,4 @@
-"""Figures of studies as files: the same axes of time and the same ticks in all of them."""
+"""Writer of figures of studies, with equal time axes and ticks in all of them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _TICKS = (1.0, 2.0, 5.0)
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a matplotlib figure to `path`. A logarithmic axis has plain figures (0.2, not 2e-1), an
-    axis of seconds says that they are time."""
+    """Write a matplotlib figure to `path`. A logarithmic axis has plain figures (0.2, not 2e-1); an
+    axis of seconds is labelled as time."""
     for axes in figure.axes:
         if axes.get_xlabel() == "s":
             axes.set_xlabel("time, s")

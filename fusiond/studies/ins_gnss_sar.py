@@ -1,5 +1,4 @@
-r"""Study `ins-gnss-sar`: the flight of paper 002 flown, 23 states against 17, four satellites
-against all.
+r"""Study `ins-gnss-sar`: live flight of paper 002, with 23 or 17 states and four or all satellites.
 
 The paper computes covariances; here the daemon's filter flies on its timeline through drawn errors
 of IMU, clock, radar and start (`fusiond.studies.reduced_order.runs`), with the best four BeiDou
@@ -72,7 +71,7 @@ def run_study(
     progress: Progress | None = None,
     seconds: float = flight.DURATION_S,
 ) -> dict[str, Any]:
-    """The study with `runs` flights (default 50) of each sky. All but times repeat exactly."""
+    """Run the study with `runs` flights (default 50) of each sky. All but times repeat exactly."""
     count = DEFAULT_RUNS if runs is None else runs
     if count < 2:
         raise ValueError("runs must be at least 2")
@@ -147,7 +146,7 @@ def _satellites(seconds: float, all_in_view: bool) -> dict[str, float]:
 
 
 def _integration(of: Model, seconds: float) -> dict[str, float]:
-    """Effect of the IMU's rate on a flight without sensor errors."""
+    """Error by the IMU's rate in a flight without sensor errors."""
     nav = flight.true_nav(flight.truth(seconds))
     true = State(nav[0], np.zeros(of.size), np.zeros(STEP_SIZE), of)
     errors, sd = [], []

@@ -1,10 +1,10 @@
 """Parallel Monte Carlo runs with progress, and the bounds of their mean NEES.
 
-A run draws from a generator of its own, made of the study's seed and the run's number, so that no
-result depends on who ran what, in which order, and on how many processes. `run_generator` makes it
-by a spawn key, as numpy intends. The papers' studies mix [seed, number] instead, which keeps runs
-as far apart (numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0]
-are one stream. None of them has two such lists, and their printed figures stand.
+Each run has its own generator, made of the study's seed and the run's number, so that results do
+not depend on the order of runs or on the number of processes. `run_generator` makes it by a spawn
+key, as numpy intends. The papers' studies mix [seed, number] instead, which keeps runs as far apart
+(numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0] are one
+stream. None of them has two such lists, and their printed figures stand.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 TAIL = (1.0 - 0.95) / 2.0
 """Share of either side outside a 95 % interval."""
 MOST_AT_ONCE = 100
-"""Runs handed to a worker together: their hand-over is then no share of the time."""
+"""Runs handed to a worker at once, so that the hand-over takes a negligible share of the time."""
 SHARES = 4
 """Least chunks a worker, given enough runs, so that all end at about the same time."""
 
@@ -42,8 +42,7 @@ class RunsLostError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class LostRun:
-    """A run without a result: its number, how it ended and why
-    (`fusiond.workers.runner_interface`)."""
+    """Run without a result: number, outcome and reason (`fusiond.workers.runner_interface`)."""
 
     number: int
     ended: str
@@ -88,7 +87,8 @@ def step_counter(progress: Progress | None, total: int) -> Callable[[], None]:
 def map_runs(
     work: Callable[[int], R], runs: int, progress: Callable[[], None] | None = None
 ) -> list[R]:
-    """`work` of 0 to `runs` - 1 in order, by workers of `runner_context`, else in this process.
+    """Results of `work` for 0 to `runs` - 1 in order, by workers of `runner_context` or in this
+    process.
 
     Workers leave out the runs that they lost. Raises `RunsLostError` if fewer than two are left.
     """
@@ -98,7 +98,7 @@ def map_runs(
 def map_items(
     work: Callable[[T], R], items: Sequence[T], progress: Callable[[], None] | None = None
 ) -> list[R]:
-    """`work` of each item, as `map_runs`."""
+    """Results of `work` for each item, as in `map_runs`."""
     given = _GIVEN.get()
     found: dict[int, R] = {}
     if given is None:
@@ -139,8 +139,8 @@ def _outcomes(given: _Given, work: Callable[[T], R], items: Sequence[T]) -> Iter
 
 
 def run_generator(seed: int, number: int) -> np.random.SeedSequence:
-    """Random generator of run `number`: child `number` of the seed's sequence, without the others
-    having been made."""
+    """Random generator of run `number`: child `number` of the seed's sequence, made without the
+    other children."""
     return np.random.SeedSequence(seed, spawn_key=(number,))
 
 

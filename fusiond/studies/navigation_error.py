@@ -56,7 +56,7 @@ def nav_error(computed: Array, true: Array) -> Array:
 
 
 def with_error(true: Array, error: Array) -> Array:
-    """The computed state (10,) that is off from `true` by `error` (9,)."""
+    """Computed state (10,) whose error against `true` is `error` (9,)."""
     nav = true.copy()
     rotate_quaternion(nav[6:], -float(error[0]), -float(error[1]), -float(error[2]), True)
     nav[3:6] += error[3:6]

@@ -1,4 +1,4 @@
-r"""Observability of a linear system over a trajectory: rank, Gramian, and what can be estimated.
+r"""Observability of a linear system over a trajectory: rank, Gramian, and estimable states.
 
     x_k = Phi_k x_{k-1},   z_k = H_k x_k + v_k,   v_k ~ N(0, diag(r_k)),   Theta_k = Phi_k ... Phi_1
     O = [ R_k^{-1/2} H_k Theta_k D ]_k            one block of rows an epoch, columns scaled
@@ -145,8 +145,7 @@ class Observability:
     def not_estimated(self, names: Sequence[str], kept: float = KEPT_SIGMA) -> list[str]:
         """States that the measurements cannot estimate: candidates to go, in paper 002's sense.
 
-        That a state is not estimated does not mean that leaving it out is harmless: what it does
-        to the others says the covariance analysis.
+        Omitting such a state can still harm the others; the covariance analysis shows its effect.
         """
         return [name for name, left in zip(names, self.sigma_left, strict=True) if left > kept]
 

@@ -46,13 +46,13 @@ HONEST = (0.7, 1.4)
 GROUPS = {"position": slice(6, 9), "velocity": slice(3, 6), "attitude": slice(0, 3)}
 IN_DEGREES = {"attitude": math.degrees(1.0)}
 KIND_OF = {"gnss": "gnss", "star_tracker": "attitude", "sar": "bearing", "rdss": "rdss"}
-"""File of a device: the kind of measurement."""
+"""Kind of measurement by a device's file."""
 MEMS = {"axes": ("+x", "-y", "-z"), "rate_hz": 100.0, "sensor_class": "mems"}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A model on a paper's vehicle: what is changed of its configuration, and for how long."""
+    """Case of a model on a paper's vehicle: changes of its configuration, and duration."""
 
     paper: str
     label: str
@@ -62,7 +62,7 @@ class Case:
     mems: bool = False
 
     def made(self) -> tuple[Config, Scenario]:
-        """Configuration and vehicle."""
+        """Configuration and vehicle of the case."""
         if not self.mems:
             return configured(self.paper, self.more)
         config, scenario = configured("004", self.more)
@@ -209,7 +209,7 @@ def run_study(
     progress: Progress | None = None,
     cases: tuple[str, ...] = (*CASES, WITHOUT_IMU),
 ) -> dict[str, Any]:
-    """`runs` of each case. The same arguments give the same result."""
+    """Run the study with `runs` of each case. Equal arguments give equal results."""
     count = DEFAULT_RUNS if runs is None else runs
     advance = step_counter(progress, len(cases) * count)
     found: dict[str, Any] = {}

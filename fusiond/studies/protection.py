@@ -1,4 +1,4 @@
-r"""Study `protection`: whether errors stay below the protection levels, and what a level costs.
+r"""Study `protection`: rate of errors beyond the protection levels, and cost of the levels.
 
 A car drives through a town with two GNSS receivers, the second one poorer, and RDSS. One receiver
 or none is at fault for a minute: a step, a ramp, or a swing that its gate lets pass. The navigator
@@ -62,7 +62,7 @@ CONFIDENCE = 0.99
 TICKS_PER_S = 10
 MOST_DRIVES = 1_000_000
 EARTH_M = 6_378_137.0
-"""North of a radian; a fault of 100 m need not be exact to a metre."""
+"""Metres north of a radian; a fault of 100 m need not be exact to a metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +179,7 @@ def drive(case: Case, watched: bool, seed: int) -> dict[str, Array]:
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` drives a case. All but `cost_ratio` repeats exactly.
+    """Run the study with `runs` drives a case. All but `cost_ratio` repeats exactly.
 
     ValueError for fewer than 1 run."""
     count = DEFAULT_RUNS if runs is None else runs
@@ -210,7 +210,7 @@ def run_study(
 
 
 def _of_seed(case: Case, watched: bool, seed: int, k: int) -> dict[str, Array]:
-    """Drives of a seed; those of other seeds than 0 share none with it."""
+    """Drives of a seed; other seeds than 0 share no drive with it."""
     return drive(case, watched, k + MOST_DRIVES * seed)
 
 

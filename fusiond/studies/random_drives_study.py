@@ -1,4 +1,4 @@
-"""Study `drives`: drives drawn at random through the daemon's navigator, each a row of figures.
+"""Study `drives`: random drives through the daemon's navigator, each a row of figures.
 
 A run is 60 s from rest on: speeds, bends and stops drawn as for the fault matrix, a receiver of 1
 to 10 Hz and an RDSS terminal, the car and the devices of `config/vehicle.toml`. Its figures have
@@ -48,7 +48,7 @@ SHOWN = {
 
 
 def drive_run(duration_s: float, seed: int, number: int) -> Row:
-    """The figures of one drive."""
+    """Run one drive and return its figures."""
     path, devices = run_generator(seed, number).spawn(2)
     drive = replace(random_drive(np.random.default_rng(path)), duration_s=duration_s)
     truth, recording = drive.recorded(VEHICLE, devices)
@@ -109,7 +109,7 @@ def run_study(
     progress: Progress | None = None,
     duration_s: float = DURATION_S,
 ) -> dict[str, Any]:
-    """`runs` drives. The same arguments give the same result."""
+    """Run the study with `runs` drives. Equal arguments give equal results."""
     count = runs or DEFAULT_RUNS
     rows = map_runs(partial(drive_run, duration_s, seed), count, step_counter(progress, count))
     figures = []
@@ -139,7 +139,7 @@ def run_study(
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The distribution of each figure over the drives."""
+    """Table of the distribution of each figure over the drives."""
     header = ["", "mean", *(f"{share:g} %" for share in SHARES)]
     rows = [
         [f["figure"], f"{f['mean']:.3f}", *(f"{v:.3f}" for v in f["percentiles"])]

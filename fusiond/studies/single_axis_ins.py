@@ -1,4 +1,4 @@
-r"""Level-axis INS errors aided by positions: the smallest filter with INS drift.
+r"""Single-axis INS error filter aided by positions: the smallest one with INS drift.
 
     p' = v,   v' = a + w_v,   a' = w_a,   z = p + e,   var e = R
 

@@ -1,4 +1,4 @@
-"""Runs of a study as rows of a file: one row a run, each computed once.
+"""Store of a study's runs as rows of a file, so that each run is computed once.
 
 A row is named by study, part of it, digest of what its runs are given, version of fusiond, seed and
 number. The digest is of the function that makes a run and of all its arguments: a case that has
@@ -31,7 +31,7 @@ from fusiond.workers.runner_interface import Outcome
 
 NAME = ("study", "part", "config_digest", "version", "seed", "run")
 AS_IT_IS = 3
-"""A vector of space has as many."""
+"""Longest array stored value by value: a vector of space."""
 _OURS = "fusiond.studies."
 _PLAIN = {
     ("collections", "Counter"),
@@ -63,7 +63,7 @@ class StoredRuns:
 
 
 class StoredPart:
-    """The runs of one function."""
+    """Stored runs of one function."""
 
     def __init__(self, kept: StoredRuns, file: ResumableRows, named: Row) -> None:
         self._kept, self._file, self._named = kept, file, named

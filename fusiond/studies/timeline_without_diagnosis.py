@@ -10,10 +10,11 @@ from fusiond.integrity.series_states import Series
 
 
 class WithoutDiagnosis(Diagnosis):
-    """Leaves all to the filter: its gate, and what detects faults in a federated one."""
+    """Replacement of the diagnosis that accepts everything: the filter's gate and, in a federated
+    one, its fault detection remain."""
 
     def plain(self, measurement: AidingMeasurement) -> Series | None:
-        """Each measurement is handed over by itself."""
+        """Hand over each measurement by itself."""
         return None
 
     def comes(self, measurement: AidingMeasurement, estimator: Estimator) -> Series:

@@ -1,10 +1,10 @@
-r"""Paper 003's own set-up: its state vector (`ins20`), its clock, its way, its filter.
+r"""Set-up of paper 003: state vector (`ins20`), clock model, path, filter.
 
 It prints: 500 s; from the origin to 200 m west and 40 m up (figure 1); states phi, dv, dr, gyro
 constant and Markov drift, accelerometer Markov bias, clock offset and first-order Markov drift;
 pseudorange and rate of the visible BeiDou satellites; unscented filter; errors of position and
-velocity before and after filtering (figure 4, without legible values). It prints no figure of any
-noise, and not how the vehicle goes there. Taken here: it winds 40 deg to both sides of west in
+velocity before and after filtering (figure 4, without legible values). The paper prints neither
+noise figures nor the shape of the path. Taken here: it winds 40 deg to both sides of west in
 between rests of 20 s; an inertial unit of the 1 deg/h class as in `config/tactical.toml`, its 1 mg
 of accelerometer bias all Markov; the sky, receiver and clock of the study's case `open`.
 
@@ -93,7 +93,7 @@ BEFORE = {
     "tilt": "ins_alone",
     "heading": "ins_alone",
 }
-"""Labels of "before filtering" of each quantity."""
+"""Labels of each quantity "before filtering"."""
 COLUMNS = {
     "position m": "position",
     "height m": "height",
@@ -129,8 +129,8 @@ def truth() -> Truth:
 
 @dataclass(slots=True)
 class Trace:
-    """A row of a run at each epoch: errors (n, 9) phi, dv, dr north, east, down, NaN where there is
-    no solution; NEES (n,) of the nine, NaN of what is no filter."""
+    """Trace of a row of one run, by epoch: errors (n, 9) phi, dv, dr north, east, down (NaN without
+    a solution), and their NEES (n,), NaN for rows that are not filters."""
 
     error: Array
     nees: Array
@@ -257,8 +257,8 @@ def _course(traces: Sequence[Trace]) -> dict[str, list[float | None]]:
 
 
 def draw(panels: Any, series: dict[str, Any]) -> None:
-    """Figures 1, 2 and 4 of the paper on `panels` (3, 2): way, velocities, errors before and
-    after."""
+    """Draw figures 1, 2 and 4 of the paper on `panels` (3, 2): path, velocities, errors before and
+    after filtering."""
     first, second, *others = panels.ravel()
     first.plot(series["east_m"], series["up_m"])
     first.set_title("figure 1: the way", loc="left")

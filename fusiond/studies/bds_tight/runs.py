@@ -1,4 +1,4 @@
-r"""Tight BeiDou/INS coupling (paper 003): what is simulated, and one Monte Carlo run of it.
+r"""Monte Carlo runs of tight BeiDou/INS coupling (paper 003): simulation and filters.
 
 A drive of 500 s under the BeiDou-3 sky of a week's instant that is drawn for each run. The
 simulated receiver (`fusiond.simulation.gnss.raw`) observes B1I pseudoranges and rates once a
@@ -67,15 +67,16 @@ from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 Array = NDArray[np.float64]
 
 IMU = Imu(rate_hz=RATE_HZ, gyro_scale_ppm=1e-6, accel_scale_ppm=1e-6)
-"""A car's, as `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1 m/s/sqrt(h).
-Without errors of scale, which the model `ins15` does not have. Paper 003 prints no figures."""
+"""IMU of a car, as in `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1
+m/s/sqrt(h). Without errors of scale, which the model `ins15` does not have. Paper 003 prints no
+figures."""
 LEVER = (0.4, -0.3, -1.2)
 STRETCH_S = (200.0, 400.0)
 """Open sky before the stretch, long enough to estimate the IMU's biases, and after it for the
 recovery."""
 COUNTED_S = 30.0
-"""Errors count from here: velocity has found the heading since the start at rest, which ends after
-20 s."""
+"""Time from which errors count: the vehicle moves off after 20 s, and its velocity has found the
+heading by then."""
 CASES: dict[str, int | None] = {"open": None, "canyon2": 2, "canyon3": 3, "canyon4": 4}
 START_SD = (10.0, 15.0, 0.2, 0.2, 2.0)
 """One sigma of the start: horizontal position and height (m) of a first fix, velocity (m/s), tilt
@@ -83,8 +84,8 @@ and heading (deg) of levelling and a compass."""
 RAW = RawAiding(systems=("C",), lever_arm_m=LEVER)
 LOOSE = GnssAiding(lever_arm_m=LEVER, bias_sd_m=RAW.bias_sd_m, bias_down_sd_m=RAW.bias_down_sd_m)
 ORBIT_ERRORS_M = (0.6, 0.3, 0.0)
-"""Errors of orbits and clocks: BeiDou-3's as published (fusiond.gnss.signal_choice), for the cases;
-half of them and none, to explain the NEES."""
+"""Errors of orbits and clocks: those published of BeiDou-3 (fusiond.gnss.signal_choice) for the
+cases; half of them and none, to explain the NEES."""
 OPTIONS = GnssRawOptions(
     rate_hz=1.0,
     signals=(("C", "2I"),),
@@ -154,7 +155,7 @@ def epochs() -> Array:
 
 
 def in_stretch(t_s: Array) -> NDArray[np.bool_]:
-    """Mask of instants in the stretch: from its start to before its end, as masks hold."""
+    """Mask of instants in the stretch: from its start until before its end, as sky masks apply."""
     return (t_s >= STRETCH_S[0]) & (t_s < STRETCH_S[1])
 
 
@@ -171,7 +172,7 @@ def _true_states() -> tuple[Array, Array]:
 def observe(
     case: str, seed: int, number: int, orbit_error_m: float = ORBIT_ERRORS_M[0]
 ) -> tuple[GnssRaw, list[RawGnssEpoch]]:
-    """Observations of a run of a case; the errors are the same in every case."""
+    """Simulated observations of a run of a case; the errors are the same in every case."""
     rng = np.random.default_rng([seed, number, 1])
     satellites, (first_s, last_s) = CASES[case], STRETCH_S
     masks = () if satellites is None else (canyon(satellites, first_s, last_s - first_s),)
@@ -182,8 +183,8 @@ def observe(
 
 
 class Receiver:
-    """The receiver's own solution: each epoch alone, refused where its residual test fails or its
-    geometry is too poor. `pdop` is that of the last epoch, NaN where nothing was solved."""
+    """Receiver's own solution: each epoch alone, rejected if its residual test fails or its
+    geometry is too poor. `pdop` is of the last epoch, NaN without a solution."""
 
     def __init__(self, simulated: GnssRaw) -> None:
         store = EphemerisStore()
@@ -205,14 +206,14 @@ class Receiver:
 
 
 def broadcast(simulated: GnssRaw) -> list[Ephemeris | Klobuchar]:
-    """Stored messages of a receiver that has been on for a while: every ephemeris and the
-    ionosphere. They hold for longer than a run."""
+    """Messages stored by a receiver after some time of reception: every ephemeris and the
+    ionosphere. They stay valid for longer than a run."""
     everything = {(slot.system, slot.prn) for slot in slots(simulated.options.systems)}
     return [*simulated.broadcast(0.0, everything), *simulated.ionosphere]
 
 
 def fix(found: SinglePoint, t_ns: int) -> PositionFix:
-    """Receiver's message of its solution, with the sigmas of its epoch."""
+    """Position fix of the receiver's solution, with the sigmas of its epoch."""
     lat, lon, height = to_geodetic(*(float(v) for v in found.position))
     axes = ned_axes(lat, lon)
     velocity = sd_velocity = None

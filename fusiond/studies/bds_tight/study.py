@@ -57,7 +57,7 @@ claims less is of little use on a road."""
 GROWTH_S = (30.0, 60.0, STRETCH_S[1] - STRETCH_S[0])
 """Times of growth; the claim on three satellites refers to the first."""
 CLAIM = 1.0 / 3.0
-"""Claimed error with three satellites for 30 s, at most this part of coasting's."""
+"""Claim on three satellites for 30 s: the error is at most this share of coasting's."""
 PAPER = {
     "source": "paper 003: BDS/INS tight coupling, UKF, 500 s",
     "duration_s": 500.0,
@@ -73,7 +73,7 @@ PAPER = {
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 50) of each case. Repeats exactly."""
+    """Run the study with `runs` Monte Carlo runs (default 50) of each case. It repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
@@ -137,7 +137,7 @@ def _case(case: str, runs: Sequence[CaseRun]) -> dict[str, Any]:
 
 
 def _sky(runs: Sequence[CaseRun]) -> dict[str, Any]:
-    """Satellites and PDOP of the stretch; PDOP is that of what least squares solves."""
+    """Satellites and PDOP of the stretch; PDOP belongs to the least-squares solution."""
     few = in_stretch(epochs())
     pdop = np.concatenate([r.pdop[few] for r in runs])
     solved = pdop[np.isfinite(pdop)]

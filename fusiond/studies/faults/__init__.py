@@ -1,5 +1,5 @@
-"""The fault matrix: faults on values, each in the phases of a drive, and what the navigator says.
+"""Fault matrix: faults on values, each in the phases of a drive, and the navigator's response.
 
-`python -m fusiond.studies.faults` runs it; `fusiond.studies.faults.error_sigma_score` says what a
-verdict means.
+`python -m fusiond.studies.faults` runs it; `fusiond.studies.faults.error_sigma_score` defines the
+verdicts.
 """

@@ -1,8 +1,7 @@
 """Command line of the fault matrix and its related studies.
 
-They are: single rows, how well faults are detected, how often none is one, faults that happen now
-and then, what they cost in service, how soon any test could tell them, how sharp sigma is, and what
-is reported of recorded drives."""
+The studies are: rows of the matrix, power of detection, false alarms, occasional faults, loss of
+service, bounds of detection, sharpness of sigma, and reports on recorded drives."""
 
 from __future__ import annotations
 

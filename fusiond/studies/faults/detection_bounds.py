@@ -1,4 +1,4 @@
-r"""Bounds: the earliest possible detection of a fault, and the largest error before it.
+r"""Bounds of detection: earliest possible instant for a fault, and largest error before it.
 
 All of a filter's information on a fault is in its whitened innovations y. A fault adds a signature
 s_k to them: the difference of the innovations of two runs with the same noise, with the fault and
@@ -59,12 +59,12 @@ ROWS: tuple[tuple[str, PhaseName, int], ...] = (
     ("drift_0.1_m_s", "navigating", 62),
     ("drift_0.1_m_s", "coasting", 83),
 )
-"""Rows of the matrix on drawn drives that are lies: fault, phase, drive."""
+"""Rows of the matrix on random drives whose verdict is a lie: fault, phase, drive."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A fault on a drive: of the service study with a receiver, or of the matrix in a phase."""
+    """Fault on a drive: of the service study, with a receiver, or of the matrix, in a phase."""
 
     fault: str
     where: str
@@ -73,7 +73,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class UngatedRun:
-    """Solution of a filter that trusts all, and its innovations by instant (ns) and source."""
+    """Solution of a filter without gates, and its innovations by instant (ns) and source."""
 
     run: Published
     whitened: Mapping[tuple[int, str], tuple[float, ...]]
@@ -86,7 +86,7 @@ def jobs(drives: int) -> list[Job]:
 
 
 def bound_run(job: Job, share: Share) -> dict[str, Any]:
-    """The figures of a job."""
+    """Run a job and return its figures."""
     if job.where in RECEIVERS:
         config, truth, recording = _drive(job.where, job.drive, share)
         draws = part_generator(share, job.drive, 4, ["", *FAULTS].index(job.fault))

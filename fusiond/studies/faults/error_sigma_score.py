@@ -63,7 +63,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A run as seen from outside; `crash` is the exception that ended it."""
+    """Published course of a run: samples and events; `crash` is the exception that ended it."""
 
     samples: Sequence[Sample]
     events: Sequence[Event]
@@ -71,7 +71,7 @@ class Course:
 
 
 def axis_ratio(error: float, sigma: float) -> float:
-    """|error| / sigma; infinite where that is no comparison."""
+    """Ratio |error| / sigma; infinite if error or sigma does not permit the comparison."""
     if not (math.isfinite(error) and math.isfinite(sigma) and sigma > 0.0):
         return math.inf
     return abs(error) / sigma
@@ -127,8 +127,8 @@ def recovered_s(samples: Sequence[Sample], end_s: float) -> float | None:
 
 
 def row_figures(course: Course, reference: Course, begin_s: float, end_s: float) -> dict[str, Any]:
-    """The figures of a row: a fault from `begin_s` to `end_s`. Largest errors are those in mode
-    `navigating` from the begin on, the largest ratio that of any mode."""
+    """Figures of a row with a fault from `begin_s` to `end_s`. Largest errors are in mode
+    `navigating` from the begin on, the largest ratio is in any mode."""
     since = [s for s in course.samples if s.t_s >= begin_s]
     vouched = [s for s in since if s.mode == NAVIGATING]
     worst, of = max(
@@ -170,5 +170,5 @@ def _largest(values: Iterable[float]) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """Finite value; None for others, which JSON cannot hold."""
+    """Value if finite, else None, since JSON has no other numbers."""
     return value if math.isfinite(value) else None

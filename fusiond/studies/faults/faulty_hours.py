@@ -1,9 +1,9 @@
 """Long runs with occasional faults of the library: reports during faults and between them.
 
 The vehicles of `hours`, with the same noise for the same seed. Faults are those that alter a
-recording over a window and need no other drive or configuration; the seed draws which, and when:
-each begins `SPACING_S` after the last one began. Those that last to the end of the matrix's drive
-have a drawn length (`LASTS_S`). Of two receivers one, the other or both are wrong.
+recording over a window and need no other drive or configuration. The seed draws the fault and its
+begin, `SPACING_S` after the previous begin. A fault that lasts to the end of the matrix's drive has
+a drawn length (`LASTS_S`). With two receivers one, the other or both are at fault.
 
 A fault answers for all that follows it until the next begins. It is noticed if an event or another
 mode than `navigating` comes within `SETTLED_S` of its end. Quiet is every second in mode
@@ -56,14 +56,14 @@ LASTS_S = (20.0, 60.0)
 SETTLED_S = 60.0
 """Time after a fault's end within which events belong to it."""
 JUDGED_S = 100.0
-"""A hundred fixes of one a second."""
+"""Time (s) of a hundred fixes at one a second."""
 RECEIVERS = (GNSS, SECOND)
 NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
 
 
 @dataclass(frozen=True, slots=True)
 class TimedFault:
-    """Fault of the library from `begin_s` to `end_s`, on all receivers but one it may spare."""
+    """Fault of the library from `begin_s` to `end_s`, on all receivers or on all but one."""
 
     fault: str
     begin_s: float
@@ -91,8 +91,7 @@ def faults_of(kind: Kind) -> tuple[str, ...]:
 
 
 def timed_faults(kind: Kind, seed: int, duration_s: float) -> list[TimedFault]:
-    """Faults of an hour, without the last; the last so long before the end as two are apart at
-    least."""
+    """Faults of an hour; the last one begins before the end by the least spacing or more."""
     rng = np.random.default_rng([seed, 3])
     names, found = faults_of(kind), []
     begin_s = 0.0
@@ -107,8 +106,8 @@ def timed_faults(kind: Kind, seed: int, duration_s: float) -> list[TimedFault]:
 
 
 def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
-    """Figures of an hour of the kind that is the seed's turn: `row_figures` of each fault until the
-    next, and those of `hours.hour_of` for the quiet between faults."""
+    """Figures of an hour, whose kind follows from the seed: `row_figures` of each fault until the
+    next, and figures of `hours.hour_of` for the quiet between faults."""
     name = tuple(KINDS)[seed % len(KINDS)]
     kind = KINDS[name]
     config = kind.config()

@@ -92,7 +92,7 @@ def circuit_legs(legs: tuple[Leg, ...], duration_s: float) -> Path:
 
 
 def around_town(duration_s: float) -> Path:
-    """The town of the matrix."""
+    """Drive around the town of the matrix."""
     return circuit_legs(TOWN_LEGS, duration_s)
 
 
@@ -117,7 +117,7 @@ class Kind:
     drive: Drive
 
     def config(self) -> Config:
-        """Input of the navigator."""
+        """Configuration of the navigator."""
         settings = VEHICLE.model_dump(exclude_unset=True)
         settings["imu"]["rate_hz"] = RATE_HZ
         if self.drive.second:
@@ -167,8 +167,8 @@ KINDS = {
 
 
 def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
-    """An hour of the kind that is the seed's turn: what was told, by event and source, how often
-    in an hour may be, tests, seconds beyond five sigma by quantity, resident memory."""
+    """Figures of an hour, whose kind follows from the seed: events by code and source, their
+    allowed number an hour, tests, seconds beyond five sigma by quantity, resident memory."""
     name = tuple(KINDS)[seed % len(KINDS)]
     kind = KINDS[name]
     config = kind.config()

@@ -30,7 +30,7 @@ def saturated(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def stuck(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The sample that the window begins with, again and again."""
+    """Repeat the first sample of the window."""
     samples, window = r.samples.copy(), r.window(begin_s, length_s)
     samples[window] = samples[np.flatnonzero(window)[0]]
     return replace(r, samples=samples)
@@ -44,7 +44,7 @@ def all_zero(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def dead_axis(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The gyro of the yaw axis says zero."""
+    """Set the gyro of the yaw axis to zero."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s), YAW_AXIS] = 0.0
     return replace(r, samples=samples)
@@ -118,7 +118,7 @@ def mount_turned(
 
 
 def silent(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """No sample comes."""
+    """Remove all samples of the window."""
     return r.without(r.window(begin_s, length_s))
 
 
@@ -137,7 +137,7 @@ def small_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def not_numbers(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """No figure is a number."""
+    """Set all values of the window to NaN."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s)] = np.nan
     return replace(r, samples=samples)
@@ -151,21 +151,21 @@ def stamp_ahead(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def stamps_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The stamps of the window run backwards."""
+    """Reverse the stamps of the window."""
     stamps, window = r.stamps.copy(), r.window(begin_s, length_s)
     stamps[window] = stamps[window][::-1]
     return replace(r, stamps=stamps)
 
 
 def force_in_g(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Specific force in standard gravities."""
+    """Express specific force in standard gravities."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s), 3:] /= STANDARD_GRAVITY_M_S2
     return replace(r, samples=samples)
 
 
 def rate_in_deg_s(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Rates in degrees a second."""
+    """Express rates in degrees a second."""
     samples = r.samples.copy()
     samples[r.window(begin_s, length_s), :3] /= DEG
     return replace(r, samples=samples)

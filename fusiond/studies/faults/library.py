@@ -1,8 +1,8 @@
 """Faults of the matrix by name: change, duration and phases.
 
-`aligning` begins at rest, before the first heading; `navigating` on a straight at 20 m/s with all
-measurements; `coasting` in an outage of all fixes, where the faults of IMU and wheels begin in its
-midst and those of fixes with the first that come back.
+Phase `aligning` is at rest, before the first heading; `navigating` on a straight at 20 m/s with all
+measurements; `coasting` in an outage of all fixes: faults of IMU and wheels begin in the middle of
+it, faults of fixes with the first fix after it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Configure = Callable[[Config], Config]
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Phase: start of faults of IMU, wheels and fixes, and the outage (start, end), in s."""
+    """Phase of a drive: begin of faults of IMU, wheels and fixes, and outage (start, end), in s."""
 
     imu_s: float
     fix_s: float
@@ -56,8 +56,8 @@ class Fault:
     """Fault: `alter` changes the recording for `length_s` from the phase's start, or from
     `begin_s`.
 
-    `configure` changes the configuration that the navigator gets, not the vehicle. With neither the
-    drive itself is what may be taken for something else, and nothing is wrong.
+    `configure` changes the navigator's configuration, not the vehicle. A row with neither has no
+    fault: its drive itself may be mistaken for one.
     """
 
     alter: Alter | None = None
@@ -84,7 +84,7 @@ _OFF = (Leg(REST_S), Leg(8, speed_m_s=14.0), Leg(12), Leg(8, turn_deg=90.0))
 
 
 def _creeping(speed_m_s: float, duration_s: float) -> Path:
-    """Town speed, and from 80 s on a crawl."""
+    """Drive at town speed, from 80 s on at a crawl."""
     legs = (*_OFF, Leg(17), Leg(20, speed_m_s=speed_m_s), Leg(duration_s))
     return follow(legs, duration_s, course_deg=40.0)
 
@@ -105,7 +105,7 @@ def _turning(rate_deg_s: float, duration_s: float) -> Path:
 
 
 def _reversing(duration_s: float) -> Path:
-    """Backwards at 5 m/s first, then forwards."""
+    """Drive backwards at 5 m/s, then forwards."""
     legs = (Leg(REST_S), Leg(6, speed_m_s=-5.0), Leg(20), Leg(6, speed_m_s=0.0), *_OFF[1:])
     return follow((*legs, Leg(duration_s)), duration_s, course_deg=40.0)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 def table(header: Iterable[str], lines: Iterable[tuple[str, ...]]) -> str:
-    """A table of Markdown."""
+    """Format a table in Markdown."""
     header = tuple(header)
     return "\n".join(
         "| " + " | ".join(line) + " |" for line in (header, ("---",) * len(header), *lines)
@@ -15,5 +15,5 @@ def table(header: Iterable[str], lines: Iterable[tuple[str, ...]]) -> str:
 
 
 def number(value: float | None, none: str) -> str:
-    """Value with three significant figures, `none` for None."""
+    """Format a value with three significant figures, `none` for None."""
     return none if value is None or math.isnan(value) else f"{value:.3g}"

@@ -1,14 +1,13 @@
-"""Drives, receivers and IMUs of `sharpness` and `service`, with noise matched to the filter's
-settings.
+"""Simulated drives, receivers and IMUs for `sharpness` and `service`, with noise as the filter's.
 
-Everything a run draws comes from a `SeedSequence` of its drive's number and its share: drives of
-the share `looked` may be looked at while the code is changed, those of `scored` are only scored.
+All random numbers of a run come from a `SeedSequence` of its drive's number and share: drives of
+the share `looked` may be inspected while the code is changed, those of `scored` are scored alone.
 
     SeedSequence(38, spawn_key=(0, k, ...))   drive k of those that are looked at
     SeedSequence(38, spawn_key=(1, k, ...))   drive k of those that are scored
 
-What follows says of what: 0 path, 1 IMU, 2 receiver, 3 what nobody has measured (the lever arm),
-4 and the number of the fault when it begins. So a drive has the same noise under every fault.
+The rest of the key names the part: 0 path, 1 IMU, 2 receiver, 3 unmeasured quantities (the lever
+arm), 4 with the fault's number the fault's begin. So a drive has the same noise under every fault.
 
 A receiver's error is white, or shared: a Gauss-Markov process of `SHARED_S` beside white noise. The
 car neither slides nor is its unit askew, and stamps are exact. What of this the configuration says
@@ -87,7 +86,7 @@ class Receiver:
 
 
 CODE = Receiver("code", 1, (1.5, 3.0), (0.08, 0.12))
-"""Receiver of the prototype to which figures of issue and page refer."""
+"""Receiver of the prototype to which published figures refer."""
 SHARING = Receiver("code, shared errors", 1, (0.8, 1.6), (0.08, 0.12), (1.5, 3.0))
 RTK = Receiver("RTK", 4, (0.02, 0.04), (0.03, 0.05))
 _HALF = 0.5**0.5
@@ -107,7 +106,7 @@ class Vehicle:
     told: Told = "all"
 
     def config(self) -> Config:
-        """Input of the navigator."""
+        """Configuration of the navigator."""
         gnss: dict[str, Any] = {"lever_arm_m": ANTENNA_M} if self.lever_given else {}
         slip = {"enabled": self.told != "all", "lever_arm_m": AXLE_M}
         if self.told != "class":
@@ -141,7 +140,7 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A drive: who it is told to, what is true, and what was said of it."""
+    """Scene of a drive: configuration of the navigator, truth, and recorded sensor data."""
 
     config: Config
     truth: Truth
@@ -149,7 +148,7 @@ class Scene:
 
 
 def scene(vehicle: Vehicle, share: Share, number: int, duration_s: float) -> Scene:
-    """Drive `number` of a share, with that vehicle."""
+    """Make the scene of drive `number` of a share with a vehicle."""
     path, imu, receiver, unknown = (part_generator(share, number, k) for k in range(4))
     config, unit = vehicle.config(), vehicle.unit()
     drive = random_drive(path, duration_s)

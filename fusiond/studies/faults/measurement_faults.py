@@ -58,7 +58,7 @@ def _fixes(r: Recording, begin_s: float, end_s: float) -> list[Received]:
 
 
 def except_source(alter: Alter, source: str) -> Alter:
-    """Change to a recording, except to that source."""
+    """Restrict a change of a recording to the other sources."""
 
     def altered(r: Recording, begin_s: float, length_s: float) -> Recording:
         turns = list(dict.fromkeys(item.measurement.source for item in r.received))
@@ -85,12 +85,12 @@ def _north(fix: PositionFix, north_m: float) -> PositionFix:
 def position_step(
     r: Recording, begin_s: float, length_s: float, north_m: float = STEP_M
 ) -> Recording:
-    """Positions too far to the north."""
+    """Offset positions to the north."""
     return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, north_m))
 
 
 def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Position 0 N 0 E."""
+    """Set positions to 0 N 0 E."""
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, lat_rad=0.0, lon_rad=0.0)
     )
@@ -108,7 +108,7 @@ def frozen_fix(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def velocity_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Horizontal velocity with the wrong sign, position honest."""
+    """Reverse horizontal velocities; positions unchanged."""
 
     def turned(fix: PositionFix, _: float) -> PositionFix:
         assert fix.v_ned_m_s is not None
@@ -119,7 +119,7 @@ def velocity_reversed(r: Recording, begin_s: float, length_s: float) -> Recordin
 
 
 def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S) -> Recording:
-    """Positions drift to the north, velocity honest."""
+    """Let positions drift to the north; velocities unchanged."""
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, since_s: _north(fix, north_m_s * since_s)
     )
@@ -161,7 +161,7 @@ def velocity_old(r: Recording, begin_s: float, length_s: float, age_s: float = 1
 
 
 def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Velocity to the north that grows by 0.1 m/s^2, position honest."""
+    """Add a velocity to the north that grows by 0.1 m/s^2; positions unchanged."""
 
     def grown(fix: PositionFix, since_s: float) -> PositionFix:
         assert fix.v_ned_m_s is not None
@@ -174,9 +174,9 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
 def stamped_too_new(
     r: Recording, begin_s: float, length_s: float, delay_s: float = DELAY_S
 ) -> Recording:
-    """Fixes that are older than their stamps.
+    """Stamp fixes later than they are valid.
 
-    As of a line that is slow from its first byte on, and a receiver whose time nobody knows."""
+    A slow line delays fixes so, for a receiver without a known time."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
     ns = round(delay_s * 1e9)
     return r.with_received(
@@ -199,7 +199,7 @@ def false_burst(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def tiny_sigma(r: Recording, begin_s: float, length_s: float, sd_m: float = TINY_SD_M) -> Recording:
-    """Errors as always, and a stated sigma of 1e-9 m."""
+    """State a sigma of 1e-9 m; errors unchanged."""
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(sd_m,) * 3)
     )
@@ -224,21 +224,21 @@ def small_sigma(r: Recording, begin_s: float, length_s: float, factor: float) ->
 
 
 def infinite_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A stated sigma that is infinite."""
+    """State an infinite sigma."""
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(math.inf,) * 3)
     )
 
 
 def nan_latitude(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Latitude is not a number."""
+    """Set the latitude to NaN."""
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, lat_rad=math.nan)
     )
 
 
 def huge_height(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A height of 1e300 m."""
+    """Set the height to 1e300 m."""
     return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, height_m=HUGE))
 
 
@@ -253,17 +253,17 @@ def _at_speed(r: Recording, begin_s: float, length_s: float, north_m_s: float) -
 
 
 def huge_speed(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A velocity of 1e300 m/s to the north."""
+    """Set the velocity to 1e300 m/s to the north."""
     return _at_speed(r, begin_s, length_s, HUGE)
 
 
 def impossible_speed(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """A velocity of 2,000 knots to the north."""
+    """Set the velocity to 2,000 knots to the north."""
     return _at_speed(r, begin_s, length_s, FAST_M_S)
 
 
 def repeated(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Every fix comes twice."""
+    """Repeat every fix once."""
     return r.with_received([*r.received, *_fixes(r, begin_s, begin_s + length_s)])
 
 
@@ -276,7 +276,8 @@ def from_future(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Offset fixes by 80 m for 0.6 s, then a tunnel, and a first fix behind it 80 m off."""
+    """Offset fixes by 80 m for 0.6 s, remove those in a tunnel, and offset the first fix after it
+    by 80 m."""
     burst = _changed(r, begin_s, MULTIPATH_S, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M))
     out_s = begin_s + length_s
     tunnel = burst.withheld(begin_s + MULTIPATH_S, out_s)
@@ -295,7 +296,7 @@ def no_fix_yet(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def rdss_step(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """RDSS fixes 500 m to the north."""
+    """Offset RDSS fixes by 500 m to the north."""
 
     def moved(fix: DelayedFix, _: float) -> DelayedFix:
         return replace(fix, lat_rad=_north_of(fix.lat_rad, fix.height_m, STEP_M))
@@ -328,17 +329,17 @@ def _wheels_times(r: Recording, begin_s: float, length_s: float, factor: float) 
 def wheels_scaled(
     r: Recording, begin_s: float, length_s: float, factor: float = WHEEL_SCALE
 ) -> Recording:
-    """Speeds too large by a factor, by a fifth."""
+    """Multiply wheel speeds by a factor, default 1.2."""
     return _wheels_times(r, begin_s, length_s, factor)
 
 
 def wheels_locked(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The wheels stand still."""
+    """Set wheel speeds to zero."""
     return _wheels_times(r, begin_s, length_s, 0.0)
 
 
 def wheels_delayed(r: Recording, begin_s: float, length_s: float, delay_s: float) -> Recording:
-    """Speeds that are older than their stamps."""
+    """Stamp wheel speeds later than they are valid."""
     ns = round(delay_s * 1e9)
     begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
     received = []
@@ -383,7 +384,7 @@ def scattered_positions(r: Recording, begin_s: float, length_s: float, sd_m: flo
 
 
 def too_high(r: Recording, begin_s: float, length_s: float, up_m: float) -> Recording:
-    """Heights too large."""
+    """Offset heights upwards."""
     return _changed(
         r,
         begin_s,
@@ -394,5 +395,5 @@ def too_high(r: Recording, begin_s: float, length_s: float, up_m: float) -> Reco
 
 
 def wheels_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Speeds with the wrong sign."""
+    """Reverse the sign of wheel speeds."""
     return _wheels_times(r, begin_s, length_s, -1.0)

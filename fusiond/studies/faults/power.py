@@ -26,13 +26,13 @@ from fusiond.studies.faults.sensor_data import Alter, Drive
 
 LASTS_S = 60.0
 BEGINS = 10
-"""Faults begin at as many different seconds."""
+"""Number of different seconds at which faults begin."""
 DRIVE = Drive(duration_s=PHASES["navigating"].fix_s + BEGINS + LASTS_S + 10.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A kind of fault: its sizes in `unit`, and how a recording is altered by one."""
+    """Kind of fault: its sizes in `unit`, and the change of a recording by a size."""
 
     unit: str
     sizes: tuple[float, ...]
@@ -86,13 +86,13 @@ CELLS = tuple((name, size) for name, sweep in SWEEPS.items() for size in sweep.s
 
 
 def jobs(runs: int, seed: int) -> list[tuple[str, float, int]]:
-    """Kind, size and seed of every run; all of a seed together, as they share a drive without a
-    fault, and what has been run so far covers every size."""
+    """Kind, size and seed of every run, ordered by seed: runs of a seed share the fault-free drive,
+    and an unfinished study covers every size."""
     return [(name, size, k) for k, (name, size) in product(range(seed, seed + runs), CELLS)]
 
 
 def power_run(job: tuple[str, float, int]) -> dict[str, Any]:
-    """The figures of one run."""
+    """Make one run and return its figures."""
     name, size, seed = job
     alter = SWEEPS[name].altered_by(size)
     begin_s = PHASES["navigating"].fix_s + seed % BEGINS
@@ -109,7 +109,7 @@ def power_run(job: tuple[str, float, int]) -> dict[str, Any]:
 
 
 def powers(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line a kind and size, of the runs of `power_run`."""
+    """Detection power by kind and size, from the runs of `power_run`."""
     lines = []
     for name, size in CELLS:
         rows = [row for row in found if (row["fault"], row["size"]) == (name, size)]

@@ -1,8 +1,8 @@
-"""Drives drawn at random for the matrix: what holds on one town drive may be luck.
+"""Random drives for the matrix, whose one town drive may be a lucky one.
 
-Speeds of 4 to 32 m/s, bends of 10 to 120 deg at up to 3 m/s^2, straights of up to 40 s, stops of
-up to 25 s, any course, some bank, a receiver of 1, 2, 5 or 10 Hz. The instants of the faults stay
-those of the phases, so that they meet the vehicle wherever it is: at rest, in a bend, braking.
+Speeds of 4 to 32 m/s, bends of 10 to 120 deg at up to 3 m/s^2, straights of up to 40 s, stops of up
+to 25 s, any course, some bank, a receiver of 1, 2, 5 or 10 Hz. Faults begin at the instants of the
+phases and so meet the vehicle in any motion: at rest, in a bend, braking.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 
 @lru_cache(maxsize=8)
 def drive_of_number(number: int) -> Drive:
-    """The drive of a number."""
+    """Make the random drive of a number."""
     return random_drive(np.random.default_rng([2026, number]))
 
 
 def random_drive(rng: np.random.Generator, duration_s: float = DURATION_S) -> Drive:
-    """The drive that a generator draws."""
+    """Draw a drive from a random generator."""
     legs = _legs(rng, duration_s)
     course_deg, bank_ratio = rng.uniform(0.0, 360.0), rng.uniform(-0.1, 0.02)
 

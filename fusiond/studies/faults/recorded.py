@@ -1,4 +1,4 @@
-"""Faults put into a recorded drive: vibration, a road and errors that nobody simulated.
+"""Faults put into recorded drives, with their real vibration, roads and errors.
 
 A recorded drive has no true attitude and velocity. Its own fault-free smoothed solution, of all
 measurements, stands for the truth, and errors are compared with the sigmas of both together:
@@ -77,8 +77,8 @@ class Place:
 
 
 def smooth(place: Place) -> None:
-    """Write the smoothed solution that runs are compared with. The fixes' errors count as white:
-    what they share is in the runs, too, and no difference shows it."""
+    """Write the smoothed solution that runs are compared with. Errors of fixes count as white:
+    their shared part is in the runs as well, so that the difference does not show it."""
     config = load_config(place.config)
     gnss = config.aiding.get("gnss")
     if isinstance(gnss, GnssAiding):
@@ -109,7 +109,7 @@ def recorded_rows(
 
 
 def run_recorded(row: RecordedRow, place: Place) -> dict[str, Any]:
-    """The figures of a row."""
+    """Run a row and return its figures."""
     fault = EVERY[row.fault]
     part = _part(row, place)
     begin_s = part.lead_s
@@ -192,7 +192,7 @@ def _cut(r: Recording, from_s: float, length_s: float) -> Recording:
 
 
 def _moved(item: Received, by_ns: int) -> Received:
-    """Item on a clock that is behind by so much."""
+    """Move an item to a clock that is behind by an offset."""
     m, t, seen = item.measurement, item.t_ns - by_ns, item.seen_ns - by_ns
     assert isinstance(m, FUSED)
     return Received(t, seen, replace(m, t_seen_ns=seen, stamp=MonotonicStamp(t)))

@@ -1,10 +1,10 @@
-"""Fault-free recorded drives: false reports, and sigma against error in outages or by a reference.
+"""Fault-free recorded drives: false reports, and error against sigma in outages or by a reference.
 
-Each drive goes through the navigator by its class alone: what the owner of the vehicle knows, axes
-and class, and nothing of noise. Once as it is, and then with outages (`Drive.outages`), set by set.
-A reference is what is not fused at that instant: the fixes that are withheld, or a truth of another
-device. Its sigma counts beside the published one; it is compared at the instants nearest to its
-own, `GAP_S` at most. Lever arms of 5 cm are passed over.
+Each drive passes the navigator with the knowledge of the vehicle's owner: axes and sensor class, no
+noise figures. It runs once unchanged, then with each set of outages (`Drive.outages`). The
+reference is not fused: withheld fixes, or a truth by another device. Its sigma adds to the
+published one; the nearest instants are compared, `GAP_S` apart at most. Lever arms of 5 cm are
+neglected.
 
 told        events after the first `navigating`, but for those that say all is well
 own         published horizontal sigma over that of the filter's own covariance, at each tick
@@ -110,7 +110,7 @@ DRIVES: dict[str, Drive] = {
 
 @dataclass(frozen=True, slots=True)
 class RealJob:
-    """Drive of a data folder with one set of its outages; None: without."""
+    """Drive of a data folder with one set of its outages, or None."""
 
     data: Path
     drive: str
@@ -132,7 +132,7 @@ def jobs(data: Path) -> list[RealJob]:
 
 
 def real_run(job: RealJob) -> dict[str, Any]:
-    """The figures of a job."""
+    """Run a job and return its figures."""
     drive = DRIVES[job.drive]
     config = Config.model_validate(drive.settings)
     whole, reference, begin_s = _read(job.data / drive.folder, drive.wheels, drive.truth)

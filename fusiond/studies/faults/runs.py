@@ -1,7 +1,7 @@
 """Row of the matrix: a drive, its fault, the navigator and its output.
 
-The navigator is fed as the daemon feeds it: at each tick the samples that have come, then the
-measurements in order of arrival, then the filter as far as the IMU reaches.
+The navigator is fed as in the daemon: at each tick the samples that have arrived, then the
+measurements in order of arrival; then the filter runs up to the last sample.
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ no error."""
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A fault in a phase."""
+    """Row of the matrix: a fault in a phase."""
 
     fault: str
     phase: PhaseName
 
 
 def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
-    """Matrix, or a part of it."""
+    """Rows of the matrix, or of a part of it."""
     return [
         Row(name, p)
         for name, fault in FAULTS.items()
@@ -82,7 +82,8 @@ def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
 
 
 def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
-    """The figures of a row; the same seed gives the same. `drive` as of `on_random_drive`."""
+    """Run a row and return its figures, equal for equal seeds. `drive` is made by
+    `on_random_drive`."""
     return {
         "fault": row.fault,
         "phase": row.phase,
@@ -106,7 +107,7 @@ def on_random_drive(fault: Fault, drive: int | None) -> Fault:
 
 
 def run_fault(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
-    """The figures of a fault in a phase."""
+    """Run a fault in a phase and return its figures."""
     begin_s = fault.begins_s(phase)
     harmless = fault.alter is None and fault.configure is None
     end_s = begin_s if harmless else min(begin_s + fault.length_s, DURATION_S)
@@ -163,8 +164,8 @@ def run_navigator(
     watch: Callable[[Navigator], None] | None = None,
     every_ticks: int = TICKS_PER_S,
 ) -> Course:
-    """Feed a navigator with a recording; `look` at its solution every so many ticks from the first
-    of them, row 0, on: at each second."""
+    """Feed a navigator with a recording and call `look` with its solution at intervals, by default
+    each second, from row 0 on."""
     samples: list[Sample] = []
     events: list[Event] = []
     now_s = 0.0
@@ -210,7 +211,7 @@ class _Units:
             self._said.sort(key=lambda sample: sample.t_seen_ns)
 
     def give(self, navigator: Navigator, now_ns: int) -> None:
-        """Results so far."""
+        """Hand over the samples that have arrived."""
         if self._choice is None:
             r, given = self._recording, self._given
             self._given = end = int(np.searchsorted(r.imu_seen, now_ns, side="right"))
@@ -266,12 +267,13 @@ def _ratio(errors: Sequence[float], sigmas: Sequence[float]) -> float:
 
 
 def _wrapped(angle_rad: float) -> float:
-    """Into -pi to pi; not a number stays none."""
+    """Wrap an angle to [-pi, pi]; NaN stays NaN."""
     return math.remainder(angle_rad, 2.0 * math.pi) if math.isfinite(angle_rad) else math.nan
 
 
 def _position_error_m(solution: Solution, true: Array) -> list[float]:
-    """North, east, down; from the true latitude, longitude (rad) and height (m)."""
+    """Position error north, east, down (m) from the true latitude, longitude (rad) and height
+    (m)."""
     unit = metres_to_geodetic(true[0:1], true[2:3], np.ones((1, 3)))[0]
     lat, lon, height = true.tolist()
     difference = (

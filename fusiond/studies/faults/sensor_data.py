@@ -33,10 +33,10 @@ BEND_S = 90.0
 RDSS_EVERY_S = 11.0
 GNSS, SECOND = "gnss", "second"
 """Names of the receivers in the configuration."""
-"""One second more than the service frequency of a 10 s card."""
+"""Interval of RDSS fixes: one second more than the service interval of a 10 s card."""
 WHEEL_EVERY_S = 0.1
 WHEEL_SD_M_S = 0.1
-"""The default of `[aiding.wheel]`."""
+"""Sigma of wheel speeds: the default of `[aiding.wheel]`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,9 @@ class Received:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """IMU samples (n, 6) rate and force in sensor axes, their stamps (n,) and arrivals (n,) in ns,
-    and all else in order of arrival. `spare` has the samples of a second unit, in its own axes."""
+    """Sensor data of a drive. IMU samples (n, 6) are rate and force in sensor axes, with stamps
+    (n,) and arrivals (n,) in ns; the other measurements follow in order of arrival. `spare` has the
+    samples of a second unit, in its own axes."""
 
     stamps: Stamps
     imu_seen: Stamps
@@ -93,7 +94,7 @@ class Recording:
 
 
 Alter = Callable[[Recording, float, float], Recording]
-"""Fault of a recording, from an instant (s) on, for a duration (s)."""
+"""Change of a recording by a fault, from an instant (s) on, for a duration (s)."""
 
 TOWN_LEGS = (
     Leg(8, speed_m_s=14.0),
@@ -121,7 +122,7 @@ def town(duration_s: float) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A motion and the sensors on board. No vibration: what is quiet need not be at rest."""
+    """Motion and sensors on board, without vibration: a quiet IMU need not be at rest."""
 
     path: Callable[[float], Path] = town
     wheels: bool = False
@@ -168,8 +169,8 @@ class Drive:
 
 
 def _spare(car: Scenario, truth: Truth, rng: np.random.Generator) -> Array:
-    """Samples of a car's spare (n, 6): errors of its own, as large, and misaligned by what the
-    configuration allows."""
+    """Samples of a car's spare IMU (n, 6), with independent errors of the same size and the
+    misalignment that the configuration allows."""
     spare = car.imu.spare
     assert spare is not None
     misalignment = np.add(spare.mounting_deg, rng.normal(0.0, spare.mounting_sd_deg, 3))

@@ -1,9 +1,9 @@
 """Loss of service by a fault of a minute, and after an outage.
 
-A drawn drive of `DURATION_S`, the MEMS unit of `config/vehicle.toml`, one receiver of one fix a
-second, no slip, noise told.
-Each of `FAULTS` begins at an instant drawn between `BEGINS_S` and lasts `LASTS_S`; the same drive
-with nothing wrong, at the same instants, is what is steady. What is judged is published at 10 Hz:
+A run is a random drive of `DURATION_S` with the MEMS unit of `config/vehicle.toml`, one receiver at
+one fix a second, no slip, and configured noise. Each of `FAULTS` begins at an instant drawn between
+`BEGINS_S` and lasts `LASTS_S`; the same drive without a fault is the steady run. Figures are of the
+solution published at 10 Hz:
 
 out        in another mode than `navigating` from the fault's begin to the run's end; `after` of it
            behind the fault's end
@@ -61,7 +61,7 @@ STAYS_S = 5.0
 OUTAGES_S = {150.0: 10.0, 300.0: 30.0, 450.0: 60.0}
 """Length of an outage by its start."""
 QUIET_S = 90.0
-"""Time after an outage that is studied, and no longer."""
+"""Time (s) studied after an outage."""
 OUTAGE_DURATION_S = 600.0
 IMU, VELOCITY, POSITION, NONE = "IMU", "velocity", "position, latency, freeze", "nothing wrong"
 
@@ -113,7 +113,7 @@ FAULTS: dict[str, tuple[str, Alter]] = {
     "fixes frozen": (POSITION, measurement.frozen_fix),
     "velocity reversed": (VELOCITY, measurement.velocity_reversed),
 }
-"""Group and alteration of each. Of receivers to the north."""
+"""Group and change of each fault; offsets of receivers are to the north."""
 RECEIVERS = {receiver.name: receiver for receiver in (CODE, SHARING)}
 AFTER_OUTAGES = {
     f"{receiver.name}, {rate:g} Hz": replace(receiver, rate_hz=rate)
@@ -142,7 +142,7 @@ def jobs(drives: int) -> list[Job]:
 
 
 def service_run(job: Job, share: Share) -> dict[str, Any]:
-    """The figures of a job."""
+    """Run a job and return its figures."""
     if job.fault is None:
         return _outages(job, share)
     group, alter = FAULTS[job.fault] if job.fault else (NONE, None)
@@ -217,7 +217,7 @@ def settled(run: Published, steady: Published, after: Bools) -> dict[str, float 
 
 
 def _outages(job: Job, share: Share) -> dict[str, Any]:
-    """Result of each outage, from the first fix that comes on."""
+    """Result of each outage, from the first fix after it on."""
     receiver = AFTER_OUTAGES[job.receiver]
     on, steady = _steady(receiver, job.number, share, OUTAGE_DURATION_S)
     recording = on.recording
@@ -259,5 +259,5 @@ def _largest(values: Any) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """Finite value; None for others, which JSON cannot hold."""
+    """Value if finite, else None, since JSON has no other numbers."""
     return value if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Tables of `service`, as Markdown: sums by group, a line a fault, and what follows outages."""
+"""Markdown tables of `service`: sums by group, a line a fault, and the recovery from outages."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ OUTAGES_S = {150.0: 10.0, 240.0: 30.0, 340.0: 20.0}
 FIRST_S, AFTER_S = 60.0, 30.0
 PHASES = ("steady", "first minute", "outage", "after")
 RIGHT = (0.7, 1.4)
-"""NEES a degree that is called right; sigma over RMS lies in its roots then."""
+"""Range of the NEES a degree that is called right; sigma over RMS then lies between its roots."""
 RECEIVERS = (CODE, SHARING, RTK, SHARING_RTK)
 RATES_HZ = (1.0, 10.0)
 MOST_DRIVES = 100
@@ -64,8 +64,8 @@ CONFIDENCE = 0.95
 def _cells() -> tuple[Vehicle, ...]:
     """Vehicles of the study.
 
-    Some whose noise is configured in full, some by their class alone, and a unit with square axes
-    by its data sheet."""
+    Noise is configured in full, or by sensor class alone, or by the data sheet of a unit without
+    misalignment."""
     told = [
         Vehicle(sensor, replace(receiver, rate_hz=rate), given)
         for sensor, receiver, rate, given in product(CLASSES, RECEIVERS, RATES_HZ, (True, False))
@@ -126,7 +126,7 @@ def cell_name(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def phases_of(run: Published, recording: Recording) -> dict[str, Bools]:
-    """Mask of instants by phase; no instant is of two."""
+    """Mask of instants by phase; phases do not overlap."""
     t_s, left = run.t_s, run.there.copy()
     found: dict[str, Bools] = {}
 

@@ -1,8 +1,7 @@
-"""Published solution of a run at 10 Hz, beside the truth: errors and stated sigmas of every
-instant.
+"""Published solution of a run against the truth at 10 Hz: errors and stated sigmas.
 
-Only solutions are read, as outputs publish them, and no state inside the navigator. Modes that
-publish are all with a solution, `coasting` and `invalid` included.
+Only published solutions are read, not the navigator's state. Every mode with a solution counts,
+`coasting` and `invalid` included.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ AXES: dict[str, tuple[int, ...]] = {
 }
 """Columns of errors and sigmas of each quantity; its degrees of freedom are their number."""
 JUDGED = (0, 1, 2, 3, 4, 6, 7, 8)
-"""Columns that lie, as in `judge`: all but the velocity down."""
+"""Columns whose excess is a lie: all but the velocity down."""
 _FIGURES = 18
 _TURNS = slice(6, 9)
 
@@ -138,7 +137,7 @@ def errors_against(
 
 
 def _wrapped(angles_rad: Array) -> Array:
-    """Into -pi to pi."""
+    """Wrap an angle to [-pi, pi]."""
     found: Array = (angles_rad + math.pi) % (2.0 * math.pi) - math.pi
     return found
 

@@ -67,7 +67,7 @@ HAPPENED = (
     "longest, s",
 )
 SLOW_S = 60.0
-"""Longest recovery from a fault that is over."""
+"""Longest acceptable recovery (s) after a fault."""
 
 
 def recorded_table(found: Rows) -> str:
@@ -86,7 +86,7 @@ def _failed(row: Mapping[str, Any]) -> bool:
 
 
 def matrix_table(found: Rows) -> str:
-    """A line a row, and the count of each verdict."""
+    """Table with a line a row, and the count of each verdict."""
     lines = []
     for row in found:
         codes = Counter(event["code"] for event in row["events"])
@@ -121,7 +121,7 @@ def _count(found: Rows) -> str:
 
 
 def power_table(found: Rows) -> str:
-    """A line a kind and size of fault."""
+    """Table with a line a kind and size of fault."""
     lines = [
         (
             row["fault"],
@@ -206,7 +206,8 @@ def _beyond(found: Rows) -> str:
 
 
 def bounds_table(found: Rows) -> str:
-    """A line a fault and receiver or phase: of its runs each, but the longest lie, in order."""
+    """Table with a line a fault and receiver or phase: instants of its runs in order, longest
+    lie."""
     lines = []
     for key in dict.fromkeys((row["fault"], row["where"]) for row in found):
         rows = [row for row in found if (row["fault"], row["where"]) == key]

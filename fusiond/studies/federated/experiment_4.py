@@ -1,10 +1,10 @@
-"""Experiment 4 of paper 004: one platform, an active and a passive receiver at once, fused live.
+"""Experiment 4 of paper 004: an active and a passive receiver on one platform, fused live.
 
-Active: BeiDou RDSS, a fix every 1.5 s that arrives 1.5 s after it was true, horizontal, with the
-height that the centre solved with (10 m). Passive: a GNSS receiver of 10 m, once a second, 0.1 s
-late. The paper prints no figures of either. Fixes go through the daemon's intake and timeline in
-order of arrival: each late one rewinds. Beside the federated filter run a centralised one and one
-with each receiver alone.
+The active receiver is BeiDou RDSS: a horizontal fix every 1.5 s that arrives 1.5 s after its
+instant, by the centre's height (10 m). The passive one is a GNSS receiver of 10 m, once a second,
+0.1 s late. The paper prints no figures of either. Fixes pass the daemon's intake and timeline in
+order of arrival, with a rewind for each late one. A centralised filter and one with each receiver
+alone run beside the federated filter.
 """
 
 from __future__ import annotations

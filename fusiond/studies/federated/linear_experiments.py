@@ -35,9 +35,9 @@ STEPS = 200
 WALK_SD, NOISE_SD = 1.0, 5.0
 SENSORS_SD = (5.0, 8.0)
 PERIOD_S, ACCELERATION = 1.0, 0.25
-"""q in m^2/s^3: velocity wanders by 0.5 m/s in a second."""
+"""Density q (m^2/s^3): a random walk of velocity by 0.5 m/s in a second."""
 SETTLED = 50
-"""Steps before figures count."""
+"""Number of steps before figures count."""
 H = np.array([[1.0, 0.0]])
 F = np.array([[1.0, PERIOD_S], [0.0, 1.0]])
 Q = ACCELERATION * np.array([[PERIOD_S**3 / 3.0, PERIOD_S**2 / 2.0], [PERIOD_S**2 / 2.0, PERIOD_S]])
@@ -117,7 +117,7 @@ def _update(x: Array, p: Array, z: Array, sd: float) -> _Local:
 
 
 def two_sensors(runs: int, seed: int) -> dict[str, Any]:
-    """Experiment 3: RMS of the position, the sigma stated, and the NEES, by way of fusion."""
+    """Experiment 3: RMS of the position, stated sigma and NEES, by kind of fusion."""
     rng = np.random.default_rng([seed, 3])
     root_q, root_p = np.linalg.cholesky(Q), np.linalg.cholesky(START_P)
     truth = rng.standard_normal((runs, 2)) @ root_p.T

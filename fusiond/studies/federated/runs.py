@@ -1,8 +1,8 @@
-r"""Monte Carlo of a drive with several position sources: what the `federated` study runs.
+r"""Monte Carlo runs of the `federated` study: a drive with several position sources.
 
 Every filter of a run gets the same samples and fixes through the daemon's own timeline; sensor
-errors are drawn from the model that the filters assume, the start from their own P(0). What counts
-is the live solution once a second.
+errors are drawn from the model that the filters assume, the start from their own P(0). The live
+solution is compared once a second.
 
     NEES = x^T P^-1 x,   x computed minus true: attitude, velocity, position, gyro and accelerometer
     bias (15,)
@@ -49,9 +49,9 @@ SOURCES = ("first", "second", "third")
 EQUAL_M = (3.0, 3.0, 3.0)
 """One sigma of each source, north and east: single-frequency receivers under open sky."""
 UNEQUAL_M = (2.0, 6.0, 20.0)
-"""A receiver with corrections, one without, an RDSS terminal."""
+"""One sigma of a receiver with corrections, one without, and an RDSS terminal."""
 VERTICAL = 5.0 / 3.0
-"""Sigma down over sigma north."""
+"""Ratio of sigma down to sigma north."""
 GATE = 0.9999
 """The daemon's default."""
 DURATION_S, FAULT_START_S, FAULT_END_S = 240.0, 70.0, 170.0
@@ -64,15 +64,15 @@ REST_S = 10.0
 STUDY_IMU = Imu(
     rate_hz=50.0, gyro_bias_initial_deg_h=36.0, gyro_scale_ppm=1e-6, accel_scale_ppm=1e-6
 )
-"""Default IMU without scale factor errors, as `ins15` has no states for them, and with a tenth of
-the turn-on bias of its gyros: the full bias loses the heading by degrees before the car drives off,
-and then the linearisation, not the filter, determines the NEES."""
+"""Default IMU without scale factor errors, for which `ins15` has no states, and with a tenth of the
+gyros' turn-on bias: the full bias turns the heading by degrees before the car drives off, and the
+linearisation, not the filter, would then determine the NEES."""
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A line of the result; no options: the centralised filter. `isolates`: sources are judged by
-    the daemon's diagnosis too (`fusiond.integrity.diagnosis`)."""
+    """Filter of a line of the result; without options the centralised one. `isolates`: sources are
+    judged by the daemon's diagnosis too (`fusiond.integrity.diagnosis`)."""
 
     name: str
     options: FederatedOptions | None = None
@@ -108,7 +108,7 @@ def grid() -> tuple[Array, Array]:
 def fixes(
     rng: np.random.Generator, fault: FaultKind, sd_m: tuple[float, ...] = EQUAL_M
 ) -> list[PositionMeasurement]:
-    """The fixes of all sources in order of validity; each once a second, one after the other."""
+    """Fixes of all sources in order of validity: each once a second, staggered."""
     count = len(SOURCES)
     t_s = np.arange(1.0, DURATION_S, 1.0 / count)
     at = truth().at(t_s).position
@@ -139,7 +139,7 @@ def fixes(
 
 
 def estimator_of(filter_: Filter, model: Model) -> Estimator:
-    """A filter of the study."""
+    """Make a filter of the study."""
     if filter_.options is None:
         return KalmanEstimator(model, STUDY_IMU.gap_s)
     return federated(model, STUDY_IMU.gap_s, SOURCES, filter_.options)

@@ -2,10 +2,10 @@ r"""Study `federated`: the four experiments of paper 004, and faults in one of t
 
 Experiments: `fusiond.studies.federated.linear_experiments` (1 to 3),
 `fusiond.studies.federated.experiment_4` (4, with an inertial unit),
-`fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has them).
-Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its
-start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
-is the median over the runs; a run in which it is not detected counts as later than any.
+`fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has them). Faults and honesty:
+`fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its start to the end of the
+run, 70 s after its end, so that the recovery counts too. `detected_after_s` is the median over the
+runs; a run without detection counts as later than any other.
 
 `centralised` is the daemon's default: one filter, and sources judged by their innovations over time
 (`fusiond.integrity.diagnosis`). `rms_centralised_gate_only_m` has the gate alone.
@@ -67,7 +67,7 @@ FAULT_FILTERS = (
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 50) of everything. All repeats exactly."""
+    """Run the study with `runs` Monte Carlo runs (default 50) of each part. It repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
@@ -322,7 +322,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 
 def _ways(panel: Any, series: dict[str, Any]) -> None:
-    """Figures 3 and 4: the true way, each receiver's fixes, and what was made of them."""
+    """Plot figures 3 and 4: true path, fixes of each receiver, and fused paths."""
     for name, fixes in series["fixes"].items():
         north, east = zip(*fixes, strict=True)
         panel.plot(east, north, ".", markersize=2.5, label=f"{name} fixes")

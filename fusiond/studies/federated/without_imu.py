@@ -1,7 +1,7 @@
 r"""Experiments 3 and 4 of paper 004: two receivers, no inertial unit, live.
 
-The fixes go through the daemon's navigator in order of arrival, which navigates by a constant
-velocity (`fusiond.navigator.without_imu`), once with each filter of `FILTERS`.
+The daemon's navigator receives the fixes in order of arrival and navigates by a constant velocity
+(`fusiond.navigator.without_imu`), once with each filter of `FILTERS`.
 
 3  two active terminals, a fix each in 1.5 s. Their fixes share an error, that of one centre's
    height model and of the same two satellites: 10 m that last for 100 s. They are correlated.
@@ -80,7 +80,7 @@ class Course(NamedTuple):
 
     @property
     def nees(self) -> Array:
-        """(m,), of 4."""
+        """NEES (m,) with 4 degrees of freedom."""
         found: Array = np.einsum(
             "ki,ki->k", self.x, np.linalg.solve(self.p, self.x[..., None])[..., 0]
         )
@@ -153,7 +153,7 @@ def _fix(source: str, active: bool, t_ns: int, position: Array) -> Measurement:
 
 
 def true_path(positions: Array) -> Array:
-    """Metres north and east (n, 2) of the start."""
+    """True path in metres north and east (n, 2) of the start."""
     lat, lon, height = truth().at(np.zeros(1)).position[0]
     unit = metres_to_geodetic(np.array([lat]), np.array([height]), np.ones((1, 3)))[0]
     found: Array = (positions[:, :2] - [lat, lon]) / unit[:2]
@@ -161,7 +161,7 @@ def true_path(positions: Array) -> Array:
 
 
 def fly(config: Config, fixes: list[Measurement]) -> Course:
-    """Through the daemon's navigator, a tick each 0.1 s."""
+    """Run the daemon's navigator on the fixes, with a tick each 0.1 s."""
     navigator = Navigator(config)
     following = 0
     errors: list[Array] = []
@@ -257,7 +257,7 @@ def _true_way() -> Array:
 
 
 def _series(run: Run) -> dict[str, Any]:
-    """The paper's figures 3 and 4: ways of one run, north and east (m)."""
+    """Paths of one run, north and east (m), for the paper's figures 3 and 4."""
     shown = {label: course.way.tolist() for label, course in run.courses.items()}
     kept = {s: each[each[:, 0] >= COUNTED_FROM_S, 1:].tolist() for s, each in run.fixes.items()}
     return {"truth": _true_way().tolist(), "fixes": kept, "ways": shown}

@@ -60,7 +60,7 @@ DURATION_S, COUNTED_FROM_S = 400.0, 60.0
 GPS_M, GPS_M_S, TRACKER_RAD = 8.0, 0.5, 200.0 / 3600.0 * DEG
 BIAS_MG = 1.0
 GATE = 1.0 - 1e-12
-"""Gate wide enough that no filter hides its errors by refusing measurements."""
+"""Gate so wide that no filter hides its errors by rejecting measurements."""
 TIMED_S, TIMED_REPEATS = 60, 5
 NONE = 1e-9
 IMU = Imu(
@@ -128,7 +128,7 @@ def filters() -> dict[str, Callable[[Model], Estimator]]:
 
 @lru_cache(maxsize=1)
 def truth() -> Truth:
-    """The flight; the aircraft is at speed after its first three seconds."""
+    """True flight; the aircraft is at speed after its first three seconds."""
     lat, lon, height = ORIGIN_DEG_M
     legs = chain([Leg(3, speed_m_s=12.0)], chain.from_iterable(repeat(CIRCUIT)))
     path = follow(legs, DURATION_S, course_deg=90.0, bank_ratio=1.0)
@@ -198,12 +198,12 @@ def draw(case: Case, seed: int, number: int) -> RunErrors:
 
 
 def flown_imu(case: Case) -> Imu:
-    """The IMU that is flown: the filters' own, and the accelerometer's bias of the case."""
+    """IMU of the simulation: the filters' IMU with the accelerometer bias of the case."""
     return IMU.model_copy(update={"accel_bias_initial_mg": case.accel_bias_mg})
 
 
 def begin(drawn: RunErrors, make: Callable[[Model], Estimator]) -> Estimator:
-    """A filter at the start of a run."""
+    """Start a filter at the begin of a run."""
     estimator = make(drawn.model)
     parameters = np.zeros(drawn.model.size)
     estimator.initialise(0, 0, drawn.start, parameters, np.diag(drawn.sd**2))
@@ -245,8 +245,8 @@ def monte_carlo(
 
 @dataclass(frozen=True, slots=True)
 class StepTimes:
-    """Processor time of a second, us: the median, least of some repeats, and as table 2 of the
-    paper has it (mean, max, min, variance) over the seconds of the repeat of that median."""
+    """Processor time of a second (us): the least median of some repeats, and mean, maximum, minimum
+    and variance over the seconds of that repeat, as in table 2 of the paper."""
 
     median: float
     spread: dict[str, float]
@@ -254,7 +254,7 @@ class StepTimes:
 
 def times_per_step_us(case: Case, seed: int) -> dict[str, StepTimes]:
     """Processor time of one second by filter: its IMU samples propagated, its measurements fused.
-    The filters take turns, so that what else runs falls on all of them."""
+    The filters take turns, so that other load falls on all of them."""
     drawn = draw(case, seed, 0)
     best: dict[str, StepTimes] = {}
     for _ in range(TIMED_REPEATS):

@@ -1,4 +1,4 @@
-r"""Study `multiscale`: paper 001's block filter against federated and centralised, same runs.
+r"""Study `multiscale`: block filter of paper 001 against federated and centralised filters.
 
 Standard deviations are about the mean error over all runs and counted seconds, one axis: the root
 of the axes' mean square (position and velocity north and east, attitude n, e, d), just after each
@@ -81,7 +81,7 @@ variance; its unit is not printed."""
 
 
 def _paper() -> dict[str, Any]:
-    """The printed figures, with standard deviations in the place of variances."""
+    """Printed figures of the paper, as standard deviations instead of variances."""
     out: dict[str, Any] = {"source": "paper 001, tables 1 and 2: GPS/star tracker/SINS, one run"}
     for name, printed in PRINTED.items():
         out[name] = {"printed": printed}
@@ -100,7 +100,8 @@ def _paper() -> dict[str, Any]:
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat."""
+    """Run the study with `runs` Monte Carlo runs (default 100) of each case. All but times
+    repeat."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
@@ -269,7 +270,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 
 def _beside_the_paper(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Tables 1 and 2, ours below the paper's."""
+    """Tables 1 and 2: the study's figures below the paper's."""
     names, first, second = ("multiscale", "federated"), [], []
     for name in names:
         paper, ours = result["paper"][name], result["filters"][name]

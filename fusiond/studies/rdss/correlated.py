@@ -2,7 +2,8 @@
 
 Each case is the drive of `rdss-dynamic` (15 min of it, the paper's cycle) with a first-order
 Gauss-Markov error north and east beside the white noise that the geometry gives. The filters rewind
-and differ in `bias_sd_m` alone (correlation time 600 s, whatever the truth is): 0 ignores it.
+and differ in `bias_sd_m` alone, where 0 ignores the shared error; their correlation time is 600 s
+in every case.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ CASES = tuple(
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 100) of each case."""
+    """Run the study with `runs` Monte Carlo runs (default 100) of each case."""
     head, found = run_cases("rdss-correlated", CASES, runs or DEFAULT_RUNS, seed, progress)
     variants = {case["case"]: case for case in found[1:]}
     return {**head, **found[0], "variants": variants, "finding": _finding(variants, found[0])}

@@ -34,7 +34,7 @@ _SLOW = replace(_CYCLE, name="slow", spacing_s=10.5, delay_s=4.5)
 
 
 def _away(case: Case, name: str, counted_s: float) -> Case:
-    """The case with RDSS away; what counts begins when its first fix has arrived again."""
+    """Case with an RDSS outage; errors count from the arrival of its first fix after it."""
     first = case.spacing_s + case.delay_s
     counted = tuple((end + first, end + first + counted_s) for _, end in _AWAY)
     return replace(case, name=name, away_s=_AWAY, counted_s=counted)
@@ -46,7 +46,7 @@ CASES = (_CYCLE, _SLOW, _away(_CYCLE, "away", 60.0), _away(_SLOW, "away_slow", 1
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat
+    """Run the study with `runs` Monte Carlo runs (default 100) of each case. All but times repeat
     exactly."""
     head, found = run_cases("rdss-dynamic", CASES, runs or DEFAULT_RUNS, seed, progress)
     add_times(found[0], CASES[0], seed)

@@ -1,4 +1,4 @@
-"""Study: sigma north and east of an RDSS fix over latitude and longitude, from geometry.
+"""Study `rdss-map`: sigma north and east of an RDSS fix by geometry, over latitude and longitude.
 
 `fusiond.aiding.rdss_fix_covariance` gives the linearised covariance on a grid; the part of the
 ranges and the part of the height stand apart, as in paper 000, eq. 4. At named places the nonlinear
@@ -53,13 +53,13 @@ PLACES: dict[str, tuple[float, float]] = {
 DRAWS = 2000
 CONFIDENCE = 0.99
 CENTRE_DEG = (39.9, 116.4)
-"""Any place that sees both satellites does: the centre's own legs are known and drop out."""
+"""Place of the centre: any that sees both satellites, since its own legs are known and drop out."""
 
 
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Map, places, and `runs` nonlinear solutions at each place (default 2000).
+    """Run the study: map, places, and `runs` nonlinear solutions at each place (default 2000).
 
     Cells without a fix are None, with the reason under `outcome`. All lengths in m, one sigma.
     """
@@ -293,7 +293,7 @@ def _ecef(lat: Array, lon: Array, height: Array) -> Array:
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Three maps: sigma north, sigma east, and how far the height's error moves the fix.
+    """Plot three maps: sigma north, sigma east, and displacement by the height's error.
 
     Needs matplotlib. The suffix of `path` chooses the format.
     """

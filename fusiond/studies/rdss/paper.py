@@ -1,7 +1,7 @@
-"""Paper 000's tables and figures beside ours, from a single run, as in the paper.
+"""Tables and figures of paper 000 beside the study's, from a single run as in the paper.
 
-Innovations are whitened, so that one is one sigma: the paper prints curves of metres without a
-scale that could be read. K is that of the case; the paper has 50 of 55 steps.
+Innovations are whitened (in sigmas), since the paper's curves in metres have no legible scale. K is
+of the case; the paper has 50 of 55 steps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def _there(way: Array) -> list[list[float]]:
 
 
 def rows(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
-    """Static test as printed, and ours: average NIS with its interval, rho(1) to rho(8)."""
+    """Rows of the static test, printed and of the study: average NIS with its interval, rho(1) to
+    rho(8)."""
     paper = result["paper"]["static"]
     table = [
         _row("paper, one test", paper["k"], paper["nis_mean"], paper["nis_interval"], paper["rho"]),

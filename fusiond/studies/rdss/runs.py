@@ -1,9 +1,8 @@
-r"""Strategies for the delay of RDSS fixes, by Monte Carlo: what every `rdss-*` study shares.
+r"""Monte Carlo runs of the `rdss-*` studies: strategies for the delay of RDSS fixes.
 
-A run draws an IMU and fixes. Every filter of the study then gets the same samples and the same
-fixes, in order of arrival, through the daemon's own intake, timeline and estimator. What counts is
-the *live* solution: the state at an instant with what had arrived by then, never smoothed
-afterwards.
+A run draws IMU samples and fixes. Every filter of the study receives them in order of arrival,
+through the daemon's own intake, timeline and estimator. The *live* solution is compared: the state
+at an instant by the data that had arrived, never smoothed.
 
 The filters start from the truth plus an error drawn from their own P0; sensor and fix errors are
 drawn from the very models that they assume unless the case says otherwise, so that the filter that
@@ -55,7 +54,7 @@ GRID_S = 1.5
 NEES_EVERY = 8
 """Grid points from one NEES to the next."""
 GATE = 1.0 - 1e-12
-"""Gate wide enough that no strategy hides its errors by refusing fixes."""
+"""Gate so wide that no strategy hides its errors by rejecting fixes."""
 
 PAPER_IMU = Imu(
     rate_hz=20.0,
@@ -78,7 +77,8 @@ Strategy = Literal["rewind", "optimal_prediction", "position_compensation", "non
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A line of the result: what it does about the delay; no strategy: the INS alone."""
+    """Filter of a line of the result, with its strategy for the delay; without one the INS
+    alone."""
 
     name: str
     strategy: Strategy | None
@@ -233,12 +233,12 @@ class Navigation:
         self.timeline.start()
 
     def _outcome(self, entry: Entry) -> None:
-        """Keep the whitened innovation of each fix; one that a rewind applies again replaces it."""
+        """Store the whitened innovation of each fix; a repetition after a rewind replaces it."""
         if entry.outcome is not None and entry.outcome.whitened:
             self.innovations[entry.key[0]] = entry.outcome.whitened
 
     def advance(self, t_s: float) -> None:
-        """Add the IMU samples up to `t_s`, and run."""
+        """Add the IMU samples up to `t_s` and run the filter."""
         end = min(round(t_s * 1e9) // self._period_ns, len(self._samples))
         if end > self._given:
             times = np.arange(self._given + 1, end + 1, dtype=np.int64) * self._period_ns
@@ -247,7 +247,7 @@ class Navigation:
         self.timeline.advance()
 
     def arrive(self, fixes: Fixes, k: int) -> None:
-        """Fix k arrives."""
+        """Add fix k at its arrival."""
         t_ns, seen_ns = (round(t[k] * 1e9) for t in (fixes.t_s, fixes.arrival_s))
         lat, lon = (float(x) for x in fixes.position[k])
         fix = DelayedFix("rdss", seen_ns, MonotonicStamp(t_ns), lat, lon, YANTAI_DEG_M[2], CLASS_M)

@@ -16,7 +16,8 @@ from fusiond.studies.rdss.statistics import add_times, plot, run_cases, tables
 __all__ = ["CASE", "plot", "run_study", "tables"]
 
 CASE = Case("static", static, 84.0, counted_s=((30.0, 1e9),), window=47)
-"""55 fixes, for 1.5 to 82.5 s. The first 20 steps, in which 100 m go down, do not count."""
+"""Case of 55 fixes, from 1.5 to 82.5 s. The first 20 steps, in which an initial error of 100 m
+decays, do not count."""
 
 DEFAULT_RUNS = 500
 
@@ -24,7 +25,7 @@ DEFAULT_RUNS = 500
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 500). All but times repeat exactly."""
+    """Run the study with `runs` Monte Carlo runs (default 500). All but times repeat exactly."""
     head, (found,) = run_cases("rdss-static", [CASE], runs or DEFAULT_RUNS, seed, progress)
     add_times(found, CASE, seed)
     return {**head, **found, "finding": _finding(found)}

@@ -64,7 +64,7 @@ PAPER = {
 def run_cases(
     name: str, cases: Sequence[Case], count: int, seed: int, progress: Progress | None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Head of the result, and `figures` of each case over `count` runs."""
+    """Run each case `count` times; return the head of the result and the `figures` of the cases."""
     if count < 2:
         raise ValueError("runs must be at least 2")
     step = step_counter(progress, count * len(cases))

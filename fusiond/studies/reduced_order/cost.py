@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 IMU_RATE_HZ = 100.0
-"""The live rate that the system is built for."""
+"""IMU rate (Hz) for which the system is built."""
 LIVE_S = 30
 RECURSIONS = 1000
 """Timed at once: some milliseconds, long against the resolution of the clock."""
@@ -79,7 +79,8 @@ def _recursions_for(width: int) -> Callable[..., None]:
         nav: Array,
         xi: Array,
     ) -> None:
-        """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
+        """Repeat `count` times: propagate `cov` over h seconds, then update by `rows` (m, n) with
+        variances `r` (m,)."""
         z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
         g = np.empty((r.shape[0], width))
         flat = cov.reshape(width * width)
@@ -128,7 +129,7 @@ def level_step(nav: Array) -> Array:
 
 
 def _live_second(of: Model, all_in_view: bool) -> Callable[[], float]:
-    """A function that times the running filter: CPU seconds of a second of flight."""
+    """Function that measures the CPU time of the running filter for a second of flight."""
     path = flight.truth(float(LIVE_S), IMU_RATE_HZ)
     nav = flight.true_nav(path)
     buffer = flight.imu_buffer(np.hstack([path.gyro, path.accel]), IMU_RATE_HZ)
@@ -155,7 +156,7 @@ def costs(
 ) -> dict[str, Cost]:
     """Medians over `rounds` of recursions, then over a third as many of live seconds.
 
-    The filters take turns, so that a processor which changes its clock changes it for all.
+    The filters take turns, so that a changing processor clock affects all of them.
     """
     recursions = {name: _recursion(of, all_in_view) for name, of in models.items()}
     live = {name: _live_second(of, all_in_view) for name, of in models.items()}

@@ -1,5 +1,5 @@
-r"""The flight of paper 002 (studies `reduced-order` and `ins-gnss-sar`): truth, satellites, radar
-points, and what is measured.
+r"""Flight of paper 002: truth, satellites, radar points and measurements, for the studies
+`reduced-order` and `ins-gnss-sar`.
 
 Set-up: 120 deg E, 30 deg N, 1000 m, due east at 300 m/s for 4000 s, gyro 0.1 deg/h, accelerometer
 1e-4 g, pseudorange and its rate to the four satellites of best GDOP (or to all in view), SAR
@@ -79,7 +79,7 @@ POINT_ASIDE_M = 30_000.0
 is abeam next or was last. Azimuth runs 37 deg to both sides of the beam."""
 LEAST_RANGE_M = 5_000.0
 GATE = 1.0
-"""No gate: no filter hides its errors by refusing measurements, and the analysis is linear."""
+"""No gate: no filter hides its errors by rejecting measurements, and the analysis is linear."""
 
 INITIAL_ATTITUDE_SD = np.array([60.0, 60.0, 600.0]) * ARC_SECOND
 INITIAL_VELOCITY_SD_M_S = 0.5
@@ -90,7 +90,7 @@ by 20 arc seconds, 0.1 deg/h turns the azimuth by 1600; here a reference has hel
 
 @lru_cache(maxsize=2)
 def truth(seconds: float, rate_hz: float = IMU.rate_hz) -> Truth:
-    """Level and due east."""
+    """True flight, level and due east."""
     still = Profile([0.0], [0.0])
     path = Path(Profile([0.0], [SPEED_M_S]), Profile([0.0], [0.5 * math.pi]), still)
     return Truth(path, START, rate_hz, seconds)
@@ -119,10 +119,10 @@ def model(
 
 
 def filters(sar_sd: float = SAR_SD_RAD, sar_tau_s: float = math.inf) -> dict[str, Model]:
-    """The filters compared; the first describes the truth.
+    """Models of the compared filters; the first describes the truth.
 
     `17` has the accelerometer biases as white noise (`fusiond.models.unmodelled_bias_noise`),
-    `17_bare` takes no notice of them.
+    `17_bare` ignores them.
     """
     return {
         "23": model("ins23", sar_sd, sar_tau_s),
@@ -155,7 +155,7 @@ class Scene(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """n ranges, n rates, azimuth, elevation."""
+        """Number of rows: n ranges, n rates, azimuth, elevation."""
         return 2 * len(self.names) + 2
 
     def noise(self, drawn: Array) -> Array:
@@ -253,7 +253,7 @@ def measured(scene: Scene, true: State, noise: Array) -> Measurements:
 
 
 def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
-    """A buffer that holds all samples (n, 6)."""
+    """IMU buffer with all samples (n, 6)."""
     buffer = ImuBuffer(rate_hz, len(samples) / rate_hz, np.eye(3), 0.0, IMU.gap_s)
     times = np.arange(1, len(samples) + 1, dtype=np.int64) * round(1e9 / rate_hz)
     buffer.append(times, samples)

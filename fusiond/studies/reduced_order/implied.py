@@ -1,4 +1,4 @@
-r"""Noises that table 2 of paper 002 implies and does not print.
+r"""Noises implied by table 2 of paper 002, which it does not print.
 
 **By hand.** A level axis of the 23 states, seen by velocity: the tilt phi walks by the gyro's white
 noise n, a constant bias b of the accelerometer hides behind it, and v is measured with the density
@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 
 ROOT_HOUR = 60.0
 GYRO_DEG_SQRT_H, OTHER_GYRO_DEG_SQRT_H = 0.127, 0.112
-"""Gyro noise of `FOUND` and of `OTHER`."""
+"""Gyro noise (deg/sqrt(h)) of `FOUND` and of `OTHER`."""
 GYRO_OF_17_DEG_SQRT_H, ACCELEROMETER_OF_17_M_S_SQRT_H = 0.622, 1.96
 """Noises of the filter with 17 states that represent constant drifts and biases."""
 

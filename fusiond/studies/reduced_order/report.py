@@ -1,6 +1,6 @@
 """Attitude and velocity sigmas of paper 002's flight, for JSON, tables and pictures.
 
-East, north, up, as the paper has them: attitude in arc seconds, velocity in m/s.
+Axes are east, north, up as in the paper; attitude is in arc seconds, velocity in m/s.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def east_north_up(p: Array) -> tuple[list[float], list[float]]:
 
 
 def sigmas(p: Array, keys: tuple[str, str] = KEYS) -> dict[str, list[float]]:
-    """The two figures of a covariance (n, n)."""
+    """Attitude and velocity sigmas of a covariance (n, n)."""
     return dict(zip(keys, east_north_up(p), strict=True))
 
 
@@ -81,7 +81,8 @@ def curves(of: Iterable[Array]) -> dict[str, list[list[float]]]:
 
 
 def picture(series: dict[str, Any], path: Path) -> None:
-    """Sigmas over time: attitude left, velocity right, one row an axis; dashed what is believed.
+    """Plot sigmas over time: attitude left, velocity right, one row an axis; the filter's own are
+    dashed.
 
     `series`: instants `t_s`, and of each of `models` the `true` and the `believed` `curves` there.
     """

@@ -156,7 +156,7 @@ def _clock(rng: np.random.Generator, start: Array, steps: int) -> Array:
 
 
 def started_filter(of: Model, nav: Array) -> KalmanEstimator:
-    """A filter at the start of the flight with navigation state (10,)."""
+    """Start a filter at the begin of the flight with navigation state (10,)."""
     estimator = KalmanEstimator(of, flight.IMU.gap_s)
     estimator.initialise(0, 0, nav, np.zeros(of.size), np.diag(flight.initial_sd(of) ** 2))
     return estimator

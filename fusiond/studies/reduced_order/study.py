@@ -62,7 +62,7 @@ CHECKED_S = 100
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study; `runs` (default 40) live flights of 600 s check the covariance analysis.
+    """Run the study; `runs` (default 40) live flights of 600 s check the covariance analysis.
 
     All but times repeat exactly.
     """
@@ -119,7 +119,7 @@ def run_study(
 
 
 class Analysed:
-    """A filter over the flight: what the analysis gives at each second, and its linear model."""
+    """Filter over the flight: results of the analysis at each second, and its linear model."""
 
     def __init__(self, of: Model, kept: NDArray[np.int64], systems: list[System]) -> None:
         self.model, self.kept, self.systems = of, kept, systems
@@ -225,7 +225,7 @@ def _observability(of: Analysed) -> dict[str, Any]:
 def _validation(
     models: dict[str, Model], analysed: dict[str, Analysed], flown: dict[str, FilterRun]
 ) -> dict[str, Any]:
-    """NEES of live filters against the analysis and against their own belief.
+    """NEES of live filters by the analysis's covariance and by their own.
 
     Averages over the runs at the last instant; instants of one run are not independent.
     `rms_to_sigma`: east, north, up, RMS of the live errors over the analysis's sigma.
@@ -341,7 +341,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 
 def _implied_tables(of: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Noises that table 2 implies: by the flight, and by hand."""
+    """Tables of the noises that table 2 implies: by the flight, and by hand."""
     sensors, other = of["sensors"], of["other_sensors"]
     title = (
         f"with noises that table 2 implies: gyro {of['gyro_noise_deg_sqrt_h']} deg/sqrt(h), radar "
@@ -368,5 +368,5 @@ def _implied_tables(of: dict[str, Any]) -> list[tuple[str, list[str], list[list[
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Sigmas over time, true and believed, beside the paper's."""
+    """Plot sigmas over time, true and the filters' own, beside the paper's."""
     picture(result["series"], path)

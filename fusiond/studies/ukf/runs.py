@@ -1,4 +1,4 @@
-r"""Unscented against extended filter: the problems, and one Monte Carlo run of them.
+r"""Monte Carlo runs of the study `ukf`: problems for unscented and extended filters.
 
 `double_star`   slant ranges of a terminal to two geostationary satellites every 1.5 s, from the two
                 path lengths that the centre measures (fusiond.aiding.rdss_fix_covariance), and a
@@ -81,11 +81,11 @@ MASK_RAD, MOST_PDOP = 10.0 * DEG, 6.0
 START = (2300, 345_600.0)
 """Start as GPS week and second."""
 GATE = 1.0 - 1e-9
-"""Gate wide enough that a matched filter refuses nothing; a refusal shows a bad prediction."""
+"""Gate so wide that a matched filter rejects nothing; a rejection shows a bad prediction."""
 COUNTED_S = 30.0
-"""Errors count from here: the first corrections of a poor start have been made."""
+"""Time from which errors count: after the first corrections of a poor start."""
 NEES_EVERY_S = 15.0
-"""A whole number of either problem's epochs."""
+"""Interval of NEES: a whole number of epochs of either problem."""
 LAST_S = 100.0
 
 FILTERS: dict[str, Callable[[Model], KalmanEstimator]] = {

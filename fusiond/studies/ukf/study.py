@@ -48,7 +48,8 @@ PAPER = {
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The study with `runs` Monte Carlo runs (default 50) of each problem. Repeats exactly."""
+    """Run the study with `runs` Monte Carlo runs (default 50) of each problem. It repeats
+    exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
@@ -124,7 +125,7 @@ def _finding(problems: dict[str, Any]) -> str:
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Table: problems and filters down, figures across."""
+    """Table with a row a problem and filter, and a column a figure."""
     low, high = result["nees_interval"]
     rows = [
         [

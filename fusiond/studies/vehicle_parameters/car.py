@@ -68,7 +68,7 @@ Measured = PositionFix | WheelSpeed | Height
 
 RATE_HZ = 50.0
 ORIGIN = (30.5 * DEG, 114.3 * DEG, 400.0)
-"""Some height, so that a barometer's scale means something."""
+"""Origin, at some height, so that a barometer's scale is observable."""
 STEP_M_S = 1.0 / 3.6
 FIX_SD_M, FIX_VELOCITY_SD_M_S = (0.02, 0.02, 0.04), (0.03, 0.03, 0.05)
 """A receiver with fixed ambiguities: what shows a lever arm of decimetres."""
@@ -94,7 +94,7 @@ VEHICLE: dict[str, Any] = {
 
 
 def configuration(**imu: Any) -> Config:
-    """The car's configuration: defaults wherever there are any."""
+    """Configuration of the car, with defaults where they exist."""
     return Config.model_validate(VEHICLE | {"imu": VEHICLE["imu"] | imu})
 
 
@@ -111,7 +111,7 @@ class SlippingConstraint(NonHolonomicConstraint):
         return found._replace(z=found.z + np.array(self.slip))
 
     def packed(self, model: Model) -> None:
-        """No packed row, since a kernel ignores the slip."""
+        """Return no packed row, since the kernel ignores the slip."""
         return None
 
 
@@ -162,7 +162,7 @@ def draw_car(config: Config, path: Path, seconds: float, rng: np.random.Generato
 
 
 def _walk(n: int, step_s: float, sd: float, walk: float, rng: np.random.Generator) -> Array:
-    """A random walk (n,) from N(0, sd)."""
+    """Random walk (n,) from N(0, sd)."""
     return rng.standard_normal() * sd + np.cumsum(rng.standard_normal(n) * walk * math.sqrt(step_s))
 
 

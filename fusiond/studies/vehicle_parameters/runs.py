@@ -32,12 +32,12 @@ NAVIGATION = ("attitude", "velocity", "position")
 
 
 def observable_drive(seconds: float = SHOWN_S) -> Path:
-    """A drive that shows everything: bends to both sides, stops, a hill."""
+    """Drive that makes all parameters observable: bends to both sides, stops, a hill."""
     return drive(seconds, 10.0)
 
 
 def straight_drive(seconds: float = HIDDEN_S) -> Path:
-    """Straight on at one speed: neither bends nor changes of speed."""
+    """Drive straight on at one speed."""
     constant = Profile([0.0], [0.0])
     return Path(Profile([0.0], [CRUISE_M_S]), constant, constant)
 

@@ -46,7 +46,7 @@ def _one(case: str, seed: int, number: int) -> Run:
 
 
 def rows_of(case: str, runs: list[Run]) -> list[dict[str, Any]]:
-    """A row for each block."""
+    """Rows of the result, one for each block."""
     rows = []
     for block in runs[0].nees:
         k = len(runs[0].errors[block])
@@ -72,7 +72,7 @@ def rows_of(case: str, runs: list[Run]) -> list[dict[str, Any]]:
 def run_study(
     runs: int | None = None, seed: int = 0, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """`runs` cars a case. The same arguments give the same result."""
+    """Run the study with `runs` cars a case. Equal arguments give equal results."""
     count = runs or DEFAULT_RUNS
     step = step_counter(progress, count * len(CASES))
     blocks: list[dict[str, Any]] = []
