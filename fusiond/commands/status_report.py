@@ -37,7 +37,7 @@ def status_page(answer: dict[str, Any]) -> list[str]:
 
 
 def duration(seconds: float) -> str:
-    """The two greatest units: 3 d 4 h, 58 min 20 s, 4.2 s."""
+    """Format a duration in its two greatest units: 3 d 4 h, 58 min 20 s, 4.2 s."""
     if seconds < 60.0:
         return f"{seconds:.1f} s"
     whole = int(seconds)

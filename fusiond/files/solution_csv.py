@@ -127,8 +127,8 @@ class SolutionWriter:
         stated: Flags,
         status_code: NDArray[np.int64],
     ) -> None:
-        """Append n rows: times (n,) ns, navigation states (n, 10) and one sigma (n, 9) as `rows`
-        has it, of which those that are `stated` (9,) are written."""
+        """Append n rows: times (n,) ns, navigation states (n, 10) and one sigma (n, 9) as in
+        `rows`. Only the `stated` (9,) sigmas are written."""
         for start in range(0, len(times), _CHUNK_ROWS):
             part = slice(start, min(start + _CHUNK_ROWS, len(times)))
             values = self._values[: part.stop - start]

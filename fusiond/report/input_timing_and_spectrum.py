@@ -46,7 +46,7 @@ _TRIAL = 200
 
 
 class InputStatistics:
-    """Statistics of the input's records in order; `folder` holds the log's DBC files meanwhile."""
+    """Collector of statistics from input records, in order; `folder` is for the log's DBC files."""
 
     def __init__(self, about: About, folder: Path) -> None:
         self._epoch_ns = about.epoch_ns

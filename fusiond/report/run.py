@@ -176,7 +176,7 @@ class Run:
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
     def modes(self) -> Iterator[tuple[float, float, str]]:
-        """Stretches of one mode: from, to, which."""
+        """Stretches of one mode: begin, end, mode."""
         status, t_s = self.solution.status, self.solution.t_s
         started = 0
         for k in range(1, len(status) + 1):

@@ -38,7 +38,7 @@ Verdict = Literal["crashed", "lie", "degraded and said so", "survived"]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Instant: mode, error/sigma of each of QUANTITIES with a solution, errors."""
+    """Sample of a run at an instant: mode, ratio of error to sigma by quantity, errors."""
 
     t_s: float
     mode: str
