@@ -22,7 +22,7 @@ from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 
 RATE_HZ, EPOCHS_HZ = 200.0, 10.0
 DELAY_S = 1.5
-"""Age of an RDSS fix as it comes: docs/rdss.md."""
+"""Age of an RDSS fix as it comes: docs/rdss-terminal.md."""
 AT_S, EVERY_S = 90.0, 2.0
 """Time of the first delayed fix after the start, and the interval between delayed fixes."""
 SAMPLES, TICK_SAMPLES = round(RATE_HZ / EPOCHS_HZ), round(RATE_HZ / 100.0)
