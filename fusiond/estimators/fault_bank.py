@@ -18,9 +18,9 @@ variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt
     left unexplained    J - l                            chi-square of N - p if it is f
     log odds            as of fusiond.estimators.fault_odds
 
-An onset is not known: each kind runs from restarts of several periods T, in turns. Before one
-begins anew it takes the place of a less likely one of the next longer period, whose T it stands for
-then. A fault of the inertial unit begins as a step of
+An onset is not known: each kind runs from restarts of several periods T, in turns. What has turned
+out to be a likely onset takes the place of a less likely one of the next longer period before it
+begins anew. A fault of the inertial unit begins as a step of
 states, V = 1 at its onset; one of a measurement is its rows' D. A delay of tau is the filter's own
 past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here; its velocities as they
 are known now: what has been fed back since is taken off the past as well. A change of velocity over
@@ -58,6 +58,11 @@ RESTARTS = sum(SLOTS_OF)
 LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(count))
 BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
 PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
+PROMOTED = 3.0
+"""Log odds, twenty to one, by which an onset replaces one of the level above.
+
+Asked when its own turn to restart has come."""
+
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
 attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,
