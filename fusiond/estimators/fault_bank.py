@@ -18,13 +18,12 @@ variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt
     left unexplained    J - l                            chi-square of N - p if it is f
     log odds            as of fusiond.estimators.fault_odds
 
-Onsets are unknown: each kind is restarted with several periods T, in turns. Before a restart, an
-onset replaces a less likely one of the next longer period, and stands for that T from then on. A
-fault of the inertial unit starts as a step of states, V = 1 at its onset; a fault of a measurement
-is D of its rows. A delay of tau uses the filter's own past, D = p(t) - p(t - tau), of a stored path
-by dead reckoning. Feedback also corrects the stored velocities, so that a change of velocity over
-tau is the sensed one, without noise of later measurements, which a filter with too much process
-noise follows.
+Onsets are unknown: each kind is restarted with several periods T, in turns. Before a restart, a
+likely onset replaces a less likely one of the next longer period. A fault of the inertial unit
+starts as a step of states, V = 1 at its onset; a fault of a measurement is D of its rows. A delay
+of tau uses the filter's own past, D = p(t) - p(t - tau), of a stored path by dead reckoning.
+Feedback also corrects the stored velocities, so that a change of velocity over tau is the sensed
+one, without noise of later measurements, which a filter with too much process noise follows.
 
 The bank lies in the filter's memory: a snapshot copies it, a rewind restores it bit for bit. This
 module has its layout; onsets are in fusiond.estimators.fault_onsets, signatures and evidence in
@@ -57,6 +56,11 @@ RESTARTS = sum(SLOTS_OF)
 LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(count))
 BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
 PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
+PROMOTED = 3.0
+"""Log odds, twenty to one, by which an onset replaces one of the level above.
+
+Asked when its own turn to restart has come."""
+
 STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
 attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,

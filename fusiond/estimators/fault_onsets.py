@@ -27,6 +27,7 @@ from fusiond.estimators.fault_bank import (
     OF_THREE,
     ONSET,
     PERIODS_NS,
+    PROMOTED,
     RESTARTED,
     RESTARTS,
     SENSITIVITIES,
@@ -158,10 +159,9 @@ def begin_all(
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
 def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
-    """Keep the onset whose turn to restart has come, in place of a less likely one of the level
-    above.
+    """Replace the less likely onset of the level above, if much less likely.
 
-    The mixture then loses the least likely of all, as any sum that is cut to length."""
+    The replacement is the hypothesis that is due to restart."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return
@@ -172,7 +172,7 @@ def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> Non
         above = bank[group_at(bank, RESTARTS * kind + slot) + LOG_ODDS]
         if above < least:
             least, found = above, slot
-    if found < 0 or not odds > least:
+    if found < 0 or not odds > least + PROMOTED:
         return
     to = RESTARTS * kind + found
     there = group_at(bank, to)
