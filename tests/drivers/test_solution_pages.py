@@ -20,7 +20,7 @@ from tests.places import REPOSITORY
 EPOCHS = {"ubx": ubx_pvt(), "bestpos": bestpos(), "sbf": sbf_pvt()}
 DRIVERS = REPOSITORY / "drivers"
 SHARED = "".join(
-    (DRIVERS / name).read_text() for name in ("solution.py", "cycle.py", "nmea/time.py")
+    (DRIVERS / name).read_text() for name in ("solution.py", "epoch_ends.py", "nmea/time.py")
 )
 LINE = {"sentences", "ubx_frames", "rtcm_frames", "bytes_in"}
 """Of the splitter and the line: they are in the pages of NMEA and the network."""
