@@ -8,12 +8,14 @@ import os
 import re
 import socket
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import reduce
 from operator import xor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -278,6 +280,16 @@ async def test_imu_that_says_nothing(tmp_path: Path) -> None:
     assert "SIM_GYRO" in text
     assert "check that the unit sends" in text
     assert "ip -d link" not in text  # the bus is no SocketCAN interface
+
+
+def test_silent_socketcan_interface_names_its_own_commands() -> None:
+    status = SimpleNamespace(state="silent", detail="silent (nothing heard of SIM_GYRO)")
+    driver: Any = SimpleNamespace(status=status, counters=Counter())
+    options = SimpleNamespace(interface="socketcan", channel="can3")
+    (found,) = doctor_devices.open_findings("imu", driver, options, SECONDS)
+    assert "check bit rate (ip -d link show can3)" in found
+    assert "`candump can3`" in found
+    assert "SIM_GYRO" in found
 
 
 async def test_can_interface_that_does_not_exist(tmp_path: Path) -> None:
