@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
+from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelS
 from fusiond.configuration.schema import Config
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.gnss.receiver import GnssReceiver
+from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 
 RATE_HZ, FIXES_HZ = 200.0, 10.0
@@ -27,6 +29,30 @@ AT_S, EVERY_S = 110.0, 1.0
 SAMPLES, TICK_SAMPLES = round(RATE_HZ / FIXES_HZ), round(RATE_HZ / 100.0)
 
 
+class Driven(Protocol):
+    """Simulated drive: its navigator, its truth, and the work of one tick."""
+
+    navigator: Navigator
+    truth: Truth
+
+    def tick(self) -> None: ...
+
+
+def late_fix(drive: Driven, at: int, now: int) -> Callable[[], int]:
+    """The tick at `now` (ns) in which an RDSS fix of the instant `at` comes."""
+    lat, lon, height = drive.truth.at(np.array([at * 1e-9])).position[0].tolist()
+    fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
+
+    def work() -> int:
+        rewinds = drive.navigator.timeline.counters.rewinds
+        assert drive.navigator.add(fix, at, seen_ns=now) == "accepted"
+        drive.tick()
+        assert drive.navigator.timeline.counters.rewinds > rewinds
+        return 1
+
+    return work
+
+
 class Drive:
     """Navigator that is run from measurement to measurement, with delayed fixes inserted."""
 
@@ -34,12 +60,12 @@ class Drive:
         scenario = SCENARIOS["drive"]
         imu = CAR_IMU.model_copy(update={"rate_hz": RATE_HZ})
         scenario = replace(scenario, imu=imu, gnss=replace(scenario.gnss, rate_hz=FIXES_HZ))
-        self._truth = scenario.truth(AT_S + (repetitions + 1) * EVERY_S)
+        self.truth = scenario.truth(AT_S + (repetitions + 1) * EVERY_S)
         rng = np.random.default_rng(1)
-        output = scenario.imu_output(self._truth, rng)
-        self._times = np.rint(self._truth.t_s[1:] * 1e9).astype(np.int64)
+        output = scenario.imu_output(self.truth, rng)
+        self._times = np.rint(self.truth.t_s[1:] * 1e9).astype(np.int64)
         self._samples = np.hstack((output.gyro, output.accel))
-        self.receiver = GnssReceiver(self._truth, scenario.gnss, rng)
+        self.receiver = GnssReceiver(self.truth, scenario.gnss, rng)
         lever = {"lever_arm_m": scenario.gnss.lever_arm_m}
         aiding = {"gnss": lever, "wheel": {"lever_arm_m": scenario.no_slip_m}, "rdss": lever}
         self.navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
@@ -49,18 +75,7 @@ class Drive:
         """Drive on to the next late fix and return the tick of its arrival as the work to time."""
         self.go_on(AT_S + number * EVERY_S)
         row = self._row - round(DELAY_S * RATE_HZ)
-        lat, lon, height = self._truth.at(self._truth.t_s[1 + row : 2 + row]).position[0].tolist()
-        at, now = int(self._times[row]), int(self._times[self._row - 1])
-        fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
-
-        def work() -> int:
-            rewinds = self.navigator.timeline.counters.rewinds
-            assert self.navigator.add(fix, at, seen_ns=now) == "accepted"
-            self.tick()
-            assert self.navigator.timeline.counters.rewinds > rewinds
-            return 1
-
-        return work
+        return late_fix(self, int(self._times[row]), int(self._times[self._row - 1]))
 
     def go_on(self, until_s: float) -> None:
         """Advance to `until_s`, the instant of the next epoch."""

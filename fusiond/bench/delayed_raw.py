@@ -13,7 +13,7 @@ from itertools import count
 
 import numpy as np
 
-from drivers.measurements import DelayedFix, MonotonicStamp
+from fusiond.bench.delayed_fix import late_fix
 from fusiond.bench.raw_epoch import SIGNALS, Crowd
 from fusiond.configuration.schema import Config
 from fusiond.navigator.navigator import Navigator
@@ -34,13 +34,13 @@ class RawDrive:
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
         imu = CAR_IMU.model_copy(update={"rate_hz": RATE_HZ})
-        self._truth = replace(scenario, imu=imu).truth(AT_S + (repetitions + 1) * EVERY_S)
+        self.truth = replace(scenario, imu=imu).truth(AT_S + (repetitions + 1) * EVERY_S)
         rng = np.random.default_rng(1)
-        output = replace(scenario, imu=imu).imu_output(self._truth, rng)
-        self._times = np.rint(self._truth.t_s[1:] * 1e9).astype(np.int64)
+        output = replace(scenario, imu=imu).imu_output(self.truth, rng)
+        self._times = np.rint(self.truth.t_s[1:] * 1e9).astype(np.int64)
         self._samples = np.hstack((output.gyro, output.accel))
         options = GnssRawOptions(rate_hz=EPOCHS_HZ, signals=SIGNALS)
-        self._receiver = GnssRaw(self._truth, options, rng)
+        self._receiver = GnssRaw(self.truth, options, rng)
         aiding = {"raw": {"kind": "raw", "systems": ["G", "C"]}, "rdss": {}}
         self.navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
         self._crowd = Crowd(self._receiver, 0, self.navigator.raw["raw"], "raw")
@@ -50,19 +50,7 @@ class RawDrive:
         """Drive on to the next late fix; the work is the tick in which it comes."""
         self.go_on(AT_S + number * EVERY_S)
         now = int(self._times[self._row - 1])
-        at = now - round(DELAY_S * 1e9)
-        t_s = np.array([at * 1e-9])
-        lat, lon, height = self._truth.at(t_s).position[0].tolist()
-        fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
-
-        def work() -> int:
-            rewinds = self.navigator.timeline.counters.rewinds
-            assert self.navigator.add(fix, at, seen_ns=now) == "accepted"
-            self.tick()
-            assert self.navigator.timeline.counters.rewinds > rewinds
-            return 1
-
-        return work
+        return late_fix(self, now - round(DELAY_S * 1e9), now)
 
     def go_on(self, until_s: float) -> None:
         """Advance to `until_s`, tick by tick."""
