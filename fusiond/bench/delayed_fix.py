@@ -38,7 +38,7 @@ class Driven(Protocol):
     def tick(self) -> None: ...
 
 
-def late_fix(drive: Driven, at: int, now: int) -> Callable[[], int]:
+def tick_of_delayed_fix(drive: Driven, at: int, now: int) -> Callable[[], int]:
     """The tick at `now` (ns) in which an RDSS fix of the instant `at` comes."""
     lat, lon, height = drive.truth.at(np.array([at * 1e-9])).position[0].tolist()
     fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
@@ -75,7 +75,7 @@ class Drive:
         """Drive on to the next late fix and return the tick of its arrival as the work to time."""
         self.go_on(AT_S + number * EVERY_S)
         row = self._row - round(DELAY_S * RATE_HZ)
-        return late_fix(self, int(self._times[row]), int(self._times[self._row - 1]))
+        return tick_of_delayed_fix(self, int(self._times[row]), int(self._times[self._row - 1]))
 
     def go_on(self, until_s: float) -> None:
         """Advance to `until_s`, the instant of the next epoch."""

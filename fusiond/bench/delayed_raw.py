@@ -13,7 +13,7 @@ from itertools import count
 
 import numpy as np
 
-from fusiond.bench.delayed_fix import late_fix
+from fusiond.bench.delayed_fix import tick_of_delayed_fix
 from fusiond.bench.raw_epoch import SIGNALS, Crowd
 from fusiond.configuration.schema import Config
 from fusiond.navigator.navigator import Navigator
@@ -50,7 +50,7 @@ class RawDrive:
         """Drive on to the next late fix; the work is the tick in which it comes."""
         self.go_on(AT_S + number * EVERY_S)
         now = int(self._times[self._row - 1])
-        return late_fix(self, now - round(DELAY_S * 1e9), now)
+        return tick_of_delayed_fix(self, now - round(DELAY_S * 1e9), now)
 
     def go_on(self, until_s: float) -> None:
         """Advance to `until_s`, tick by tick."""
