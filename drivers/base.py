@@ -1,9 +1,9 @@
 """Interface of a driver: a name, options, counters, a state, and one coroutine.
 
-A driver runs until it is cancelled. It opens its device, reopens it with backoff when it goes away,
-and hands over measurements and events by calling `emit`; it never raises for what a device does.
-A fault that no retry can mend (a DBC file that does not exist) raises `PermanentDriverError` from
-the constructor.
+A driver runs until it is cancelled. It opens its device, reopens it with growing waits when it
+disappears, and hands over measurements and events by calling `emit`. Nothing that a device does
+makes it raise. A fault that no retry can repair, such as a missing DBC file, raises
+`PermanentDriverError` in the constructor.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class DriverError(Exception):
 
 
 class PermanentDriverError(DriverError):
-    """A fault that no retry can mend; the configuration or the installation must change."""
+    """Fault that no retry can repair: the configuration or the installation must change."""
 
 
 class DriverOptions(BaseModel):
@@ -45,7 +45,7 @@ class DriverOptions(BaseModel):
 
 @dataclass(slots=True)
 class DriverStatus:
-    """State of a device for `health`: its state and why it is so, in one sentence.
+    """State of a device for `health`, with the reason in one sentence.
 
     `starting` not yet tried; `absent` the port or bus cannot be opened; `silent` open but nothing
     intelligible for the driver's time-out; `running`; `failed` permanently.
@@ -56,15 +56,14 @@ class DriverStatus:
 
 
 def state_event(source: str, t_ns: int, port: str, status: DriverStatus) -> DeviceEvent:
-    """`device_absent`, `device_silent` or `device_running`: what a driver on a serial line says
-    when its state has changed."""
+    """Event of a serial line's new state: `device_absent`, `device_silent` or `device_running`."""
     said = status.detail or status.state
     text = said if port in said else f"{port}: {said}"
     return DeviceEvent(source, t_ns, f"device_{status.state}", text)
 
 
 class Driver(Protocol):
-    """A device's driver. `counters` holds every received, refused and damaged item by name."""
+    """Driver of a device. `counters` holds every received, refused and damaged item by name."""
 
     Options: ClassVar[type[DriverOptions]]
     name: str
@@ -77,24 +76,24 @@ class Driver(Protocol):
 
 @dataclass(slots=True)
 class Backoff:
-    """Wait between attempts to reopen a device: doubling from `first_s` up to `longest_s`."""
+    """Waits between attempts to reopen a device, doubling from `first_s` up to `longest_s`."""
 
     first_s: float = 0.25
     longest_s: float = 5.0
     _next_s: float = 0.0
 
     def next(self) -> float:
-        """The wait before the next attempt, in s."""
+        """Next wait, s."""
         self._next_s = min(self.longest_s, self._next_s * 2 or self.first_s)
         return self._next_s
 
     def reset(self) -> None:
-        """Start again from the first wait: the device was there."""
+        """Return to the first wait, after a success."""
         self._next_s = 0.0
 
 
 def monotonic_ns() -> int:
-    """The host's monotonic clock: CLOCK_MONOTONIC_RAW, which nobody steps or slews, ns.
+    """Host's monotonic clock (ns): CLOCK_MONOTONIC_RAW, which is neither stepped nor slewed.
 
     adjtimex(2) slews CLOCK_MONOTONIC together with the system clock, by up to 10 %.
     """

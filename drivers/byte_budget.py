@@ -2,9 +2,9 @@
 
     a bucket of BURST bytes, filled at the line's rate; each byte read takes one out of it
 
-A byte of the worst stream costs some microseconds (`python -m tests.fuzz.hostile`), a flood over a
-network as much processor time as there is. What is not read waits with its sender (TCP, a pty) or
-is lost in the kernel (UDP): navigation comes first.
+Navigation comes first: parsing a byte of the worst stream takes some microseconds (`python -m
+tests.fuzz.hostile`), so a flood over a network could use the whole processor. Bytes beyond the
+limit wait with their sender (TCP, a pty) or are lost in the kernel (UDP).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BURST = 65_536.0
 
 
 class ByteBudget:
-    """The bucket of one line at `baud`; `now_s` is monotonic."""
+    """Token bucket of one line at `baud`; `now_s` is monotonic."""
 
     def __init__(self, baud: int = 0, now_s: Callable[[], float] = time.monotonic) -> None:
         self._rate = max(LINE_BYTES_S, baud / 10.0)
@@ -28,7 +28,7 @@ class ByteBudget:
         self._left, self._filled_s = BURST, now_s()
 
     def spend(self, count: int) -> float:
-        """Take `count` bytes out; for how long nothing more is to be read, in s."""
+        """Spend `count` bytes; return how long to wait before the next read, s."""
         now_s = self._now_s()
         self._left = min(BURST, self._left + self._rate * (now_s - self._filled_s)) - count
         self._filled_s = now_s

@@ -1,7 +1,8 @@
 """Call that may block for seconds, in a detached thread.
 
-A thread of the loop's own pool is joined before the process may end: a name server that does not
-answer would hold up the end of the daemon by more than its service manager allows.
+The process waits at exit for threads of the loop's pool: a name server that does not reply would
+delay the daemon's end by more than its service manager allows. It does not wait for a detached
+thread.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ T = TypeVar("T")
 
 
 async def aside(call: Callable[[], T], discard: Callable[[T], None]) -> T:
-    """Result of `call`. `discard` gets what comes after this was cancelled."""
+    """Result of `call`. If the wait is cancelled, `discard` gets the result when it comes."""
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
 
@@ -37,7 +38,7 @@ async def aside(call: Callable[[], T], discard: Callable[[T], None]) -> T:
             failed = error
         try:
             loop.call_soon_threadsafe(settle, found, failed)
-        except RuntimeError:  # the loop is closed: this came too late for anybody
+        except RuntimeError:  # the loop is closed: nobody waits any more
             for orphan in found:
                 discard(orphan)
 

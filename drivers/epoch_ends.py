@@ -1,7 +1,7 @@
 """Epochs of messages, and their ends: no I/O, no clock.
 
-An epoch is closed by a message of another instant, by one that repeats, by its last one, or by
-silence. Which one is the last is learned: the same cycle seen twice in a row.
+An epoch ends with a message of another instant, a repeated message, its last message, or silence.
+The last message is learned from two equal cycles in a row.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Name = int | str
 class Cycle:
     """Names in the open epoch, and the pattern of earlier ones.
 
-    Counts `late_message`: more of an epoch that was closed because its last one had come.
+    Counts `late_message`: messages of an epoch that its supposedly last message had closed.
     """
 
     def __init__(self, counters: Counter[str]) -> None:
@@ -44,8 +44,8 @@ class Cycle:
         return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
 
     def delayed(self, key: Hashable, name: Name) -> bool:
-        """True for a message of the epoch just closed, whose learned pattern was too short. A name
-        already in that epoch is a repetition instead."""
+        """True for a further message of the epoch just closed: the learned cycle was too short. A
+        name that the epoch already has is a repetition instead."""
         if self._names or not self._at_once or key != self._key or name in self._last:
             return False
         self._counters["late_message"] += 1
@@ -55,13 +55,13 @@ class Cycle:
         return True
 
     def add(self, key: Hashable, name: Name) -> bool:
-        """Take a message in; whether it was the last one of its epoch."""
+        """Add a message; true if it is the last one of its epoch."""
         self._key = key
         self._names.append(name)
         return tuple(self._names) == self._learned
 
     def close(self, *, learn: bool, at_once: bool) -> None:
-        """The epoch is over; `at_once`: by its last message, so that no more is expected."""
+        """Close the epoch; `at_once` if its last message closed it, so that no more is expected."""
         cycle = tuple(self._names)
         self._names.clear()
         if learn and cycle == self._last and cycle not in self._too_short:

@@ -1,8 +1,8 @@
-"""Single entry point of a driver: all external input arrives here, in sequence.
+"""Entry point of all external input of a driver, in sequence.
 
-A driver is a function of its inputs. While one of them is handled the driver's time stands at the
-instant at which it came, so that the same inputs, taken again from a recording, give the same
-measurements, requests and events.
+A driver's results depend on its inputs alone. While it handles an input, its clock stands at the
+input's instant; so the same inputs from a recording give the same measurements, requests and
+events.
 
     read     bytes off a serial line, as one read gave them
     frame    a frame off a CAN bus
@@ -26,8 +26,8 @@ Handler = Callable[[Any, int], None]
 
 
 class Inputs:
-    """The inputs of one driver by kind. `heard(kind, t_ns, payload)` is told each before it is
-    handled, and what the driver `sent`."""
+    """Inputs of one driver by kind. `heard(kind, t_ns, payload)` receives each input before the
+    driver handles it, and all data that the driver sends."""
 
     def __init__(self, host_now_ns: Now) -> None:
         self._host_now_ns = host_now_ns
@@ -40,13 +40,13 @@ class Inputs:
         self._handlers[kind] = handler
 
     def now_ns(self) -> int:
-        """The driver's time: that of the input that is being handled, else the host's."""
+        """Driver's time: the instant of the input in hand, else the host's clock."""
         return self._host_now_ns() if self._held_ns is None else self._held_ns
 
     def take(
         self, kind: str, payload: bytes | str | CanFrame | None = None, t_ns: int | None = None
     ) -> None:
-        """Handle an input that came at `t_ns`, now by default. KeyError for an unknown kind."""
+        """Handle an input that came at `t_ns`, by default now. KeyError for an unknown kind."""
         if t_ns is None:
             t_ns = self._host_now_ns()
         handler = self._handlers[kind]

@@ -1,4 +1,4 @@
-"""Common part of byte stream splitters: any pieces in, verified messages out, memory bounded."""
+"""Base of byte stream splitters: pieces of any size to verified messages, in bounded memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Splitter(ABC, Generic[Message]):
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Message]:
-        """The messages that `data` completes, in order."""
+        """Add `data`; return the messages that it completes, in order."""
         found: list[Message] = []
         for start in range(0, len(data), SLICE):
             self._buffer += data[start : start + SLICE]
@@ -33,11 +33,11 @@ class Splitter(ABC, Generic[Message]):
         return found
 
     def finish(self) -> list[Message]:
-        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
+        """End the stream: drop an incomplete message, and return complete ones inside it."""
         found: list[Message] = []
         self._scan(found, final=True)
         return found
 
     @abstractmethod
     def _scan(self, found: list[Message], *, final: bool) -> None:
-        """Remove complete messages from the buffer; everything when `final`."""
+        """Remove complete messages from the buffer, or everything if `final`."""

@@ -1,15 +1,15 @@
-"""The vocabulary that drivers speak: what a device said, in SI units, with the stamp it gave.
+"""Measurements, stamps and events that drivers emit, in SI units.
 
-A driver never settles *when* a measurement was true. It reports the device's own stamp (one of the
-`Stamp` classes) and `t_seen_ns`, the host's monotonic clock (`drivers.base`) when the last
-byte or frame came in. Whoever consumes the measurement turns the stamp into a validity instant.
+A driver does not decide *when* a measurement was valid. It reports the device's own stamp (one of
+the `Stamp` classes) and `t_seen_ns`, the host's monotonic clock (`drivers.base`) when the last byte
+or frame arrived. The consumer of the measurement resolves the stamp to an instant of validity.
 
 Frames: *sensor* axes are the device's own; *body* is forward-right-down; *NED* is
 north-east-down at the point that the measurement speaks of. Angles are radians unless a name says
 otherwise. Latitude, longitude and height are geodetic on WGS 84 (CGCS2000 agrees to centimetres).
 
-`rounding_sd` is one sigma of what a device's resolution takes off (`drivers.quantization`), beside
-the sigma that it states or that is known of it. It is 0 where the resolution is fine or not known.
+`rounding_sd` is one sigma of the device's rounding (`drivers.quantization`), in addition to the
+sigma that it states or the configuration holds; 0 if the resolution is fine or unknown.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Vector3 = tuple[float, float, float]
 
 @immutable()
 class ArrivalStamp:
-    """The device gave no time: true `latency_s` before the measurement was seen."""
+    """Stamp without a device's time: valid `latency_s` before the measurement was seen."""
 
     latency_s: float = 0.0
 
 
 @immutable()
 class MonotonicStamp:
-    """Already on the host's monotonic clock (files, simulation)."""
+    """Instant on the host's monotonic clock (files, simulation)."""
 
     t_ns: int
 
@@ -45,7 +45,7 @@ class KernelStamp:
 
 @immutable()
 class DeviceStamp:
-    """A device's own free-running clock, unwrapped by the driver; `device` names that clock."""
+    """Time of a device's free-running clock, unwrapped by the driver; `device` names the clock."""
 
     device: str
     ticks_ns: int
@@ -63,8 +63,8 @@ class TimeOfDayStamp:
     """Time of day without a date, in one of several possible zones.
 
     `time_of_day_s` may reach 86401 (leap second). `zones_h` lists the possible offsets of the
-    printed time from UTC. `requested_ns` is the monotonic instant at which the device was asked,
-    None when it was not. `uncertainty_s` bounds what the printed fraction leaves open.
+    printed time from UTC. `requested_ns` is the monotonic instant of the request, None without one.
+    `uncertainty_s` bounds the error of the printed fraction.
     """
 
     time_of_day_s: float
@@ -94,12 +94,12 @@ class ImuSample:
 class PositionFix:
     """Fix of a GNSS receiver's antenna, with velocity if stated.
 
-    `sd_ned_m` and `sd_v_ned_m_s` are one sigma; None where the device did not say (the aiding then
-    uses what the configuration holds). A velocity whose down part is None is horizontal only.
-    `quality` follows NMEA GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
-    `height_m` is None where the device does not know it. It is the height above the sea where the
-    device does not say how high the geoid is: `geoid_sd_m` is then one sigma of that, which all
-    fixes of a neighbourhood share; else 0.
+    `sd_ned_m` and `sd_v_ned_m_s` are one sigma; None if the device states none (then the configured
+    sigma is used). A velocity whose down part is None is horizontal only. `quality` follows NMEA
+    GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float. `height_m` is None if the device
+    does not know it. If the device does not state the geoid's height, `height_m` is above the sea,
+    and `geoid_sd_m` is one sigma of the geoid's height, an error that all fixes of a neighbourhood
+    share; otherwise 0.
     """
 
     source: str
@@ -122,12 +122,12 @@ class PositionFix:
 
 @immutable()
 class DelayedFix:
-    """A BeiDou RDSS fix: the terminal's position at the instant its request left the antenna.
+    """BeiDou RDSS fix: position of the terminal when its request left the antenna.
 
-    `precision_class_m` is the class the centre states (20 or 100 m). `height_m` is what went into
-    the solution, not an independent measurement. `multi_value` says two solutions were possible,
-    `height_given` that the height was ours: the request gave it, or our barometer's pressure, and
-    it says nothing new; `height_sd_m` is then its sigma, None where that is not known.
+    `precision_class_m` is the class that the centre states (20 or 100 m). `height_m` is the height
+    that the centre used, not an independent measurement. `multi_value`: two solutions were
+    possible. `height_given`: the height was ours, by the request or by our barometer's pressure, so
+    it is no new information; `height_sd_m` is then its sigma, None if unknown.
     """
 
     source: str
@@ -144,10 +144,10 @@ class DelayedFix:
 
 @immutable()
 class Attitude:
-    """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; a NaN angle is not given.
+    """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; NaN for an angle not given.
 
-    A star tracker's attitude is of the same kind, against north-east-down. The sigma of an angle
-    that is given is NaN where the device does not say it.
+    A star tracker's attitude is converted to north-east-down, too. The sigma of an angle is NaN if
+    the device states none.
     """
 
     source: str
@@ -205,8 +205,8 @@ class MagneticHeading:
 class Height:
     """Ellipsoidal height of the body origin (m), one sigma if given.
 
-    `barometric`: a pressure's height in the standard atmosphere. It changes as the height does, and
-    is off by the weather: 8 m a hPa, for hours alike.
+    `barometric`: height of a pressure in the standard atmosphere. Its changes are right; the
+    weather adds an error of 8 m a hPa, which stays for hours.
     """
 
     source: str
@@ -222,9 +222,9 @@ class Height:
 class WheelSpeed:
     """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given.
 
-    Not `signed`: the device does not know forward from backward, and the speed is its amount.
-    `shared_step_m_s`: the step of a rounding whose manner is not known; `drivers.quantization` says
-    what part of `rounding_sd_m_s` all readings share.
+    Without `signed` the device does not distinguish forward from backward, and the speed is an
+    absolute value. `shared_step_m_s`: the step of a rounding, up, down or to the nearest;
+    `drivers.quantization` has the part of `rounding_sd_m_s` that all readings share.
     """
 
     source: str
@@ -241,7 +241,7 @@ class WheelSpeed:
 class TimeReport:
     """UTC from a device (NMEA RMC/ZDA, RDSS SJXX/BDZDA), for the clock.
 
-    `trusted` is False while the device itself says its time is not yet valid.
+    `trusted` is False while the device marks its time as invalid.
     """
 
     source: str
@@ -266,7 +266,7 @@ Measurement = (
 
 @immutable()
 class DeviceEvent:
-    """Something an operator should know about a device: a stable code and one sentence."""
+    """Event of a device for the operator: a stable code and one sentence."""
 
     source: str
     t_seen_ns: int

@@ -4,8 +4,8 @@
     udp://:PORT                datagrams to this port; udp://ADDRESS:PORT of one interface alone
     gpsd://HOST:PORT[/DEVICE]  the bytes of a gpsd's device, as they come (its WATCH with raw = 2)
 
-A line over TCP ends when the other side closes, resets, or no longer answers the kernel: a cable
-that was pulled sends neither. UDP has no end; it falls silent.
+A TCP connection ends when the other side closes or resets it, or no longer replies to the kernel's
+probes, as after a pulled cable. UDP has no end; it falls silent.
 """
 
 from __future__ import annotations
@@ -175,14 +175,14 @@ class UdpPort(_SocketPort):
     def read(self) -> bytes:
         data, sender = self._socket.recvfrom(DATAGRAM_BYTES)
         now_s = monotonic()
-        # By host alone: some send each datagram from a fresh port.
+        # By host alone: some devices send each datagram from another port.
         foreign = self._sender is not None and self._sender[0] != sender[0]
         if foreign and now_s - self._received_s < SENDER_HELD_S:
             self._counters["other_sender"] += 1
             raise BlockingIOError
         self._sender, self._received_s = sender, now_s
         if not data:
-            raise BlockingIOError  # a datagram without a byte is no end of anything
+            raise BlockingIOError  # an empty datagram does not end the stream
         return data
 
     def write(self, data: bytes | bytearray) -> int:

@@ -1,7 +1,7 @@
-"""Plausible ranges of measurements on a vehicle: ranges that a number of a device is held against.
+"""Plausible ranges of measurements on a vehicle.
 
-A sentence or frame whose check is right can still hold any number: a receiver that restarts, a line
-that was edited, a decoder of somebody else's. What lies outside is refused by the counter's name.
+A sentence or frame with a correct checksum can still hold any number: from a receiver that
+restarts, an edited line, or another program. Values outside are refused under a counter's name.
 """
 
 from __future__ import annotations
@@ -22,5 +22,5 @@ LEAP_SECONDS = (10, 30)
 
 
 def within(value: float, limits: tuple[float, float]) -> bool:
-    """True if `value` lies in the range; not a number lies in none."""
+    """True if `value` lies in the range; false for NaN."""
     return limits[0] <= value <= limits[1]

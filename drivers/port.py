@@ -1,4 +1,4 @@
-"""Ports: a non-blocking open port, and the serial one."""
+"""Ports: interface of a non-blocking open port, and the serial port."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ A port is absent, locked, no terminal, or refuses the baud rate (SerialException
 
 
 class Port(Protocol):
-    """An open port. BlockingIOError where nothing can be read or written now, another OSError where
+    """Open port. Raises BlockingIOError if nothing can be read or written now, another OSError if
     it is broken."""
 
     at_end: str
@@ -34,7 +34,7 @@ class Port(Protocol):
         """True if the far end can receive."""
 
     def fileno(self) -> int:
-        """The descriptor that a loop waits for."""
+        """Descriptor for the event loop."""
 
     def read(self) -> bytes:
         """Waiting bytes; no bytes at the end of the stream."""
@@ -43,7 +43,7 @@ class Port(Protocol):
         """Number of bytes taken."""
 
     def changed(self) -> str:
-        """Reason why the port's name no longer refers to it; empty while it does."""
+        """Reason why the port's name no longer refers to this device; empty while it does."""
 
     def set_baud(self, baud: int) -> None:
         """Change the baud rate, if any."""
@@ -58,7 +58,7 @@ seconds, raises `OPEN_ERRORS`."""
 
 
 def open_serial(path: str, baud: int, counters: Counter[str]) -> Port:
-    """Open a serial device only. Raises `OPEN_ERRORS`."""
+    """Open a serial device; no network address. Raises `OPEN_ERRORS`."""
     return SerialPort(path, baud)
 
 
@@ -71,7 +71,7 @@ _WHY = {
 
 
 def why_not_open(error: Exception) -> str:
-    """Reason why a port did not open: to stand behind its name, or with it."""
+    """Reason why a port did not open, for a text behind its name or with it."""
     code = getattr(error, "errno", None)
     return str(error) if code is None else _WHY.get(code, str(error))
 
@@ -79,8 +79,8 @@ def why_not_open(error: Exception) -> str:
 class SerialPort:
     """Serial port: 8 data bits, no parity, 1 stop bit, no flow control, raw bytes.
 
-    pyserial opens and configures it; reading and writing go straight to its descriptor, so that
-    every read is bounded and an end of file is seen as what it is.
+    pyserial opens and configures it; reading and writing use its descriptor directly, so that every
+    read is bounded and an end of file is recognised.
     """
 
     at_end = "end of file, the device went away"
@@ -88,12 +88,12 @@ class SerialPort:
     writable = True
 
     def __init__(self, path: str, baud: int) -> None:
-        # exclusive is flock, not TIOCEXCL: the latter outlives a killed daemon while anybody else
-        # (a simulator on a pty) holds the terminal open. inter_byte_timeout 0 makes pyserial set
-        # VMIN 1, VTIME 0 (its default VMIN 0 gives no bytes both for idle and for end of file).
+        # `exclusive` is flock, not TIOCEXCL, which outlives a killed daemon while another process
+        # (a simulator on a pty) holds the terminal open. `inter_byte_timeout` 0 makes pyserial set
+        # VMIN 1 and VTIME 0; with its default, VMIN 0, an idle line reads like an end of file.
         self._path = path
         self._serial = serial.Serial(path, baud, timeout=0, exclusive=True, inter_byte_timeout=0)
-        with contextlib.suppress(ValueError):  # a pty or an adapter without the flag
+        with contextlib.suppress(ValueError):  # a pty, or an adapter without low latency
             self._serial.set_low_latency_mode(True)
 
     def fileno(self) -> int:
@@ -118,5 +118,5 @@ class SerialPort:
 
     def close(self) -> None:
         with contextlib.suppress(*OPEN_ERRORS):
-            self._serial.reset_output_buffer()  # else close waits for a dead line, up to 30 s
+            self._serial.reset_output_buffer()  # otherwise close waits for a dead line, up to 30 s
         self._serial.close()

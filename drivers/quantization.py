@@ -1,11 +1,12 @@
-r"""Distribution of a quantity that a device has rounded to its steps.
+r"""Distribution of a quantity that a device has rounded to steps.
 
     to the nearest   x in value + q [-1/2, 1/2]    mean value             sd q / sqrt(12)
     downwards        x in value + q [0, 1]         mean value + q / 2     sd q / sqrt(12)
     not known which  one as likely as the other    mean value + q / 4     sd q sqrt(1/12 + 1/16)
 
 q the step, x the quantity, uniform within: Bennett, Spectra of quantized signals, BSTJ 27 (1948).
-Of the last, q / 4 is shared by all readings: whichever way it is, it is always the same.
+In the last case all readings share an error of sigma q / 4, since the device always rounds the same
+way.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ ZERO_SD = 1.0 / math.sqrt(3.0)
 class RoundedSpeed(NamedTuple):
     """Mean, one sigma and step (m/s) of a speed that was rounded.
 
-    Readings share an error of sigma `SHARED_SD` steps, a part of that sigma; the step is 0 where
-    they share none."""
+    All readings share an error of sigma `SHARED_SD` steps, which is a part of that sigma; the step
+    is 0 if they share none."""
 
     mean_m_s: float
     sd_m_s: float
@@ -44,8 +45,8 @@ def rounded_speed(
 ) -> RoundedSpeed:
     """Expected speed for a rounded value of a device with steps of `step_m_s`.
 
-    A 0 does not mean standstill: the speed is below one step, whichever way it is rounded,
-    for sensors of wheels give no pulses below a least speed.
+    A 0 does not mean standstill: the speed is below one step, however the device rounds, since
+    wheel sensors give no pulses below a least speed.
     """
     if abs(value_m_s) < 0.5 * step_m_s:
         return RoundedSpeed(0.0, ZERO_SD * step_m_s, 0.0)

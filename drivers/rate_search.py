@@ -1,8 +1,8 @@
 """Search for the baud rate of a line whose bytes do not verify: no I/O, no clock.
 
-A receiver that loses its battery, or is set anew, sends at another rate than was configured. Each
-rate is tried for two epochs of a second, in turn, the configured one among them, for as long as
-bytes come and none of them verifies.
+After a loss of its battery or a reset a receiver sends at another rate than the configured one. All
+rates, the configured one among them, are tried in turn for 2 s each (two epochs of a second), as
+long as bytes arrive and none of them verifies.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ENOUGH_BYTES = 64
 
 
 class RateSearch:
-    """Search of one line that is configured to be read at `baud`, which is the rate it is at."""
+    """Search on one line with the configured rate `baud`."""
 
     def __init__(self, baud: int) -> None:
         self.configured = self.baud = baud
@@ -25,11 +25,11 @@ class RateSearch:
         self._bytes_in = 0
 
     def understood(self) -> None:
-        """Stay at this rate: something has verified."""
+        """Keep this rate, since a message has verified."""
         self._since_ns, self._untried = None, []
 
     def next(self, t_ns: int, bytes_in: int) -> int | None:
-        """The next rate to try, or None to stay at this one, after `bytes_in` bytes in all."""
+        """Next rate to try after `bytes_in` bytes in all; None to keep this one."""
         if self._since_ns is not None and (
             t_ns - self._since_ns < LISTEN_NS or bytes_in - self._bytes_in < ENOUGH_BYTES
         ):

@@ -1,7 +1,7 @@
 """Common base of receiver and compass drivers: one device on one line.
 
-A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
-silent, and says in `status` whether the device is there and intelligible.
+The decoder makes measurements of bytes. The driver hands them over, ends an epoch when the line
+falls silent, and keeps `status`: whether the device is present and intelligible.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LIFE_SIGNS = ("bytes_in", "sentences", "ubx_frames", "rtcm_frames", "logs", "sb
 
 
 class ReceiverDecoder(Protocol):
-    """Bytes in, measurements out."""
+    """Decoder of bytes into measurements."""
 
     @property
     def gga(self) -> bytes:
@@ -49,7 +49,7 @@ class ReceiverDecoder(Protocol):
 
 
 class ReceiverOptions(DriverOptions):
-    """Port of the receiver, and its initial commands."""
+    """Options of a receiver: its port and initial commands."""
 
     port: PortName
     """A serial device, or an address of a network: see `docs/network.md`."""
@@ -67,7 +67,7 @@ class ReceiverOptions(DriverOptions):
 
 
 class ReceiverDriver:
-    """Base of drivers of one device on one line. Subclasses provide the decoder and the words of
+    """Base of drivers of one device on one line. Subclasses provide the decoder and the texts of
     `status.detail`."""
 
     alive_by: tuple[str, ...] = ("sentences",)
@@ -122,7 +122,7 @@ class ReceiverDriver:
 
     @property
     def _decoder_cautions(self) -> dict[str, str]:
-        """Cautions of what arrives."""
+        """Cautions of the decoder, by counter."""
         return {}
 
     def _other_rate(self) -> str:
@@ -137,7 +137,7 @@ class ReceiverDriver:
         raise NotImplementedError
 
     def _useless_detail(self) -> str:
-        """Reason why input has given no measurement for the timeout."""
+        """Reason why the input has given no measurement within the timeout."""
         raise NotImplementedError
 
     def _unintelligible_detail(self) -> str:
@@ -145,7 +145,7 @@ class ReceiverDriver:
         raise NotImplementedError
 
     def _where_to_look(self) -> str:
-        """End of a sentence on unrecognised bytes: where to look next."""
+        """End of a sentence on unrecognised bytes: the place to look next."""
         if on_network(self._port):
             return f" from {self._port}: does it serve what the receiver sends?"
         return f" at {self._baud} baud: is that the receiver's rate?"
@@ -160,7 +160,7 @@ class ReceiverDriver:
             tasks.create_task(self._line.run(self._read, opened, self._closed))
 
     def _pass_on(self, frame: bytes) -> bool:
-        """Hand a frame of the caster to the receiver; False where it cannot be."""
+        """Write a frame of the caster to the receiver; False if that is impossible."""
         return self._line.write(frame)
 
     def _corrections_changed(self, state: str, text: str) -> None:

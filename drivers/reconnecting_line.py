@@ -1,7 +1,8 @@
 """Serial line under asyncio that reopens itself when its device disappears and returns.
 
-Every read is bounded, stamped, and an end is seen as what it is. A piece is handed over in a turn
-of the loop, and bytes no faster than a line can be (drivers.byte_budget).
+Every read is bounded and stamped, and an end of the stream is recognised. Each piece is handed over
+in a turn of the loop of its own, and bytes no faster than a real line brings them
+(drivers.byte_budget).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class SerialLine:
     """Port reopened indefinitely with `backoff`; serial, unless `open_port` is another one.
 
     `counters`: `opened`, `closed`, `open_failed`, `bytes_in`, `bytes_out`, `write_refused`,
-    `baud_refused`, `paused` (more came than a line brings). `detail` is the last trouble in words;
+    `baud_refused`, `paused` (more came than a line brings). `detail` is the last problem in words;
     empty once bytes arrive.
     """
 
@@ -69,8 +70,8 @@ class SerialLine:
         """Keep the line open until cancelled.
 
         `on_bytes(data, t_seen_ns)` gets at most `READ_BYTES` with the monotonic instant at which
-        they were found waiting; `on_close(why)` is called once for every `on_open`. An exception
-        of a callback is a defect of the caller: it closes the line and leaves here.
+        they were found waiting; `on_close(why)` is called once for every `on_open`. An exception of
+        a callback is a bug of the caller: it closes the line and is raised.
         """
         while True:
             try:
@@ -97,8 +98,8 @@ class SerialLine:
             await asyncio.sleep(self._backoff.next())
 
     def write(self, data: bytes) -> bool:
-        """Send `data` without ever blocking; False when the line is closed or congested, or has
-        nobody at its other end who could read."""
+        """Send `data` without blocking; False if the line is closed or congested, or nobody at its
+        other end can read."""
         port, gone = self._opened, self._gone
         if port is None or gone is None or gone.done() or not port.writable:
             self.counters["write_refused"] += 1
@@ -115,7 +116,7 @@ class SerialLine:
         return True
 
     def set_baud(self, baud: int) -> None:
-        """Change the baud rate, at once when the line is open, and for every later opening."""
+        """Change the baud rate of the open line and of every later opening."""
         self.baud = baud
         self._budget = ByteBudget(baud)
         if self._opened is None:
@@ -127,12 +128,13 @@ class SerialLine:
             self._end(f"{self.port}: {baud} baud refused: {error}")
 
     async def _open(self) -> Port:
-        """Open in a thread: a USB adapter in trouble holds `open` for seconds, a network too."""
+        """Open in a thread, since a faulty USB adapter or a network may block `open` for
+        seconds."""
         opening = partial(self._open_port, self.port, self.baud, self.counters)
         return await aside(opening, lambda port: port.close())
 
     async def _serve(self, port: Port, on_bytes: Callable[[bytes, int], None]) -> str:
-        """Read until the device is gone; why, in words."""
+        """Read until the device is gone; return the reason in words."""
         loop = asyncio.get_running_loop()
         gone: asyncio.Future[str] = loop.create_future()
         self._gone = gone
@@ -166,7 +168,7 @@ class SerialLine:
         self.counters["bytes_in"] += len(data)
         self._backoff.reset()
         self.detail = ""
-        self._unread = data, t_seen_ns  # a datagram comes as a whole
+        self._unread = data, t_seen_ns  # a datagram must be read as a whole
         self._hand_over(port, gone, on_bytes)
 
     def _hand_over(
@@ -175,7 +177,7 @@ class SerialLine:
         gone: asyncio.Future[str],
         on_bytes: Callable[[bytes, int], None],
     ) -> None:
-        """Hand a piece over; the next comes in a turn of its own, when a line could bring it."""
+        """Hand over a piece; schedule the next one for when a real line could bring it."""
         data, t_seen_ns = self._unread
         self._unread = data[READ_BYTES:], t_seen_ns
         try:

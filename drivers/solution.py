@@ -1,8 +1,8 @@
 """Solution of a receiver's epoch, as in its protocol, and its validation.
 
-What NMEA spreads over sentences comes here in one piece: UBX-NAV, the BESTPOS family and SBF fill a
-`Solution`, and `SolutionJudge` makes of it what `drivers.nmea.decoder` makes of an epoch: a fix, a
-heading, a report of UTC, or the counter's name of why there is none. No I/O, no clock.
+UBX-NAV, the BESTPOS family and SBF fill a `Solution`. `SolutionJudge` makes of it what
+`drivers.nmea.decoder` makes of an epoch's sentences: a fix, a heading, a report of UTC, or the
+counter's name of a refusal. No I/O, no clock.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ REFUSALS = {
 
 @dataclass(slots=True)
 class Solution:
-    """Epoch; rad, m, m/s, NED, ns of POSIX time. None where not stated.
+    """Solution of an epoch: rad, m, m/s, NED, POSIX ns. None if not stated.
 
-    `refusal`: why the position may not be used, by counter. `utc_known`: the receiver believes its
-    UTC. `hdop` and `vdop` are without unit.
+    `refusal`: reason against the position, by counter. `utc_known`: the receiver trusts its UTC.
+    `hdop` and `vdop` are without unit.
     """
 
     t_seen_ns: int
@@ -80,7 +80,7 @@ def day_of(utc_ns: int) -> date:
 
 
 class SolutionJudge:
-    """Judge of solutions, in their order.
+    """Judge of solutions in order.
 
     Counts `epochs`, `fixes`, the names of `REFUSALS`, and within a fix `sigma_too_small`,
     `height_not_measured`, `velocity_not_finite`, `velocity_unknown`; of headings
@@ -102,11 +102,11 @@ class SolutionJudge:
         self._trust = TimeTrust()
 
     def epoch(self, s: Solution) -> list[Measurement]:
-        """The fix and the time that a solution stands for."""
+        """Fix and time report of a solution."""
         found: list[Measurement] = []
         self.counters["epochs"] += 1
         stamp = self._stamp(s, found)
-        # The position's own fault is told before the time's.
+        # A fault of the position is reported before one of the time.
         self.refusal = s.refusal or _implausible(s) or ("" if stamp else "untimed_epoch")
         if self.refusal:
             self.counters[self.refusal] += 1
@@ -138,7 +138,7 @@ class SolutionJudge:
         return [Heading(self._source, t_seen_ns, stamp, math.remainder(yaw, math.tau), sd)]
 
     def _stamp(self, s: Solution, found: list[Measurement]) -> Stamp | None:
-        """Instant of the solution, None without one; reports a trusted time."""
+        """Stamp of the solution, None without an instant; a trusted time is also reported."""
         if s.utc_ns is None:
             return None
         stamp = self._stamp_of(s.utc_ns)
@@ -149,8 +149,8 @@ class SolutionJudge:
         return stamp
 
     def _stamp_of(self, utc_ns: int) -> Stamp:
-        """A date that no receiver can truly report is left out: of the time of day it says nothing,
-        whichever week was taken for which."""
+        """Stamp of an instant. An impossible date is ignored, as after a mistaken week; the time of
+        day is still right."""
         if self._calendar.plausible(day_of(utc_ns)):
             return UtcStamp(utc_ns)
         self.implausible_date = day_of(utc_ns)
@@ -168,7 +168,7 @@ class SolutionJudge:
             sd = None
         if sd_v is not None and any(x is not None and x > SPEED_M_S for x in sd_v):
             self.counters["velocity_unknown"] += 1
-            v = None  # a sigma above all speeds: a position alone
+            v = None  # a sigma above any speed: use the position alone
         if sd_v is not None and not all(x is None or 0.0 < x < math.inf for x in sd_v):
             sd_v = None
         if v is not None and not all(x is None or math.isfinite(x) for x in v):
@@ -217,7 +217,7 @@ def _implausible(s: Solution) -> str | None:
         return "position_implausible"
     if s.height_m is not None and not within(s.height_m, HEIGHT_M):
         return "height_implausible"
-    # Not a number compares as neither; it is looked at where the fix is made.
+    # Comparisons with NaN are false; it is checked where the fix is made.
     if s.v_ned_m_s is not None and math.hypot(*s.v_ned_m_s[:2]) > SPEED_M_S:
         return "speed_implausible"
     if s.sd_ned_m is not None and not max(s.sd_ned_m) <= SIGMA_M[1]:

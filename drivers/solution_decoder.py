@@ -1,7 +1,6 @@
-"""Common part of the decoders `ubx`, `bestpos` and `sbf`: messages of bytes, epochs of messages.
+"""Common part of the decoders `ubx`, `bestpos` and `sbf`: bytes to messages, messages to epochs.
 
-An epoch is closed as `drivers.epoch_ends` finds, and judged by `drivers.solution`. No I/O, no
-clock.
+`drivers.epoch_ends` finds the end of an epoch, `drivers.solution` judges it. No I/O, no clock.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ Epoch = TypeVar("Epoch")
 
 
 class SolutionDecoder(ABC, Generic[Message, Epoch]):
-    """`feed` bytes, get measurements; `flush` at the end of the file.
+    """Decoder: `feed` bytes to get measurements; `flush` at the end of the file.
 
-    Who derives from it splits the bytes, takes messages into `_epoch`, and makes a `Solution` of
-    one that is closed.
+    A subclass splits the bytes, adds messages to `_epoch`, and makes a `Solution` of a closed
+    epoch.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @property
     def gga(self) -> bytes:
-        """The last fix as a GGA; empty before one."""
+        """Last fix as a GGA; empty before the first one."""
         return self._judge.gga
 
     @property
@@ -69,7 +68,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         return self._epoch is not None
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
-        """The measurements that `data`, seen at `t_seen_ns`, completes."""
+        """Measurements that `data`, seen at `t_seen_ns`, completes."""
         self._t_seen_ns = t_seen_ns
         found: list[Measurement] = []
         self._take_all(self._splitter.feed(data), found)
@@ -82,7 +81,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         return found
 
     def flush(self) -> list[Measurement]:
-        """The stream ended, or broke: everything that can still be had from what came."""
+        """End the stream; return what its last bytes still complete."""
         found: list[Measurement] = []
         self._take_all(self._splitter.finish(), found)
         self._end(found, learn=False)
@@ -92,7 +91,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
         for message in messages:
             self._take(message, found)
 
-    # ----------------------------------------------------------------- of each protocol
+    # ----------------------------------------------------------------- protocol
 
     @abstractmethod
     def _make_splitter(self) -> Splitter[Message]:
@@ -100,11 +99,11 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @abstractmethod
     def _take(self, message: Message, found: list[Measurement]) -> None:
-        """Take a message in; what it completes is `found`."""
+        """Process a message; add what it completes to `found`."""
 
     @abstractmethod
     def _solution(self, epoch: Epoch) -> Solution | None:
-        """Solution of a closed epoch; None where it has no position to judge."""
+        """Solution of a closed epoch; None without a position to judge."""
 
     # ----------------------------------------------------------------- epochs
 

@@ -1,5 +1,4 @@
-"""Common part of the drivers `ubx`, `bestpos` and `sbf`: a receiver whose own solutions are
-read."""
+"""Common part of the drivers `ubx`, `bestpos` and `sbf`, which read a receiver's own solutions."""
 
 from __future__ import annotations
 
@@ -24,8 +23,8 @@ class SolutionOptions(ReceiverOptions, SolutionDecoding):
 
 
 class SolutionDriver(ReceiverDriver):
-    """Driver that reads a line and hands over fixes, headings and times; `status` says what is
-    wrong."""
+    """Driver that reads a line and hands over fixes, headings and times; `status` has the reason if
+    it cannot."""
 
     Options: ClassVar[type[SolutionOptions]] = SolutionOptions
     Decoder: ClassVar[Callable[..., Any]]
@@ -57,8 +56,7 @@ class SolutionDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """Text on another protocol on the line, as a sentence; "" where nothing that arrives
-        tells."""
+        """Sentence on another protocol on the line; "" if none is recognised."""
         if not self._foreign:
             return ""
         counters = Counter[str]()

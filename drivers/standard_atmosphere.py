@@ -30,6 +30,6 @@ def standard_pressure_pa(height_m: float) -> float:
 
 
 def metres_a_pascal(pressure_pa: float) -> float:
-    """Height of a step of pressure: -dH/dp."""
+    """Height of a step of pressure: -dH/dp, m/Pa."""
     ratio: float = (pressure_pa / P0_PA) ** EXPONENT
     return SCALE_M * EXPONENT * ratio / pressure_pa

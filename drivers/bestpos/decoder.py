@@ -1,4 +1,4 @@
-"""The BESTPOS family of NovAtel and Unicore in, measurements out: no I/O, no clock.
+"""Decoder of NovAtel's and Unicore's BESTPOS logs into measurements: no I/O, no clock.
 
     BESTPOS, BESTGNSSPOS, RTKPOS, PSRPOS   height above the sea + undulation = ellipsoidal height
     BESTVEL, BESTGNSSVEL, RTKVEL, PSRVEL   speed over ground, track, vertical speed upwards
@@ -6,9 +6,9 @@
     HEADING, HEADING2, UNIHEADING, DUALANTENNAHEADING    with a sigma
     TIME                                   UTC offset, where the header does not say leap seconds
 
-Of an epoch's positions the first of `POSITIONS` that the receiver itself believes serves. Status
-and type are words; a type that is not known is refused by name. Sources: NovAtel OEM7 Commands and
-Logs Reference Manual; Unicore Reference Commands Manual for N4 High Precision Products.
+An epoch's position is the first one of `POSITIONS` that the receiver marks as solved. Status and
+type are words; an unknown type is refused by name. Sources: NovAtel OEM7 Commands and Logs
+Reference Manual; Unicore Reference Commands Manual for N4 High Precision Products.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
         )
 
     def _velocity(self, log: Log) -> tuple[_Velocity, _VelocitySd | None] | None:
-        """Velocity; None where the receiver has none, or its firmware lacks BESTNAV."""
+        """Velocity; None if the receiver has none, or its firmware lacks BESTNAV."""
         f = log.fields
         if log.name == "BESTNAV":
             if len(f) < _BOTH:
@@ -194,7 +194,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
             return None
         latency, speed, track, up = (_number(f[at]) for at in (2, 4, 5, 6))
         if latency:
-            # Its instant is an error that the filter estimates (time_offset_sd_s).
+            # The filter estimates the error of the velocity's instant (time_offset_sd_s).
             self.counters["velocity_latent"] += 1
         course = math.radians(track)
         v = speed * math.cos(course), speed * math.sin(course), -up

@@ -1,4 +1,5 @@
-"""A NovAtel or Unicore receiver that sends ASCII logs: see `docs/gnss-bestpos.md`."""
+"""Driver `bestpos`: a NovAtel or Unicore receiver that sends ASCII logs, see
+`docs/gnss-bestpos.md`."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""ASCII logs of NovAtel and Unicore out of a byte stream: no I/O.
+"""Splitter of a byte stream into ASCII logs of NovAtel and Unicore: no I/O.
 
     # header ; body * hhhhhhhh      CRC-32 (reflected, EDB88320 hex, from 0) between # and *
     NovAtel   NAME,port,sequence,idle,time status,week,seconds,receiver status,reserved,version
     Unicore   NAME,load,GPS|BDS,time status,week,milliseconds,reserved,reserved,leap seconds,delay
 
-Everything else on the line (NMEA, commands' answers, binary logs) is passed over, and a log that is
-damaged costs itself. Sources: NovAtel OEM7 Commands and Logs Reference Manual, "ASCII" and "32-bit
-CRC"; Unicore Reference Commands Manual for N4 High Precision Products.
+Everything else on the line (NMEA, replies to commands, binary logs) is skipped. A damaged log does
+not affect the next one. Sources: NovAtel OEM7 Commands and Logs Reference Manual, "ASCII" and
+"32-bit CRC"; Unicore Reference Commands Manual for N4 High Precision Products.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def log_crc(data: bytes) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """A verified log: `name` without its A, GPS time (`week` None where it is not known), leap
-    seconds where the header says them, and the fields of its body."""
+    """Verified log: `name` without its A, GPS time (`week` None if unknown), leap seconds if the
+    header has them, and the fields of the body."""
 
     name: str
     week: int | None
@@ -58,7 +58,7 @@ class Log:
 
 
 class LogSplitter(Splitter[Log]):
-    """Bytes in, verified logs out, whatever the splits.
+    """Splitter of bytes, in pieces of any size, into verified logs.
 
     Counts `logs`; refused `crc_bad`, `log_too_long`, `log_cut` (text without a CRC, or the end of
     the stream), `header_bad`; and `other_bytes`, all that belonged to no good log.
@@ -87,7 +87,7 @@ class LogSplitter(Splitter[Log]):
         del buffer[:at]
 
     def _log(self, at: int, found: list[Log]) -> int | None:
-        """Bytes used by the log that starts at `at`, good or not; None: more are needed."""
+        """Length of the log that starts at `at`, good or not; None if it is incomplete."""
         buffer = self._buffer
         stop = _NOT_BODY.search(buffer, at + 1, at + MAX_LOG)
         if stop is None:

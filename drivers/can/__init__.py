@@ -1,4 +1,4 @@
 """Devices on a CAN bus, described by DBC files."""
 
-# Before any module of this room imports cantools, which imports python-can with all it brings.
+# First, before a module of this package imports cantools, which imports python-can.
 import drivers.can.python_can_import  # noqa: F401

@@ -1,4 +1,4 @@
-"""Drivers `can_attitude` and `can_bearing`: attitude and bearings out of a CAN bus, by any DBC.
+"""Drivers `can_attitude` and `can_bearing`: attitude and bearings from a CAN bus, by any DBC.
 
 A star tracker's or a reference unit's roll, pitch and yaw; a radar's azimuth and elevation of a
 point whose number it sends. Signals are "Message.Signal"; their unit is that of the DBC (deg, rad,
@@ -24,7 +24,7 @@ NAN = math.nan
 
 
 class CanMeasurementOptions(CanOptions):
-    """Common part of the two."""
+    """Common options of both drivers."""
 
     valid: str | Signals = ()
     """Flags: a measurement with 0 in one is counted as `not_valid` and dropped."""

@@ -1,8 +1,8 @@
 """Base of CAN drivers: a bus, a codec, stamps, states, events.
 
-The codec of most is a `drivers.can.decoder.CanDecoder`, which a DBC file describes. Each driver
-opens the bus for itself, so several share one channel; the kernel gives each the frames it filters
-for. A recorded frame goes the same way: `CanDriver.feed`.
+The codec of most drivers is a `drivers.can.decoder.CanDecoder`, which a DBC file describes. Each
+driver opens the bus for itself, so several may share one channel; the kernel gives each the frames
+of its filters. Recorded frames enter by the same method, `CanDriver.feed`.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ O = TypeVar("O", bound=BusOptions)  # noqa: E741
 
 
 class Codec(Protocol):
-    """Frames in, measurements out; no I/O. It counts what it refuses in the counters it is given.
-    PermanentDriverError from the constructor, made of name, options and counters, when the options
-    cannot be served."""
+    """Codec of frames into measurements; no I/O. It counts refusals in the given counters. Its
+    constructor (name, options, counters) raises PermanentDriverError for options that it cannot
+    serve."""
 
     @property
     def filters(self) -> list[CanFilter]:
@@ -95,7 +95,7 @@ class Codec(Protocol):
         """Restart after a pause: later frames do not belong to earlier ones."""
 
     def feed(self, frame: CanFrame) -> Sequence[Measurement]:
-        """Take one data frame; what it completes. Never raises."""
+        """Process one data frame and return the measurements that it completes. Never raises."""
 
 
 class CanDriver(Generic[O]):
@@ -124,7 +124,7 @@ class CanDriver(Generic[O]):
         self.inputs.on("watch", self._on_watch)
         self._now_ns = self.inputs.now_ns
         self._decoder = self.Decoder(name, options, self.counters)
-        # The other interfaces filter in Python, which the decoder does anyhow.
+        # Other interfaces filter in Python, which the decoder does itself.
         filters = self._decoder.filters if options.interface == "socketcan" else ()
         self._bus = CanBus(
             options.interface, options.channel, filters, self.counters, now_ns=now_ns
@@ -150,12 +150,13 @@ class CanDriver(Generic[O]):
             watch.cancel()
 
     def poll_from_now_on(self) -> Callable[[], None]:
-        """Leave it to the caller when the bus is read; what to call for it. Before `run`."""
+        """Return the function by which the caller reads the bus from now on; call before `run`."""
         self._bus.polled = True
         return self._bus.poll
 
     def feed(self, frame: CanFrame) -> None:
-        """Take one data frame, off the bus or out of a log: what it completes is handed over."""
+        """Process one data frame, from the bus or a log, and hand over the measurements that it
+        completes."""
         measurements = self._decoder.feed(frame)
         if not measurements:
             return
@@ -195,7 +196,7 @@ class CanDriver(Generic[O]):
             self._event(code, f"{self.options.channel}: {text}")
 
     async def _watch(self) -> None:
-        """Say `silent` when samples stop."""
+        """Set the state to `silent` when samples stop."""
         while True:
             await asyncio.sleep(self.options.timeout_s / 2)
             self.inputs.take("watch")

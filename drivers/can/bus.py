@@ -1,11 +1,10 @@
 """CAN bus under asyncio that reopens itself when its interface disappears and returns.
 
-python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
-descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descriptor (`socketcan`,
-`udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn, or
-when its owner calls `poll`: an IMU sends its frames one by one, and a daemon that wakes for each
-spends five times their cost on waking. A bus without one (`virtual`) is read by a thread into a
-ring of `RING_FRAMES`. How a frame lies in what a socket gives: `drivers.can.socket_frames`.
+python-can opens and filters the bus. Reading is done here, because python-can's `Notifier` polls a
+dead descriptor for ever and its `AsyncBufferedReader` is unbounded. A bus with a descriptor
+(`socketcan`, `udp_multicast`) is read in a callback of the event loop, `FRAMES_PER_WAKEUP` frames a
+turn at most, or when its owner calls `poll`: waking for each frame of an IMU costs five times as
+much as the frames. A bus without one (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
 """
 
 from __future__ import annotations
@@ -54,9 +53,8 @@ _SO_TIMESTAMPNS, _SO_MEMINFO, _SK_MEMINFO_DROPS = 35, 55, 8
 class CanFrame(NamedTuple):
     """A frame as received; for an error frame `can_id` holds the error classes.
 
-    `t_seen_ns` is monotonic, of its arrival: by the stamp of the bus where that lies between the
-    last reading and this one, else the instant of reading. `realtime_ns` is that stamp
-    (CLOCK_REALTIME), None where it gives none.
+    `t_seen_ns` is the monotonic instant of arrival: by the bus's stamp if between the last reading
+    and this one, else the instant of reading. `realtime_ns` is that stamp (CLOCK_REALTIME) or None.
     """
 
     can_id: int
@@ -121,9 +119,9 @@ class CanBus:
         """Listen until cancelled.
 
         `on_frame` gets every data frame. `on_link(up, why)` is called when the bus opens, when it
-        goes away, and when it cannot be opened (again only if the reason changes).
-        `on_controller(state)` is called when error frames tell a new state of the controller. An
-        exception of a callback is a defect of the caller: it closes the bus and leaves here.
+        disappears, and when it cannot be opened (again only if the reason changes).
+        `on_controller(state)` is called when error frames show a new state of the controller. An
+        exception of a callback is a bug of the caller: it closes the bus and is raised.
         """
         self._on_frame, self._on_controller = on_frame, on_controller
         reported = ""
@@ -153,12 +151,13 @@ class CanBus:
             await asyncio.sleep(self._backoff.next())
 
     def poll(self) -> None:
-        """Read what has come: `FRAMES_PER_WAKEUP` frames, the rest in the next turn of the loop."""
+        """Read `FRAMES_PER_WAKEUP` waiting frames at most; the rest follows in the next turn of the
+        loop."""
         if self.polled and self._drain is not None:
             self._drain()
 
     def send(self, frame: CanFrame) -> bool:
-        """Put a frame on the bus; False where it is down or its queue full. Never waits."""
+        """Send a frame; False if the bus is down or its queue is full. Never waits."""
         if self._bus is None:
             return False
         message = can.Message(
@@ -181,7 +180,7 @@ class CanBus:
             interface="socketcan",
             channel=self.channel,
             ignore_config=True,
-            fd=True,  # a classic interface is served all the same
+            fd=True,  # a classic interface works without CAN FD
             can_filters=self._filters or None,
             ignore_rx_error_frames=False,
         )
@@ -207,7 +206,7 @@ class CanBus:
     # ----------------------------------------------------------------- reading
 
     async def _serve(self, bus: can.BusABC) -> str:
-        """Read until the bus goes away; returns why."""
+        """Read until the bus disappears; return the reason."""
         loop = asyncio.get_running_loop()
         gone: asyncio.Future[str] = loop.create_future()
         try:
@@ -235,10 +234,10 @@ class CanBus:
             self._drain = None
             loop.remove_reader(fd)
             if own is not None:
-                own.detach()  # it is the bus that closes it
+                own.detach()  # the bus closes it
 
     def _readable(self, read: Read, gone: asyncio.Future[str]) -> None:
-        """Read what has come, the rest in the next turn of the loop."""
+        """Read the waiting frames, the rest in the next turn of the loop."""
         if self.drain(read, gone) and self.polled:
             gone.get_loop().call_soon(self._readable, read, gone)
 
@@ -264,14 +263,14 @@ class CanBus:
         if realtime_ns is None:
             return now_ns
         arrived_ns = now_ns - (time.time_ns() - realtime_ns)
-        # A stamp from before the system clock was set, or by another clock, lies outside.
+        # A stamp from before the system clock was set, or of another clock, is outside.
         return arrived_ns if self._read_ns <= arrived_ns <= now_ns else now_ns
 
     def read_socket(self, sock: socket.socket, size: int, decode: Decode) -> CanFrame | None:
         """Read one frame of a socket with its kernel stamp; None without one.
 
-        A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds. A datagram on
-        `udp_multicast` that is no CAN frame is counted and passed over.
+        It costs a quarter of `bus.recv(0)`, and keeps the stamp's nanoseconds. A datagram on
+        `udp_multicast` that is no CAN frame is counted and skipped.
         """
         try:
             raw, control, _, _ = sock.recvmsg(size, 64, socket.MSG_DONTWAIT)
@@ -287,7 +286,7 @@ class CanBus:
                 realtime_ns = seconds * 1_000_000_000 + nanoseconds
         try:
             can_id, extended, data, remote, of_error = decode(raw)
-        except Exception:  # whatever python-can raises for what others send to its group
+        except Exception:  # python-can may raise anything for strange datagrams in its group
             self.counters["bad_datagrams"] += 1
             return _NO_FRAME
         arrived_ns = self._arrived_ns(realtime_ns)
@@ -325,7 +324,8 @@ class CanBus:
     # ----------------------------------------------------------------- handing over
 
     def deliver(self, frame: CanFrame) -> None:
-        """Sort one frame: data to `on_frame`, error frames into the controller's state."""
+        """Process one frame: pass data to `on_frame`, and follow the controller's state by error
+        frames."""
         if frame.error:
             self.counters["error_frames"] += 1
             for name in error_names(frame.can_id, frame.data):
@@ -338,7 +338,7 @@ class CanBus:
         self.counters["frames"] += 1
         self._backoff.reset()
         if self.controller == "bus_off":
-            self._controller_is("active")  # a controller that is off the bus hears nothing
+            self._controller_is("active")  # a controller in bus-off receives nothing
         self._on_frame(frame)
 
     def _controller_is(self, state: ControllerState | None) -> None:
@@ -387,7 +387,7 @@ class _ThreadReader:
             self._gone.get_loop().call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
-        """Callback of the loop; clears the flag first, so that no frame is left behind."""
+        """Process the ring in the event loop; clears the flag first, so that no frame is missed."""
         self._scheduled = False
         if self._owner.drain(self._next, self._gone):
             self._scheduled = True

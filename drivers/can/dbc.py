@@ -1,8 +1,8 @@
 """Decoding plan from a DBC file and a mapping of axes; no I/O once the file is loaded.
 
 A signal is named `Message.Signal`. Physical value = raw * scale + offset (DBC), in the signal's
-unit; the plan folds sign and unit into scale and offset, so that an axis costs one multiplication
-and comes out in rad/s or m/s^2.
+unit. The plan includes sign and unit in scale and offset, so that one multiplication gives an axis
+in rad/s or m/s^2.
 """
 
 from __future__ import annotations
@@ -104,14 +104,14 @@ J1939_PDU2 = 240
 
 
 class RefusedFrameError(Exception):
-    """A frame that cannot be a sample; the text is the name of the counter."""
+    """Error of a frame that cannot be a sample; its text is the counter's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
     """Axis from one signal: SI value = raw * scale + offset, plausible within low..high.
 
-    `step` is the distance of neighbouring values, 0 of a floating-point signal.
+    `step` is the distance of neighbouring values, 0 for a floating-point signal.
     """
 
     slot: int
@@ -125,7 +125,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """A counter or a device's time: raw unsigned integer that wraps at `modulus`."""
+    """Counter or time of a device: raw unsigned integer that wraps at `modulus`."""
 
     signal: str
     modulus: int
@@ -183,7 +183,7 @@ class MessagePlan:
 
 
 def find_dbc(name: str) -> Path:
-    """DBC file of this path, else the shipped one of this name."""
+    """Path of a DBC file: `path` itself, else the shipped file of that name."""
     for path in (Path(name), SHIPPED / name, SHIPPED / f"{name}.dbc"):
         if path.is_file():
             return path
@@ -197,7 +197,7 @@ def find_dbc(name: str) -> Path:
 def load_dbc(name: str) -> Database:
     """Load a DBC file; PermanentDriverError when there is none or it cannot be read.
 
-    A flawed message is left out and logged; a mapping that uses it raises the reason.
+    A flawed message is left out and logged; a mapping that uses it raises an error with the reason.
     """
     path = find_dbc(name)
     try:
@@ -208,16 +208,16 @@ def load_dbc(name: str) -> Database:
 
 @lru_cache(maxsize=16)
 def _parsed(path: Path, changed_ns: int) -> Database:
-    """Parsed file at that time of change, shared by sources of one bus."""
+    """Parsed file, cached by its time of change, so that the sources of one bus share it."""
     content = path.read_bytes()
-    # As cantools takes it; a BOM says that it is not so.
+    # cantools's encoding, unless the file has a byte order mark.
     marked = (encoding for mark, encoding in BOMS.items() if content.startswith(mark))
     text = content.decode(next(marked, "cp1252"), "replace")
     flaw: Exception | str = "there is no message in it"
     try:
         if (database := read_whole(text)).messages and not unselected(text):
             return database
-    except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error
+    except Exception as error:  # the parser also lets KeyError and bitstruct.Error through
         flaw = error
     try:
         sound = sound_part(text)
@@ -232,7 +232,8 @@ def _parsed(path: Path, changed_ns: int) -> Database:
 
 
 def find_signal(database: Database, name: str, what: str) -> tuple[Message, Signal]:
-    """The signal `Message.Signal`; PermanentDriverError lists what there is."""
+    """Find the signal `Message.Signal`. Raises PermanentDriverError with a list of those that
+    exist."""
     message_name, dot, signal_name = name.partition(".")
     messages = [message for message in database.messages if message.name == message_name]
     if not dot or not messages:
@@ -290,9 +291,9 @@ def plan_axis(
 
 
 def plan_value(slot: int, signal: Signal, factor: float, low: float, high: float) -> Axis:
-    """The plan of one value: physical value of the DBC times `factor`, believed within low..high.
+    """Plan of one value: physical value of the DBC times `factor`, plausible within low..high.
 
-    Minimum and maximum of the DBC are believed where they differ, widened by half a step for
+    Minimum and maximum of the DBC are limits, too, if they differ; half a step is added for
     rounding.
     """
     least, most = signal.minimum, signal.maximum
@@ -306,7 +307,7 @@ def plan_value(slot: int, signal: Signal, factor: float, low: float, high: float
 
 
 def plan_angle(slot: int, signal: Signal, what: str, low: float, high: float) -> Axis:
-    """An angle within low..high (rad), in the unit that the DBC states."""
+    """Plan of an angle within low..high (rad), in the DBC's unit."""
     return plan_quantity(slot, signal, what, ANGLE_UNITS, low, high)
 
 
@@ -326,7 +327,7 @@ def plan_quantity(
 
 
 def plan_number(slot: int, signal: Signal, what: str) -> Axis:
-    """A whole number without unit: a flag, or what names something."""
+    """Plan of a whole number without unit: a flag or an identifier."""
     if signal.is_float or float(signal.scale) != 1.0 or float(signal.offset) % 1.0:
         raise PermanentDriverError(f"{what}: {signal.name} must be an integer, one a step")
     factor = _unit(NO_UNITS, signal, None, what)
@@ -334,14 +335,15 @@ def plan_number(slot: int, signal: Signal, what: str) -> Axis:
 
 
 def plan_counter(signal: Signal) -> Stamp:
-    """A counter of samples; wraps by the signal's length."""
+    """Plan of a sample counter; it wraps by the signal's length."""
     if signal.is_float or signal.is_signed:
         raise PermanentDriverError(f"counter: {signal.name} must be an unsigned integer")
     return Stamp(signal.name, 1 << signal.length)
 
 
 def plan_time(signal: Signal) -> Stamp:
-    """The device's free-running time; wraps by the signal's length, unit and scale of the DBC."""
+    """Plan of the device's free-running time; it wraps by the signal's length, unit and scale of
+    the DBC."""
     if signal.is_float or signal.is_signed:
         raise PermanentDriverError(f"device_time: {signal.name} must be an unsigned integer")
     unit: Fraction = _unit(TIME_UNITS, signal, None, "device_time")

@@ -1,18 +1,19 @@
 """Recovery of the readable messages of a damaged DBC file; the others are named.
 
-Of public files one in six has a flaw somewhere: an identifier of 29 bits without the mark of one
-(bit 31), a name that begins with a digit, a comma for a decimal point, a comment without its
-signal, values of a message that is not there. Mostly it stands beside what one wants of the file.
-Of each message its own statements are kept that decoding depends on, and nothing else of the file:
+One in six public files has a flaw: a 29-bit identifier without its mark (bit 31), a name that
+begins with a digit, a comma for a decimal point, a comment without its signal, values of a message
+that does not exist. Most flaws are not in the messages that one needs. For each message the
+statements that decoding depends on are kept, and nothing else of the file:
 
     BO_, SG_              the message and its signals
     SIG_VALTYPE_          which of them are floating-point numbers
     SG_MUL_VAL_           which multiplexer's values select one
     BA_ of `_ATTRIBUTES`  SAE J1939 or not; names longer than 32 characters
 
-An identifier that a standard frame cannot have is that of an extended one.
-They are read together, those that fail by halves. A message whose multiplexer or types cannot be
-read would be decoded wrongly, and is left out; of another one the flawed signals are.
+An identifier that a standard frame cannot have is taken as an extended one. All messages are parsed
+together; if that fails, each half by itself, and so on. A message whose multiplexer or types are
+unreadable would be decoded wrongly and is left out; of any other message only the flawed signals
+are left out.
 
 Source: Vector Informatik, DBC File Format Documentation 1.0.5.
 """
@@ -56,12 +57,12 @@ _END = '\nCM_ "";\n'
 
 
 class UnreadableError(Exception):
-    """Error: no message is readable; the text is the first reason."""
+    """Error of a file without a readable message; its text is the first reason."""
 
 
 class SoundPart(Database):
-    """The messages that can be read; `left_out` says why of the others, by `Message` or
-    `Message.Signal`; `extended` names those whose identifier was taken for one of 29 bits."""
+    """Readable messages. `left_out` has the reasons for all others, by `Message` or
+    `Message.Signal`; `extended` names those whose identifier was taken as one of 29 bits."""
 
     def __init__(
         self, messages: list[Message], left_out: dict[str, str], extended: list[str]
@@ -94,7 +95,7 @@ class _Unit:
         self.marked = True
 
     def text(self, without: Iterable[str] = ()) -> tuple[str, str]:
-        """The message, less some signals; and the statements of those that it has."""
+        """Message without some signals, and the statements of the remaining ones."""
         left = set(self.signals) - set(without)
         lines = [line for name, line in self.signals.items() if name in left]
         own = [line for name, line in self.own if name is None or name in left]
@@ -102,11 +103,11 @@ class _Unit:
 
     @property
     def selectors(self) -> set[str]:
-        """Signals that select others."""
+        """Multiplexer signals, which select others."""
         return {name for name, mark in self._marks() if mark.endswith("M")}
 
     def unselected(self) -> list[str]:
-        """Signals that need a multiplexer, where none exists."""
+        """Signals that need a multiplexer which does not exist."""
         marks = self._marks()
         if any(mark.endswith("M") for _, mark in marks):
             return []
@@ -131,7 +132,7 @@ def read_whole(text: str) -> Database:
 
 
 def sound_part(text: str) -> SoundPart:
-    """The messages of a DBC file that can be read. Raises `UnreadableError`."""
+    """Readable messages of a DBC file. Raises `UnreadableError`."""
     left_out: dict[str, str] = {}
     units, shared = _units(text, left_out)
     for unit in units:
@@ -149,7 +150,7 @@ def sound_part(text: str) -> SoundPart:
 def unselected(text: str) -> bool:
     """True if a signal of the file shares bits with others, without a multiplexer for any.
 
-    cantools reads such a one as if it were there in every frame.
+    cantools would read such a signal in every frame.
     """
     units, _ = _units(text, {})
     return any(unit.unselected() for unit in units)
@@ -175,7 +176,7 @@ class _Reader:
         self._left_out = left_out
 
     def read(self, units: Sequence[_Unit]) -> list[Message]:
-        """The messages of the units, the flawed ones found by halves."""
+        """Messages of the units; flawed ones are found by bisection."""
         if not units:
             return []
         found = self._together([unit.text() for unit in units])
@@ -191,8 +192,7 @@ class _Reader:
         return _read([*heads, *self._shared, *own])
 
     def _partly(self, unit: _Unit, reason: str) -> list[Message]:
-        """A message without the signals that cannot be read; none of it, where others hang on one
-        of them."""
+        """Message without its unreadable signals; None if other signals depend on one of them."""
         bad: dict[str, str] = {}
         selectors = unit.selectors
         for name in unit.signals:
@@ -214,14 +214,14 @@ def _read(parts: Iterable[str]) -> list[Message] | str:
     """Messages of a file with these parts, or the reason of failure."""
     try:
         database = read_whole("\n".join(('VERSION ""', *(part for part in parts if part))))
-    except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error
+    except Exception as error:  # the parser also lets KeyError and bitstruct.Error through
         said = _AT_LINE.sub("", str(error)).removeprefix("DBC: ").strip('"')
         return " ".join(said.split()) or type(error).__name__
     return list(database.messages)
 
 
 def _units(text: str, left_out: dict[str, str]) -> tuple[list[_Unit], list[str]]:
-    """The file's messages with their statements, and definitions that all share."""
+    """Split the file into messages with their statements, and the definitions that all share."""
     text = _COMMENT.sub("", text)
     own: dict[str, list[tuple[str | None, str]]] = defaultdict(list)
     shared: list[str] = []

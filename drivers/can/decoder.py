@@ -1,7 +1,7 @@
-"""The codec of devices that a DBC file describes: frames in, measurements out; no I/O.
+"""Codec of devices that a DBC file describes: frames to measurements; no I/O.
 
-A driver adds its options (which signals it takes), how it plans them, and the measurements that a
-complete set of values makes: see `drivers.can.imu`, `drivers.can.wheel` and their like.
+A driver adds the options that name its signals, their plans, and the measurements of a complete set
+of values: see `drivers.can.imu` or `drivers.can.wheel`.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Signals = tuple[str, ...]
 class Find(Protocol):
     """Function from "Message.Signal" and its purpose to the message's plan and the signal.
 
-    The frames of all messages are put together, but for those of which only `held` values are
-    wanted: of these the latest counts, and they may come at a rate of their own.
+    The frames of all messages are combined into one set. Messages of which only `held` values are
+    used may come at another rate: their latest value is used.
     """
 
     def __call__(self, name: str, what: str, held: bool = False) -> tuple[MessagePlan, Signal]: ...
@@ -70,10 +70,10 @@ second no vehicle stops and drives the other way."""
 
 
 class CanDecoder(ABC, Generic[O]):
-    """CAN frames in, measurements out; no I/O.
+    """Decoder of CAN frames into measurements; no I/O.
 
-    PermanentDriverError from the constructor when DBC and mapping do not fit. `counters`: those of
-    `Pairing`, the refusals of `MessagePlan.decode`, `samples`, `other_frames` (not mapped) and
+    The constructor raises PermanentDriverError if DBC and mapping do not match. `counters`: those
+    of `Pairing`, the refusals of `MessagePlan.decode`, `samples`, `other_frames` (not mapped) and
     `other_source` (mapped message of another J1939 address).
     """
 
@@ -137,7 +137,7 @@ class CanDecoder(ABC, Generic[O]):
         self._address = self._options.source_address
 
     def feed(self, frame: CanFrame) -> Sequence[Measurement]:
-        """Take one data frame; the measurements that it completes. Never raises."""
+        """Process one data frame and return the measurements that it completes. Never raises."""
         can_id = frame.can_id
         index = self._by_id.get((can_id, frame.extended))
         if index is None and frame.extended and self._by_pgn:
@@ -215,12 +215,11 @@ class CanDecoder(ABC, Generic[O]):
     def _measurements(
         self, values: list[float], t_seen_ns: int, stamp: Stamp
     ) -> Sequence[Measurement]:
-        """Measurements of a complete set of values (by slot); an empty set is counted and gives
-        none."""
+        """Measurements of a complete set of values (by slot); a set without any is counted."""
 
 
 def names_of(signals: str | Signals | None) -> Signals:
-    """Names of an option with one signal, several or none."""
+    """Names in an option with one signal, several or none."""
     if signals is None:
         return ()
     return (signals,) if isinstance(signals, str) else signals
@@ -229,8 +228,8 @@ def names_of(signals: str | Signals | None) -> Signals:
 def plan_flags(
     find: Find, first: int, what: str, signals: str | Signals, held: bool = False
 ) -> list[float]:
-    """Plan flags for the slots from `first` on; their values where nothing has been heard of them:
-    what a device does not say is no objection, and a held flag must have been seen."""
+    """Plan the flags in slots from `first` on. Their values before any is received are 0, not
+    valid; without flags everything is valid."""
     names = names_of(signals)
     for slot, name in enumerate(names, start=first):
         plan, signal = find(name, what, held)

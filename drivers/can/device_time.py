@@ -2,11 +2,12 @@
 
     lateness l(k) = l(k-1) + (arrival(k) - arrival(k-1)) - (device(k) - device(k-1)) >= 0
 
-A frame cannot arrive before it was sent, and may arrive at any time after: a reader that stalls
-makes the next frames late, then sees them in one burst. So the wraps are those that make a frame
-least late, and a burst, a repeated or an overtaken frame is not a restart. Lateness never makes
-device time go back: where it does and goes on from there at the pace of the arrivals, with no frame
-of the old time in between, the clock began anew or was set. So does one whose lateness stays.
+A frame cannot arrive before it was sent, but may arrive any time later: after a stall the reader
+gets the delayed frames in one burst. So the number of wraps is the one that makes a frame's
+lateness least, and a burst, a repeated or an overtaken frame is no restart. Lateness never makes
+device time go backwards. If it does, and continues from there at the pace of the arrivals, without
+a frame of the old time in between, the clock was restarted or set; so it was if the lateness
+persists.
 """
 
 from __future__ import annotations
@@ -35,8 +36,7 @@ Arrivals = tuple[int, int]
 
 @dataclass(slots=True)
 class _Doubt:
-    """A new time that may be a restart: its last ticks, and where what went on at the pace of the
-    arrivals began."""
+    """Possible restart: the last ticks of the new time, and where its steady run began."""
 
     ticks: int
     first_ticks: int
@@ -53,7 +53,7 @@ class DeviceTime:
         self._tick_ns = tick_ns
         self._tick = float(tick_ns)
         per_tick = 1e9 / self._tick
-        # Half a period tells forth from back; a short one cannot tell of a restart.
+        # Half a period separates forward from backward; a short one cannot reveal a restart.
         self._slack = min(RESTART_S * per_tick, modulus / 4)
         self._restart = RESTART_S * per_tick
         self._settle = SETTLE_S * per_tick
@@ -65,11 +65,11 @@ class DeviceTime:
         """Delay above RESTART_S under observation, and its duration (ticks)."""
 
     def unwrap(self, raw: int, arrivals_ns: Arrivals) -> int | None:
-        """Ticks in ns since the clock's own zero; None for a time that did not advance, or that
-        jumped and is not yet known for a restart.
+        """Time in ns since the clock's own zero; None for a time that did not advance, or that
+        jumped and is not yet confirmed as a restart.
 
-        `arrivals_ns`: instant of arrival on two clocks (kernel stamp, monotonic). The one that
-        explains the time best counts, for the one can be set and the other can stall.
+        `arrivals_ns`: instant of arrival on two clocks (kernel stamp, monotonic). The clock that
+        agrees better with the device is used, for the first can be set and the second can stall.
         """
         if self._ticks is None:
             return self._begin(raw, arrivals_ns)
@@ -107,7 +107,7 @@ class DeviceTime:
         return found
 
     def _confirm(self, raw: int, arrivals_ns: Arrivals) -> int | None:
-        """The device's time stood or went back; whether it goes on from there at the pace of the
+        """True if a time that stood or went backwards continues from there at the pace of the
         arrivals."""
         doubt = self._doubt
         if doubt is not None:
@@ -121,7 +121,7 @@ class DeviceTime:
             if 0 < advance < self._modulus // 2:
                 doubt.ticks = raw
                 doubt.samples += 1
-                if not on_pace:  # a burst says nothing; what follows it may
+                if not on_pace:  # a burst decides nothing; the next frames may
                     doubt.first_ticks, doubt.first_ns, doubt.samples = raw, arrivals_ns, 1
                 elif doubt.samples >= RESTART_SAMPLES:
                     self.restarts += 1

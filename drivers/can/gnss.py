@@ -1,8 +1,8 @@
-"""Driver `can_gnss`: fixes, headings and time of a receiver on a CAN bus, by any DBC.
+"""Driver `can_gnss`: fixes, headings and time from a receiver on a CAN bus, by any DBC.
 
 Position, height, velocity (north, east, down, or speed and course), heading and time come in
-several messages of one epoch, which are put together; each quantity has flags of its own, and what
-is not valid is left out of the fix. Of a speed s with course c:
+several messages of one epoch, which are combined. Each quantity has its own flags; invalid ones are
+left out of the fix. Of a speed s with course c:
 
     v = s (cos c, sin c),    sd_n^2 = (a cos c)^2 + (b sin c)^2,    b = s sd_c, or a without one
 
@@ -54,8 +54,8 @@ Triple = tuple[str, str, str]
 
 
 class CanGnssOptions(CanOptions):
-    """Signals of a receiver. A signal is "Message.Signal"; all messages but those of `quality` and
-    `satellites` alone must come at the rate of the fixes."""
+    """Signals of a receiver, each as "Message.Signal". All messages must come at the rate of the
+    fixes, except one that carries only `quality` or `satellites`."""
 
     lat: str
     lon: str
@@ -121,7 +121,7 @@ class CanGnssOptions(CanOptions):
 
 
 class CanGnssDecoder(CanDecoder[CanGnssOptions]):
-    """CAN frames in, fixes, headings and time reports out; no I/O.
+    """Decoder of CAN frames into fixes, headings and time reports; no I/O.
 
     `counters`: also `not_valid` (no position), `no_fix` (by its quality), `bad_date`.
     """
@@ -300,7 +300,7 @@ class CanGnssDecoder(CanDecoder[CanGnssOptions]):
             return None
         year, month, day, hour, minute = (round(p) for p in known[:5])
         year += 2000 if year < TWO_DIGITS else 0
-        try:  # a leap second, 60, runs into the next minute: POSIX repeats a second's count
+        try:  # a leap second, 60, becomes the next minute, as in POSIX time
             start = datetime(year, month, day, hour, minute, tzinfo=UTC)
         except ValueError:
             self.counters["bad_date"] += 1

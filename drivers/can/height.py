@@ -1,6 +1,6 @@
 """Driver `can_height`: a height, or an air pressure, from a CAN bus by any DBC.
 
-A pressure becomes a height of the standard atmosphere (drivers.standard_atmosphere).
+A pressure is converted to a height in the standard atmosphere (drivers.standard_atmosphere).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class CanHeightOptions(CanOptions):
 
 
 class CanHeightDecoder(CanDecoder[CanHeightOptions]):
-    """CAN frames in, heights out; no I/O. Slots: height or pressure, accuracy, flags."""
+    """Decoder of CAN frames into heights; no I/O. Slots: height or pressure, accuracy, flags."""
 
     def _plan_values(self, find: Find) -> list[float]:
         o = self._options

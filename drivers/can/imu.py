@@ -18,8 +18,8 @@ Triad = tuple[AxisSource, AxisSource, AxisSource]
 class CanImuOptions(CanOptions):
     """Bus, DBC and signals of the axes x, y, z of the sensor.
 
-    An axis is "Message.Signal", with a leading "-" to turn its sign, or a number for an axis that
-    the device does not measure (rad/s or m/s^2).
+    An axis is "Message.Signal", with a leading "-" to reverse its sign, or a number (rad/s or
+    m/s^2) for an axis that the device does not measure.
     """
 
     gyro: Triad
@@ -30,7 +30,7 @@ class CanImuOptions(CanOptions):
 
 
 class CanImuDecoder(CanDecoder[CanImuOptions]):
-    """CAN frames in, IMU samples out; no I/O."""
+    """Decoder of CAN frames into IMU samples; no I/O."""
 
     def _plan_values(self, find: Find) -> list[float]:
         options = self._options

@@ -1,4 +1,4 @@
-"""Driver `obd_speed`: the vehicle's speed as its diagnostics answer it, in whole km/h.
+"""Driver `obd_speed`: the vehicle's speed from its diagnostics, in whole km/h.
 
 Service 01, parameter 0D (SAE J1979, ISO 15031-5): one byte, km/h, no sign. A request and its answer
 are single frames of ISO 15765-2, by identifiers of ISO 15765-4, 6.3:
@@ -10,7 +10,7 @@ are single frames of ISO 15765-2, by identifiers of ISO 15765-4, 6.3:
     7E8  03 41 0D 32 ..          50 km/h
     7E8  03 7F 01 12 ..          refused
 
-Another tester that asks is listened to; without one the driver asks at a rate of its own.
+The driver sends requests of its own, or only listens to the replies that another tester requests.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Assembly of an IMU's frames of one instant, with counts of missing ones. No I/O.
 
-An IMU spreads a sample over several messages. Two frames belong together when
+An IMU sends a sample in several messages. Two frames belong together if
 
-* both carry the device's counter, or its time, and it is the same; or else
-* the second came less than half a sample interval after the first, and its message is still
+* both carry the same counter, or the same time, of the device; or else * the second came less than
+half a sample interval after the first, and its message is still
   missing. A message that carries only counter or time (Xsens 0x005/0x006, SBG 0x120) joins so too
   and lends its stamp to the whole sample.
 
@@ -53,7 +53,7 @@ class Group:
 
 @dataclass(slots=True)
 class _Last:
-    """The last frame of a message, to know a duplicate by."""
+    """Last frame of a message, to recognise a duplicate."""
 
     data: bytes = b""
     arrival_ns: int = 0
@@ -71,7 +71,7 @@ class _Losses:
 
 
 class Pairing:
-    """Assembly of samples from their parts.
+    """Assembler of samples from the parts in their frames.
 
     `counters`: `lost_samples`, `unpaired` (frames whose partners never came), `duplicates`,
     `time_backward` (device time that stood still or went back), `device_restarts`.
@@ -103,13 +103,13 @@ class Pairing:
         self._losses = _Losses()
 
     def reset(self) -> None:
-        """Give up the open groups: what comes next follows a pause."""
+        """Give up the open groups before a pause."""
         self._make_room(0)
 
     def feed(
         self, index: int, part: Part, data: bytes, t_seen_ns: int, realtime_ns: int | None
     ) -> Group | None:
-        """Take the part that message `index` contributes; the sample it completes, if any."""
+        """Add a part of message `index`; return the sample that it completes, if any."""
         arrival_ns = t_seen_ns if realtime_ns is None else realtime_ns
         key = self._key(part)
         last = self._last[index]
@@ -119,7 +119,7 @@ class Pairing:
         if index == self._lead:
             self._learn_interval(index, part.ticks, arrival_ns)
         last.data, last.arrival_ns, last.ticks, last.seen = data, arrival_ns, part.ticks, True
-        alone = self._all == 1  # one message is a whole sample: none is open
+        alone = self._all == 1  # one message is a whole sample: no group is open
         group = None if alone else self._group(1 << index, key, arrival_ns)
         if group is None:
             values = self._constants.copy()
@@ -144,7 +144,7 @@ class Pairing:
     # ----------------------------------------------------------------- which group
 
     def _key(self, part: Part) -> int | None:
-        """The stamp to pair by, where several messages carry one each."""
+        """Stamp to pair by, if several messages carry one."""
         if self._by_counter:
             return part.counter
         return part.ticks if self._by_time else None
@@ -189,7 +189,7 @@ class Pairing:
     def _near(self, group: Group, arrival_ns: int) -> bool:
         """True within half an interval after the group's last frame.
 
-        While the interval is not known, a stamp that came ahead holds the group together.
+        While the interval is unknown, true for a group that has a stamp.
         """
         if self.interval_ns is None:
             return group.counter is not None or group.ticks is not None

@@ -1,8 +1,8 @@
 """Import of python-can without asammdf, which only its MF4 reader and writer need.
 
-`import can` imports every format of logs that there is, and asammdf imports pandas, pyarrow and
-canmatrix: 0.75 s of processor time at the start of a daemon that reads no such log. So it is kept
-out at first. cantools imports python-can too: the room imports this module before any other.
+`import can` imports every log format, among them asammdf with pandas, pyarrow and canmatrix: 0.75 s
+of processor time at the start of a daemon that reads no such log. So asammdf is hidden during that
+import. cantools imports python-can, too: this package imports this module before any other.
 """
 
 from __future__ import annotations

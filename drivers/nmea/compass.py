@@ -1,8 +1,7 @@
 """Driver `compass`: headings of a compass that speaks NMEA 0183, see `docs/compass.md`.
 
-    HDG   sensor heading, deviation, variation     magnetic heading = sensor heading + deviation
-    HDM   magnetic heading
-    HDT   true heading, by the compass's own idea of the declination, or of a gyrocompass
+    HDG   sensor heading, deviation, variation     magnetic heading = sensor heading + deviation HDM
+    magnetic heading HDT   true heading, by the compass's own declination, or of a gyrocompass
 
 A device may send all three of one reading: the first received kind in this order is used, the
 others are counted as `other_sentence`. The variation of HDG is ignored; the declination is computed
@@ -43,7 +42,7 @@ class CompassOptions(ReceiverOptions, CompassDecoding):
 
 
 class CompassDecoder:
-    """Bytes in, headings out; no I/O, no clock.
+    """Decoder of bytes into headings; no I/O, no clock.
 
     Counts, beside those of `NmeaSplitter`: `headings`; refused `unused_sentence`,
     `other_sentence`, `no_heading` (an empty field), `bad_field`.
@@ -60,7 +59,7 @@ class CompassDecoder:
         self._best = len(FORMATTERS)
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Heading | MagneticHeading]:
-        """The headings that `data`, seen at `t_seen_ns`, completes."""
+        """Headings that `data`, seen at `t_seen_ns`, completes."""
         found = [self._heading(s, t_seen_ns) for s in self._splitter.feed(data)]
         return [heading for heading in found if heading is not None]
 
@@ -101,7 +100,7 @@ class CompassDecoder:
 
 
 def _printed(sentence: Sentence) -> tuple[float | None, float]:
-    """Heading (deg), None for an empty field, and the step of its last digit.
+    """Heading (deg; None for an empty field) and the step of its last digit.
 
     ValueError where a field cannot be true."""
     fields = [*sentence.fields, "", "", ""]

@@ -1,8 +1,9 @@
-"""Bytes of a GNSS receiver in, measurements out: epochs grouped, dated, judged. No I/O, no clock.
+"""Decoder of a GNSS receiver's bytes into measurements: groups, dates and judges epochs. No I/O, no
+clock.
 
-An epoch closes when the time of day changes, when a sentence repeats, when its last one came, or
-on `silence`. Which one is the last is configured, or learned, as is where a receiver pauses inside
-an epoch (drivers.nmea.sentence_order).
+An epoch ends when the time of day changes, when a sentence repeats, with its last sentence, or on
+`silence`. The last sentence is configured or learned, and so are the receiver's pauses inside an
+epoch (drivers.nmea.sentence_order).
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class NmeaDecoding(SolutionDecoding):
 
 
 class NmeaDecoder:
-    """`feed` bytes, get measurements; `flush` at the end of the file.
+    """Decoder: `feed` bytes to get measurements; `flush` at the end of the file.
 
     Counts, beside those of `NmeaSplitter`, `Calendar` and `EpochOrder`: `epochs`, `fixes`;
     refused sentences `other_talker`, `unused_sentence`, `rdss_sentence`, `bad_field`,
@@ -114,7 +115,7 @@ class NmeaDecoder:
         return self._epoch is not None
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
-        """The measurements that `data`, seen at `t_seen_ns`, completes."""
+        """Measurements that `data`, seen at `t_seen_ns`, completes."""
         found: list[Measurement] = []
         self._t_seen_ns = t_seen_ns
         for sentence in self._splitter.feed(data):
@@ -138,7 +139,7 @@ class NmeaDecoder:
         return found
 
     def flush(self) -> list[Measurement]:
-        """The stream ended, or broke: everything that can still be had from what came."""
+        """End the stream; return what its last bytes still complete."""
         found: list[Measurement] = []
         for sentence in self._splitter.finish():
             self._take(sentence, self._t_seen_ns, found)
@@ -160,7 +161,7 @@ class NmeaDecoder:
                 proprietary_name(sentence.address, sentence.fields) if own else sentence.formatter
             )
             count_name(self.received.unused, name)
-            if sentence.address[2:] in POSITIONS:  # of a talker that P begins, as Quectel's PQ
+            if sentence.address[2:] in POSITIONS:  # talkers with P, as Quectel's PQ
                 count_name(self.received.talkers, sentence.address[:2])
             return
         if sentence.talker not in TALKERS:
@@ -199,7 +200,7 @@ class NmeaDecoder:
                 or len(epoch.cycle) >= MAX_CYCLE
             ):
                 self._close(found, learn=True)
-            elif again:  # of another talker: the same fix by another name
+            elif again:  # the same fix by another talker
                 self.counters["repeated_sentence"] += 1
                 self.counters["two_receivers"] += _is_elsewhere(sentence, epoch)
                 return
@@ -227,8 +228,8 @@ class NmeaDecoder:
             self._close(found, learn=False, by="last")
 
     def _doubled(self, sentence: Sentence, time_ns: int | None) -> bool:
-        """True if the line says each sentence twice, or each burst: two ports of a receiver in one
-        log. The third time it is a receiver that repeats itself."""
+        """True if each sentence, or each burst, comes twice, as in a log of two ports of one
+        receiver. A third time shows a receiver that repeats itself."""
         raw, before = sentence.raw, self._raw_before
         self._raw_before = raw
         epoch = self._epoch
@@ -250,23 +251,23 @@ class NmeaDecoder:
         return same_printed_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
     def _given_already(self, time_ns: int, sentence: Sentence) -> bool:
-        """True if a better sentence gave the position at this instant: many bursts end with GLL,
-        behind all GSV, and the epoch would wait for it."""
+        """True if a better sentence gave this instant's position. Many bursts end with GLL, behind
+        all GSV, and the epoch need not wait for it."""
         epoch = self._epoch if self._epoch is not None else self._closed
         if epoch is None or epoch.time_of_day_ns is None or FULLER.isdisjoint(epoch.cycle):
             return False
         return self._of_epoch(epoch, time_ns, sentence)
 
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
-        """True if a sentence without time followed the epoch that a silence closed more closely
-        than it precedes the new one."""
+        """True if a sentence without time is closer to the epoch that a silence has closed than to
+        the new one."""
         closed = self._closed
         if closed is None or self._closed_by != "silence" or not _is_tail(epoch):
             return False
         return epoch.t_seen_ns - closed.t_seen_ns < t_seen_ns - epoch.t_seen_ns
 
     def _delayed(self) -> None:
-        """More of an epoch that was closed: where it was closed is learned anew."""
+        """Process a sentence of an epoch already closed, and learn its end again."""
         self.counters["late_sentence"] += 1
         self._judge.in_two_parts()
         if self._closed_by == "silence":
@@ -284,7 +285,7 @@ class NmeaDecoder:
 
 
 def _is_elsewhere(sentence: Sentence, epoch: Epoch) -> bool:
-    """True if another talker's GGA of this epoch prints another place."""
+    """True if another talker's GGA of this epoch has another place."""
     place = ",".join(sentence.fields[1:5]).encode()
     others = [raw for raw in epoch.raws if raw[3:6] == b"GGA"]
     return sentence.formatter == "GGA" and bool(others) and not any(place in r for r in others)

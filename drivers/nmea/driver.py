@@ -1,4 +1,4 @@
-"""A GNSS receiver that speaks NMEA 0183 on a serial line: see `docs/gnss-nmea.md`."""
+"""Driver `nmea`: a GNSS receiver with NMEA 0183 on a serial line, see `docs/gnss-nmea.md`."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class NmeaOptions(ReceiverOptions, NmeaDecoding):
 
 
 class NmeaDriver(ReceiverDriver):
-    """Driver that reads a line and hands over fixes, headings and times; `status` says what is
-    wrong."""
+    """Driver that reads a line and hands over fixes, headings and times; `status` has the reason if
+    it cannot."""
 
     Options: ClassVar[type[NmeaOptions]] = NmeaOptions
 

@@ -1,8 +1,8 @@
 """Epoch of a GNSS receiver, assembled from its sentences: no I/O, no clock.
 
-`drivers.nmea.fields` makes typed fields of a sentence; an `Epoch` takes those that matter. A
-sentence with a field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as
-it was. Empty fields are normal and become None.
+`drivers.nmea.fields` makes typed fields of a sentence; an `Epoch` takes those it needs. A sentence
+with an impossible field is refused as a whole (`BadFieldError`) and does not change the epoch.
+Empty fields are normal and become None.
 
 Quality comes from GGA; NovAtel's 9 is a fix with corrections of a satellite (2). Where only GNS is
 sent it comes from its mode string, one letter a system: the worst letter of the systems in use
@@ -71,8 +71,8 @@ state 2 beside 8 to 14)."""
 
 @dataclass(slots=True)
 class Epoch:
-    """Contents of the sentences of one instant; None where none did. Degrees as printed, SI
-    else."""
+    """Contents of the sentences of one instant; None for what none of them has. Degrees as printed,
+    otherwise SI."""
 
     time_of_day_ns: int | None = None
     time_step_ns: int = 0
@@ -124,7 +124,7 @@ class Epoch:
     heading_mode: str | None = None
 
     def take(self, sentence: Sentence, t_seen_ns: int) -> None:
-        """Add a sentence of `FORMATTERS`. BadFieldError when a field of it cannot be true."""
+        """Add a sentence of `FORMATTERS`. BadFieldError for an impossible field."""
         formatter = sentence.formatter
         try:
             fields = typed_fields(formatter, sentence.fields)
@@ -142,7 +142,7 @@ class Epoch:
 
     @property
     def phase_ns(self) -> int | None:
-        """Phase in the second, ns; None where no sentence has a time."""
+        """Phase within the second, ns; None if no sentence has a time."""
         return None if self.time_of_day_ns is None else self.time_of_day_ns % 1_000_000_000
 
     def position(self) -> tuple[float, float, int] | None:
@@ -153,7 +153,7 @@ class Epoch:
 
     @property
     def plain_valid(self) -> bool | None:
-        """Place and time of RMC, or else GLL; None where neither does."""
+        """Place and time of RMC or else GLL; None without either."""
         return self.gll_valid if self.rmc_valid is None else self.rmc_valid
 
     def take_mode(self) -> None:
@@ -216,7 +216,7 @@ def time_of_day_ns(sentence: Sentence) -> int | None:
 
 def _take_height(epoch: Epoch, fields: Fields) -> None:
     epoch.altitude_m, epoch.separation_m = number(fields, "alt"), number(fields, "sep")
-    if letter(fields, "altUnit").upper() not in _METRES:  # feet, by some simulators
+    if letter(fields, "altUnit").upper() not in _METRES:  # some simulators use feet
         epoch.altitude_m = None
     if epoch.altitude_m is not None:
         epoch.height_step_m = step(fields["printed"][8])
@@ -230,7 +230,7 @@ def _take_gga(epoch: Epoch, fields: Fields) -> None:
     epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality
     if place is None and quality is None:
         epoch.quality = 0
-    epoch.satellites = satellites or epoch.satellites or satellites  # GNS may have counted some
+    epoch.satellites = satellites or epoch.satellites or satellites  # GNS may have counted
     epoch.hdop = hdop if hdop is not None else epoch.hdop
     epoch.counted = max(epoch.counted, satellites or 0)
 
@@ -260,7 +260,7 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     place = position(fields, 2)
     if status in _MODE_QUALITY or status in _ESTIMATED:
         epoch.rmc_valid, epoch.plain = True, place
-        # Who sends D beside R means R; who sends E beside it means that, too.
+        # Status D beside mode R counts as R alone; status E counts, too.
         mode = mode + status if status in _ESTIMATED else mode or status
     elif status in _NOT_VALID:
         epoch.rmc_valid = False
@@ -280,7 +280,7 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
     place, status = position(fields, 0), letter(fields, "status")
     epoch.modes |= set(letter(fields, "posMode"))
-    if status:  # before NMEA 2.0 it has neither time nor status, and says nothing
+    if status:  # before NMEA 2.0 GLL has neither time nor status
         epoch.gll_valid = status == "A"
     if epoch.gll_valid and epoch.plain is None:
         epoch.plain = place

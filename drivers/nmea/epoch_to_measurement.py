@@ -1,4 +1,4 @@
-"""Fix, heading or UTC report from an NMEA epoch's sentences, or the name of the refusal. No I/O, no
+"""Conversion of an NMEA epoch into fix, heading or UTC report, or the name of a refusal. No I/O, no
 clock.
 
 Solutions in receivers' own protocols are validated by `drivers.solution`; NMEA states quality, date
@@ -40,7 +40,7 @@ others differ by up to hundreds of metres."""
 
 
 class EpochConverter:
-    """Judge of epochs in order. Its counters are those of `NmeaDecoder`."""
+    """Converter of epochs in order. Its counters are those of `NmeaDecoder`."""
 
     def __init__(
         self, source: str, decoding: SolutionDecoding, counters: Counter[str], received: Received
@@ -62,11 +62,11 @@ class EpochConverter:
         """Talker of the last position."""
 
     def in_two_parts(self) -> None:
-        """The last epoch was no whole one: it has what one of them lacked."""
+        """Note that the last two epochs were parts of one, which does have a GGA."""
         self._without_gga = 0
 
     def epoch(self, epoch: Epoch, found: list[Measurement]) -> None:
-        """Judge one that is closed; what it comes to is `found`."""
+        """Judge a closed epoch; add the results to `found`."""
         self.counters["epochs"] += 1
         if epoch.place is not None and epoch.talker != self._talker:
             self.counters["two_receivers"] += bool(self._talker)
@@ -115,7 +115,7 @@ class EpochConverter:
             found.append(Heading(self._source, epoch.t_seen_ns, stamp, yaw))
 
     def _refusal(self, epoch: Epoch) -> str | None:
-        """Reason why this epoch gives no position; None if it does, or none is expected."""
+        """Reason why this epoch gives no position; None if it gives one, or none is expected."""
         if epoch.quality == 6 or "E" in epoch.modes:
             return "dead_reckoning_refused"
         if not self._decoding.allow_simulator:
@@ -137,7 +137,7 @@ class EpochConverter:
         return epoch.implausible()
 
     def _date(self, epoch: Epoch, found: list[Measurement], *, valid: bool) -> date | None:
-        """Date of the epoch, its own or the calendar's; reports the time for its own."""
+        """Date of the epoch, its own or the calendar's; an own date is also reported as time."""
         if epoch.time_of_day_ns is None:
             return None
         if epoch.day is not None and not self._calendar.plausible(epoch.day):
@@ -145,7 +145,7 @@ class EpochConverter:
             epoch.day = None
         if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
-        # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
+        # RMC states whether its time is valid; for ZDA the epoch's position decides.
         valid_stated = epoch.plain_valid if epoch.quality is None else epoch.rmc_valid
         believed = valid and bool(epoch.quality) if valid_stated is None else valid_stated
         if believed:
@@ -159,7 +159,8 @@ class EpochConverter:
         return epoch.day
 
     def _heading_ok(self, epoch: Epoch, refusal: str | None) -> bool:
-        """THS mode A only; HDT has no mode and shares the fate of the position beside it."""
+        """True for THS of mode A, and for HDT, which has no mode, if the position beside it is
+        good."""
         if epoch.heading_deg is None or epoch.heading_mode == "A":
             return True
         if epoch.heading_mode is None and refusal is None:

@@ -1,9 +1,9 @@
-"""The fields of a sentence by name, typed: by the tables of pynmeagps, without its objects.
+"""Typed fields of a sentence by name, by pynmeagps's tables but without its objects.
 
-The tables say which fields a sentence has, in which order, and what each is. A field that is not of
-its type refuses the whole sentence (ValueError), one that is empty stays an empty text, those of
-later versions of the standard may be missing. pynmeagps makes an object with an attribute a field,
-and dates by `strptime`: 70 us a sentence, where this takes 5; the values are the same.
+The tables have the fields of each sentence in order, with their types. A field of a wrong type
+refuses the whole sentence (ValueError); an empty one stays an empty text; fields of later versions
+of the standard may be missing. The values are those of pynmeagps, which takes 70 us a sentence (an
+object with an attribute for each field, dates by `strptime`); this takes 5.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _PLANS: dict[str, list[tuple[str, Convert | None]]] = {}
 
 
 def typed_fields(formatter: str, printed: Sequence[str]) -> Fields:
-    """The fields of a sentence. ValueError for one that is not of its type."""
+    """Fields of a sentence. ValueError for one of a wrong type."""
     plan = _PLANS.get(formatter)
     if plan is None:
         table = cast(Mapping[str, object], NMEA_PAYLOADS_GET[formatter])
@@ -78,7 +78,7 @@ def typed_fields(formatter: str, printed: Sequence[str]) -> Fields:
     return fields
 
 
-# --------------------------------------------------------------------------- what can be true
+# --------------------------------------------------------------------------- plausibility
 
 NO_DOP = 99.0
 """Receivers without a solution print 99.99."""
@@ -88,8 +88,8 @@ _PRINTED_POSITION = re.compile(r"\d{1,2}[0-5]\d\.\d*,[NS],\d{1,3}[0-5]\d\.\d*,[E
 
 
 class PrintedPosition(NamedTuple):
-    """Latitude and longitude (deg) of a sentence, and one step of their last digits (m), that of
-    the longitude at the equator."""
+    """Latitude and longitude (deg) of a sentence, and one step (m) of their last digits, for the
+    longitude at the equator."""
 
     lat_deg: float
     lon_deg: float
@@ -102,7 +102,7 @@ class BadFieldError(ValueError):
 
 
 def number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
-    """A number, not below the least; None where the field is empty. BadFieldError."""
+    """Number, not below the least; None for an empty field. BadFieldError."""
     value = fields.get(name, "")
     if not isinstance(value, float | int):
         return None
@@ -112,13 +112,13 @@ def number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
 
 
 def count(fields: Fields, name: str) -> int | None:
-    """A number of things, without sign."""
+    """Count, without sign."""
     value = number(fields, name, 0.0)
     return None if value is None else int(value)
 
 
 def sigma(fields: Fields, name: str) -> float | None:
-    """A sigma that is no number is as large as can be: it must not pass for one not given."""
+    """Sigma; infinite if it is no number, since None would mean that it is not given."""
     value = fields.get(name, "")
     if isinstance(value, float) and not math.isfinite(value):
         return math.inf
@@ -126,12 +126,12 @@ def sigma(fields: Fields, name: str) -> float | None:
 
 
 def letter(fields: Fields, name: str) -> str:
-    """A field of text."""
+    """Text of a field."""
     return str(fields.get(name, ""))
 
 
 def dop(fields: Fields, name: str) -> float | None:
-    """A dilution of precision; None where there is no solution."""
+    """Dilution of precision; None without a solution."""
     value = number(fields, name, 0.0)
     return value if value is not None and 0.0 < value < NO_DOP else None
 

@@ -1,13 +1,13 @@
-"""Geoid height above the ellipsoid, where a receiver does not state it.
+"""Geoid height above the ellipsoid for receivers that do not state it.
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
-N lies between -107 and 85 m everywhere; an unknown N is taken as uniform in +-107 m. A printed N
-beyond that is none (999.9, of a receiver without a model). A printed N of exactly 0 means that the
-receiver has no model of the geoid: N is 0 at one place in a thousand. Such an altitude may be above
-the sea or above the ellipsoid. An N that the receiver printed before is used further, with an error
-that grows by the slope of the geoid along the way since.
-Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
+N lies between -107 and 85 m; an unknown N is taken as uniform in +-107 m. A printed N beyond that
+counts as unknown (999.9 of a receiver without a model). So does exactly 0, which shows that the
+receiver has no model (the true N is 0 at one place in a thousand): its altitude may be above the
+sea or above the ellipsoid. An N printed before is used further, with an error that grows by the
+geoid's slope along the way since. Source: Lemoine et al., The development of EGM96,
+NASA/TP-1998-206861.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Geoid:
     def height(
         self, altitude_m: float, separation_m: float | None, lat_deg: float, lon_deg: float
     ) -> tuple[float, float]:
-        """Height above the ellipsoid (m), and one sigma (m) of the geoid height in it, 0 where
-        printed; the height above the sea where the geoid is unknown."""
+        """Height above the ellipsoid (m), and one sigma (m) of its geoid height, 0 if printed. If
+        the geoid height is unknown, the height is above the sea."""
         if states_geoid(separation_m):
             assert separation_m is not None
             self._known = separation_m, lat_deg, lon_deg

@@ -1,7 +1,7 @@
 """Incremental checksums over any stretch of a growing buffer, each byte processed once.
 
-A stream can hold a header that promises 8 KiB every six bytes. Summing what each of them claims
-would cost a thousand times the stream; sums that run along with it answer for any stretch at once.
+A stream can hold a header every six bytes that claims 8 KiB. Checking each claim by itself would
+cost a thousand times the stream; running sums give the checksum of any stretch at once.
 
     Fletcher   A(i) = sum of bytes before i, B(i) = A(1) + ... + A(i), modulo 256
                over p..q: a = A(q) - A(p),  b = B(q) - B(p) - (q - p) A(p)
@@ -89,8 +89,8 @@ def _shifted(crc: int, count: int) -> int:
 class RunningFletcher:
     """Sums along a buffer. `taken`: bytes worked on since the start, each twice at most.
 
-    A stretch that overlaps none refused before is summed by itself, which is faster: good frames
-    never overlap.
+    A stretch that overlaps no refused one is summed by itself, which is faster: good frames never
+    overlap.
     """
 
     def __init__(self) -> None:
@@ -125,7 +125,7 @@ class RunningFletcher:
         self.taken += end - known
 
     def drop(self, count: int) -> None:
-        """The first `count` bytes leave the buffer."""
+        """Forget the first `count` bytes of the buffer."""
         self._refused = max(0, self._refused - count)
         if count < len(self._a):
             del self._a[:count], self._b[:count]
@@ -150,7 +150,7 @@ class RunningCrc24q:
         return self._crc[end] == _shifted(self._crc[start], end - start)
 
     def drop(self, count: int) -> None:
-        """The first `count` bytes leave the buffer."""
+        """Forget the first `count` bytes of the buffer."""
         if count < len(self._crc):
             del self._crc[:count]
         else:

@@ -4,9 +4,9 @@
     UBX         B5 62 class id length16 payload ck_a ck_b     8-bit Fletcher from class on
     RTCM 3      D3 000000 length10 payload crc24q             from D3 on
 
-Binary frames are taken whole, so that a `$` inside one starts nothing. A frame whose check fails,
-or inside which a whole sentence verifies, was none: scanning goes on one byte behind its first.
-Whatever false headers promise, each byte is summed once (drivers.nmea.incremental_checksum).
+A binary frame is taken as a whole, so that a `$` inside it starts no sentence. If its check fails,
+or a whole sentence inside it verifies, it was no frame, and scanning continues one byte after its
+first. Each byte is summed once, whatever false headers claim (drivers.nmea.incremental_checksum).
 Sources: NMEA 0183 4.11 section 5.3; u-blox ZED-F9P interface description section 3; RTCM 10403.3
 section 4.
 """
@@ -36,7 +36,7 @@ _UBX_LENGTH = rb"(?:.[\x00-\x%02x]|\x00\x%02x)" % (
     (MAX_UBX_PAYLOAD >> 8) - 1,
     MAX_UBX_PAYLOAD >> 8,
 )
-# The 12 bits behind the length, 1001 to 1300 or from 4001: what RTCM 10403.3 has given out.
+# Message numbers, the 12 bits behind the length: RTCM 10403.3 assigns 1001 to 1300 and 4001 on.
 _RTCM_NUMBER = rb"(?:\x3e[\x90-\xff]|[\x3f-\x50].|\x51[\x00-\x4f]|\xfa[\x10-\xff]|[\xfb-\xff].)"
 _START = re.compile(
     rb"\$+"
@@ -50,7 +50,7 @@ _NOT_BODY = re.compile(rb"[^\x20-\x23\x25-\x29\x2b-\x7e]")  # anything but text,
 _WHOLE = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{1,252})\*([0-9A-Fa-f]{2})")
 _ADDRESS = re.compile(r"[A-Z][A-Z0-9]{2,9}\Z")
 
-# What an RDSS terminal of the text family 2.1 (and its BDS-3 successor) says, talker BD.
+# Sentences of an RDSS terminal of the text family 2.1 (and its BDS-3 successor), talker BD.
 _RDSS = frozenset(
     {"BSI", "BSS", "DWR", "FKI", "GXM", "HZR", "ICI", "ICP", "ICZ", "KLS", "KLT"}
     | {"LZM", "PWI", "SBX", "SNR", "TCI", "TXR", "WAA", "WBA", "ZTI"}
@@ -61,7 +61,7 @@ _LINE_ENDS = b"\r\n"
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A verified sentence: `address` such as GNGGA, fields between commas, `raw` `$` to `hh`."""
+    """Verified sentence: `address` such as GNGGA, fields between commas, `raw` from `$` to `hh`."""
 
     address: str
     fields: tuple[str, ...]
@@ -78,10 +78,10 @@ class Sentence:
 
 
 def is_rdss_sentence(sentence: Sentence) -> bool:
-    """True if this belongs to a BeiDou RDSS terminal, not to a GNSS receiver.
+    """True for a sentence of a BeiDou RDSS terminal, false for a GNSS receiver's.
 
-    The one clash is BDZDA. The RDSS form has 11 fields, the first a mode of one digit; the NMEA
-    form has 6, the first a time of at least 6.
+    Both have BDZDA. The RDSS form has 11 fields, the first a mode of one digit; the NMEA form has
+    6, the first a time of at least six digits.
     """
     if sentence.talker == "CC":
         return True
@@ -105,7 +105,7 @@ Item = Sentence | Frame
 
 
 class StreamSplitter(Splitter[Item]):
-    """Bytes in, verified sentences and binary frames out, whatever the splits.
+    """Splitter of bytes, in pieces of any size, into verified sentences and binary frames.
 
     Counts in `counters`: `sentences`, `ubx_frames`, `rtcm_frames`; refused `checksum_bad`,
     `checksum_missing`, `sentence_too_long`, `inner_dollar`, `not_text`, `address_bad`,
@@ -127,7 +127,7 @@ class StreamSplitter(Splitter[Item]):
 
     @property
     def summed(self) -> int:
-        """Number of bytes that the checks of binary frames processed, of both kinds."""
+        """Number of bytes that both checks of binary frames have processed."""
         return self._fletcher.taken + self._crc.taken
 
     def _scan(self, items: list[Item], *, final: bool) -> None:
@@ -143,7 +143,7 @@ class StreamSplitter(Splitter[Item]):
                 at = start.start()
             before = len(items)
             if buffer[at] == 0x24:
-                if start.end() - at > 1:  # the last of them may begin a sentence
+                if start.end() - at > 1:  # the last byte may begin a sentence
                     at += self._inner_dollars(start.end() - at - 1)
                 used = self._sentence(at, items)
             elif buffer[at] == 0xB5:
@@ -185,7 +185,7 @@ class StreamSplitter(Splitter[Item]):
         return count
 
     def _sentence(self, at: int, items: list[Item]) -> int | None:
-        """Bytes used by the sentence that starts at `at`, good or not; None: more are needed."""
+        """Length of the sentence that starts at `at`, good or not; None if it is incomplete."""
         buffer = self._buffer
         stop = _NOT_BODY.search(buffer, at + 1, at + MAX_SENTENCE - 2)
         if stop is None:
@@ -204,7 +204,7 @@ class StreamSplitter(Splitter[Item]):
     def _verify(self, at: int, star: int, items: list[Item]) -> int:
         raw = bytes(self._buffer[at : star + 3])
         if not _verifies(raw):
-            # The two bytes behind the star may be the start of something else.
+            # The two bytes behind the star may begin something else.
             why = "checksum_missing" if raw[-2] in b"\r\n" else "checksum_bad"
             return self._refuse(why, star + 1 - at)
         if raw[-1:] in _LINE_ENDS:
@@ -250,7 +250,7 @@ class _WholeSentences:
         self._searched = 0
 
     def inside(self, buffer: bytearray, start: int, end: int) -> bool:
-        """True if start..end contains one, as far as received."""
+        """True if start..end contains a verified sentence, as far as received."""
         self._search(buffer)
         found = self._found
         while found and found[0][0] < start:
@@ -265,12 +265,12 @@ class _WholeSentences:
             after = match.end()
             if _verifies(match.group()):
                 self._found.append(match.span())
-        # A sentence may have begun, of which the rest is to come.
+        # The rest of a sentence that has begun may follow.
         begin_at = buffer.rfind(b"$", max(after, len(buffer) - MAX_SENTENCE))
         self._searched = len(buffer) if begin_at < 0 else begin_at
 
     def drop(self, count: int) -> None:
-        """The first `count` bytes leave the buffer."""
+        """Forget the first `count` bytes of the buffer."""
         self._searched = max(0, self._searched - count)
         if self._found:
             self._found = deque((a - count, b - count) for a, b in self._found if a >= count)
@@ -303,8 +303,8 @@ class NmeaSplitter:
 
 
 def _verifies(raw: bytes) -> bool:
-    """True if `$`...`*hh` contains the XOR of the characters between `$` and `*`; below 16 it may
-    be one digit and the line's end (`%X` of small devices)."""
+    """True if `hh` of `$`...`*hh` is the XOR of the characters between `$` and `*`. Below 16 it may
+    be one digit before the line's end (`%X` of small devices)."""
     found, printed = reduce(xor, raw[1:-3], 0), raw[-2:].upper()
     if printed[1:] in _LINE_ENDS:
         return b"%X" % found == printed[:1]

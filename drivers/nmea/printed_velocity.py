@@ -1,22 +1,24 @@
-r"""Horizontal velocity of an epoch from its printed speed and course, and what the two leave open.
+r"""Horizontal velocity of an epoch from printed speed and course, with the variance they leave
+open.
 
     speed s, course c     v = s (cos c, sin c)
     no course             v = 0,   r = max(s^2 / 2 - sd^2, 0)     s <= AT_REST_M_S: else unknown
     a speed held at 0     v = 0,   r = PINNED_M_S^2 / 4
 
-North, east; r is the variance of an axis beside sd^2, that of a receiver's noise. Receivers leave
-the course empty where noise has no direction: of the velocity only the amount is known. Its
-direction is uniform, so that an axis has mean 0 and variance s^2 / 2, of which sd^2 is the noise
-that every velocity has. A receiver at rest prints a speed with a Rayleigh distribution:
+Axes are north and east; r is the variance of an axis in addition to sd^2, the receiver's noise. At
+rest receivers leave the course empty: only the amount of the velocity is known. Its direction is
+uniform, so each axis has mean 0 and variance s^2 / 2, of which sd^2 is the noise that every
+velocity has. The printed speed of a receiver at rest has a Rayleigh distribution:
 
     P(s > x) = exp(-x^2 / (2 sd^2)),   P(0 printed) = 1 - exp(-(q / 2)^2 / (2 sd^2))
 
-q the step of the last digit. Zeros in a row that a free receiver, of LEAST_NOISE_M_S, prints less
-often than ODDS are held there (steps of 0.1 knots never tell): the vehicle is below the speed of
-PINNED_M_S, uniform in its disc, a quarter of the square an axis.
+with q the step of the last digit. A run of zeros that a free receiver, with noise LEAST_NOISE_M_S,
+would print less often than ODDS shows a receiver that holds its speed at 0 (with steps of 0.1 knots
+it cannot be recognised). The velocity is then uniform in the disc of radius PINNED_M_S, with a
+quarter of its square as the variance of each axis.
 
-What is beyond noise keeps its direction while it lasts, so that a run of such epochs says no more
-than one of them. The nth has r n (n + 1), which sums up to 1 / r of information and no more:
+A velocity beyond the noise keeps its direction, so a run of such epochs holds no more information
+than one of them. The nth epoch has r n (n + 1), so that all together have the information 1 / r:
 
     sum 1 / (n (n + 1)) = 1 - 1 / (N + 1)
 
@@ -53,7 +55,7 @@ class PrintedSpeed(NamedTuple):
 
 
 class VelocityReader:
-    """Reader of speeds in their order. Counts `course_missing`, `speed_held_at_zero`."""
+    """Reader of printed speeds in order. Counts `course_missing`, `speed_held_at_zero`."""
 
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
@@ -63,7 +65,8 @@ class VelocityReader:
         """Epochs in a row with motion of unknown direction."""
 
     def velocity_of(self, printed: PrintedSpeed | None) -> tuple[Velocity | None, float]:
-        """Velocity (m/s), None where unknown, and one sigma an axis of what is left open."""
+        """Velocity (m/s; None if unknown), and one sigma of an axis that speed and course leave
+        open."""
         if printed is None:
             return None, 0.0
         speed, step, course = printed
@@ -81,7 +84,7 @@ class VelocityReader:
         return (0.0, 0.0, None), self._run(0.5 * speed**2 - NOISE_M_S**2)
 
     def _run(self, variance: float) -> float:
-        """One sigma of this epoch of a run."""
+        """One sigma of the next epoch of a run."""
         if variance <= 0.0:
             self._alike = 0
             return 0.0

@@ -110,21 +110,20 @@ class Received:
 
 
 def count_name(names: Counter[str], name: str) -> None:
-    """Count a name; of a stream of nonsense the first few."""
+    """Count a name, up to a limit of different names."""
     if name in names or len(names) < MOST_NAMES:
         names[name] += 1
 
 
 def proprietary_name(address: str, fields: Sequence[str]) -> str:
-    """Name of a maker's own sentence by its address, and by its kind if the first field states
-    it."""
+    """Name of a proprietary sentence: its address, and its kind if the first field states one."""
     kind = fields[0] if fields else ""
     is_kind = kind.isalnum() and len(kind) in KIND_LETTERS
     return f"{address},{kind}" if is_kind else address
 
 
 def wrong_checksums(counters: Counter[str]) -> str:
-    """Reason why no sentence verifies, if it is the checksums; "" otherwise."""
+    """Reason why no sentence verifies, if the checksums are wrong; "" otherwise."""
     if counters["checksum_missing"] >= MANY > counters["sentences"]:
         return f"NMEA {CHECKSUMS}"
     if counters["checksum_bad"] >= MANY > counters["sentences"]:
@@ -136,8 +135,8 @@ def wrong_checksums(counters: Counter[str]) -> str:
 
 
 def nothing_verified(counters: Counter[str], unread: bytes) -> str:
-    """Reason why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
-    # In a binary protocol some bytes look like sentences without a checksum, or with a wrong one.
+    """Reason why none of the received sentences verifies; "" if the baud rate may be wrong."""
+    # Some bytes of a binary protocol look like sentences without a checksum, or with a wrong one.
     if found := verified_protocol(unread) or wrong_checksums(counters):
         return found
     if counters["address_bad"] >= MANY:
@@ -158,7 +157,7 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
 
 
 def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
-    """Reason why sentences arrive without a fix. `refusal`: that of the last epoch."""
+    """Reason why sentences arrive without a fix; `refusal` is the last epoch's."""
     if refusal:
         return REFUSALS.get(refusal, refusal)
     if received.talkers and not POSITIONS & set(received.used):
@@ -198,12 +197,12 @@ def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
 
 
 def _heading(received: Received) -> str:
-    """A sentence of a compass that has been left out; "" where none has."""
+    """Sentence on a compass's sentences that were left out; "" without any."""
     return next((name for name in OF_A_COMPASS if name in received.unused), "")
 
 
 def _attitude(received: Received) -> str:
-    """Sentence on a heading in a maker's own form alone; "" otherwise."""
+    """Sentence on a heading that only a proprietary sentence has; "" otherwise."""
     name = next((n for n in received.unused for own in ATTITUDES if n.startswith(own)), "")
     if not name or {"HDT", "THS"} & set(received.used):
         return ""
@@ -291,7 +290,7 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
 
 
 def implausible_date(day: date, earliest: date) -> str:
-    """The sentence on a date that cannot be."""
+    """Sentence on an impossible date."""
     wrong = f"before {earliest}" if day < earliest else "too far ahead"
     text = f"the receiver's date is {day}, {wrong}: its dates are not used, its times of day are"
     later = day + ROLLOVER if day < earliest else day

@@ -1,11 +1,11 @@
 """Learned order of a receiver's sentences and pauses in an epoch.
 
-Two epochs in a row of the same sentences in the same order are a *cycle*: from then on its last
-sentence ends an epoch at once. A receiver that mixes output rates, RMC at 50 Hz and GGA at 1 Hz,
-has a cycle of its own at each phase of the second: there two seconds in a row show it.
+Two consecutive epochs with the same sentences in the same order are a *cycle*; from then on its
+last sentence ends an epoch at once. A receiver with several output rates, such as RMC at 50 Hz and
+GGA at 1 Hz, has a cycle for each phase within the second, learned from two consecutive seconds.
 
-A silence ends an epoch too, unless the receiver has continued with the same instant after a silence
-at this place: then the silence is a pause inside the epoch, and its other sentences are awaited.
+A silence ends an epoch, too, unless the receiver has continued the same instant after a silence at
+this place before: then it is a pause inside the epoch, whose other sentences follow.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ class SentenceOrder:
         return tuple(so_far) in self._pauses
 
     def ended(self, sentences: Sequence[str], phase: Phase, *, learn: bool) -> None:
-        """An epoch has ended. `learn`: something but what was learned has shown it."""
+        """Note the end of an epoch. `learn`: its end was not found by a learned cycle."""
         cycle = tuple(sentences)
         if learn and cycle == self.last and cycle not in self._too_short:
             self._whole = cycle
         if phase is None:
-            self._not_whole_here()  # what has no time may be of the epoch before
+            self._not_whole_here()  # a sentence without time may belong to the epoch before
         else:
             self._learn_at(phase, cycle)
         self.last, self._phase = cycle, phase
@@ -69,19 +69,19 @@ class SentenceOrder:
         self._at_phase[phase] = cycle
 
     def too_short(self) -> None:
-        """More came of an epoch that was ended at once: what was learned is forgotten."""
+        """Forget the cycle that ended an epoch too early."""
         if self._whole and len(self._too_short) < MOST_KEPT:
             self._too_short.add(self._whole)
         self._not_whole_here()
         self._whole = self.last = ()
 
     def _not_whole_here(self) -> None:
-        """More came of the last epoch: at its phase these sentences are never a whole one again."""
+        """Forbid these sentences as a cycle at the last epoch's phase: more of it followed."""
         self._whole_at.discard((self._phase, self.last))
         self._too_short_at.add((self._phase, self.last))
 
     def paused(self) -> None:
-        """More came of an epoch that a silence had ended."""
+        """Note that an epoch continued after a silence."""
         if self.last and len(self._pauses) < MOST_KEPT:
             self._pauses.add(self.last)
         if self.last == self._whole:

@@ -1,8 +1,8 @@
-"""The instant of an NMEA epoch: time of day, date, order, and whether to believe the receiver.
+"""Instant of an NMEA epoch: time of day, date, order, and trust in the receiver's time.
 
-A sentence carries `hhmmss.ss` and rarely a date. Instants here are integers of nanoseconds: a time
-of day of up to 86401 s (23:59:60 is the leap second) and POSIX time, in which a leap second repeats
-the count of the second before it.
+A sentence carries `hhmmss.ss` and rarely a date. Instants here are integers in ns: time of day up
+to 86401 s (23:59:60 is the leap second), and POSIX time, in which a leap second repeats the
+previous second's count.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def parse_time_of_day(text: str) -> int | None:
 
 
 def same_printed_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
-    """True if two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
-    it to two."""
+    """True if two printed times may be the same instant: receivers cut it to 0, 1, 2 or 3 decimals,
+    or round it to two."""
     if a_step_ns == b_step_ns:
         return a_ns == b_ns
     step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
@@ -60,7 +60,7 @@ def same_printed_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> b
 
 
 def printed_time(sentence: Sentence) -> str:
-    """Printed time; empty where this kind has none, or the field is empty."""
+    """Printed time of a sentence; empty without one."""
     at = _TIME_AT.get(sentence.formatter, 0)
     return sentence.fields[at] if 0 <= at < len(sentence.fields) else ""
 
@@ -80,8 +80,8 @@ def posix_ns(day: date, time_of_day_ns: int) -> int:
 class Calendar:
     """Calendar that dates undated epochs nearest to the last dated one.
 
-    Dates before `earliest` are refused: after a rollover of the GPS week an old receiver is
-    1024 weeks off. So are dates after `LATEST`. Counts `implausible_date`.
+    Dates before `earliest` are refused, since an old receiver is 1024 weeks behind after a rollover
+    of the GPS week; so are dates after `LATEST`. Counts `implausible_date`.
     """
 
     def __init__(self, earliest: date, counters: Counter[str]) -> None:
@@ -102,7 +102,7 @@ class Calendar:
         self._t_seen_ns = t_seen_ns
 
     def date_of(self, time_of_day_ns: int, t_seen_ns: int) -> date | None:
-        """The date of an undated epoch; None before any date was seen."""
+        """Date of an undated epoch; None before any date was seen."""
         if self._t_seen_ns is None:
             return None
         expected = self._utc_ns + t_seen_ns - self._t_seen_ns
@@ -113,8 +113,8 @@ class Calendar:
 class EpochOrder:
     """Filter of repeated and backward epochs: counts `duplicate_epoch`, `backward_epoch`.
 
-    A receiver that goes on from an earlier instant (`time_set_back`) is followed after
-    `BACKWARD_EPOCHS`.
+    If a receiver continues from an earlier instant (`time_set_back`), its epochs are accepted again
+    after `BACKWARD_EPOCHS`.
     """
 
     def __init__(self, counters: Counter[str]) -> None:
@@ -171,7 +171,7 @@ class TimeTrust:
         if self._last is not None:
             step, elapsed = utc_ns - self._last[0], t_seen_ns - self._last[1]
             if step == 0 and elapsed < STEP_TOLERANCE_NS:
-                return None  # another sentence of the epoch; later, UTC has turned back
+                return None  # another sentence of the epoch, or UTC was set back
             even = step == self._step_ns or abs(step - elapsed) < STEP_TOLERANCE_NS
             good = valid and even and 0 < step <= MAX_STEP_NS
             self._even = self._even + 1 if good else 0

@@ -1,11 +1,11 @@
-"""Detection of protocols other than NMEA, UBX or RTCM 3: named, not read.
+"""Detection of protocols other than NMEA, UBX or RTCM 3, for a message that names them.
 
-A name is given where two messages in it verify, by their checksum where it is cheap, else by what
-must stand at their end. Sources: u-blox, Septentrio (SBF reference guide), NovAtel OEM7 and Unicore
-command manuals, SiRF Binary Protocol Reference Manual, Trimble (TSIP) and Garmin (device interface
+A protocol is named if two messages of it verify: by a cheap checksum, or else by the fixed bytes at
+their end. Sources: u-blox, Septentrio (SBF reference guide), NovAtel OEM7 and Unicore command
+manuals, SiRF Binary Protocol Reference Manual, Trimble (TSIP) and Garmin (device interface
 specification), SkyTraq AN0003, Allystar, CASIC and MTK protocol specifications, Rockwell Zodiac
-interface guide, GREIS reference guide (Topcon, JAVAD), NavCom technical reference, iTalk,
-SuperStar II and GeoS-1M protocol specifications, RTCM 10402.3, gpsd_json(5).
+interface guide, GREIS reference guide (Topcon, JAVAD), NavCom technical reference, iTalk, SuperStar
+II and GeoS-1M protocol specifications, RTCM 10402.3, gpsd_json(5).
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _BARE = re.compile(rb"(?:^|[\r\n])[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG),[^\r\n$]*[
 
 
 def _framed(sync: bytes, whole: Callable[[bytes, int], int]) -> Callable[[bytes], int]:
-    """Number of messages behind `sync` that verify: `whole(data, at)` is the length of one, 0 of
-    none."""
+    """Number of verified messages behind `sync`; `whole(data, at)` is the length of a message, 0
+    for none."""
 
     def count(data: bytes) -> int:
         at, found, tries = data.find(sync), 0, 0
@@ -247,7 +247,7 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
 
 
 def verified_protocol(data: bytes) -> str:
-    """Sentence on the protocol of which messages in these bytes verify; "" if none."""
+    """Sentence on the protocol whose messages in these bytes verify; "" if none."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
             return f"{name} arrives, which is not read here: {remedy}"
@@ -260,7 +260,7 @@ def protocol_sentence(data: bytes) -> str:
 
 
 def _text(data: bytes) -> str:
-    """Readable lines in these bytes, which no other baud rate produces."""
+    """Readable lines in these bytes; a wrong baud rate produces none."""
     lines = [line for line in _LINE_ENDS.split(data) if line.strip()]
     letters = sum(len(_PRINTED.findall(line)) for line in lines)
     if len(lines) < FEWEST + 1 or letters < MOSTLY * sum(map(len, lines)):

@@ -1,7 +1,7 @@
 """Client of an NTRIP caster: keeps the connection alive and passes whole frames on.
 
-Only RTCM 3 frames with a correct checksum pass, each as a whole, so that
-nothing that was torn or means something else to the receiver gets to it.
+Only whole RTCM 3 frames with a correct checksum pass, so that no torn frame and no command reaches
+the receiver.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ NtripState = Literal["starting", "waiting", "running", "lost", "refused"]
 
 
 class NtripOptions(DriverOptions):
-    """Section `ntrip` of a receiver: whose corrections it gets."""
+    """Section `ntrip` of a receiver: the source of its corrections."""
 
     caster: Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+(:\d{1,5})?$")]
     """HOST or HOST:PORT."""
@@ -93,7 +93,7 @@ class _Frames:
 
 
 def _reach(host: str, port: int, tls: bool) -> tuple[socket, ssl.SSLContext | None]:
-    """Connection to the caster, with the means to verify it; reads the authorities' files."""
+    """Open a connection to the caster; for TLS it reads the files of the authorities."""
     context = ssl.create_default_context() if tls else None
     return connect(host, port), context
 
@@ -163,14 +163,14 @@ class NtripClient:
             await asyncio.sleep(self._backoff.next())
 
     async def _position_known(self) -> None:
-        """True once the position is known, without which a caster of local corrections closes or is
-        silent."""
+        """Wait for the receiver's position, without which a caster of local corrections closes or
+        is silent."""
         while self._options.send_gga and not self._gga():
             self._set_state("waiting", "the receiver has no position to send to the caster yet")
             await asyncio.sleep(FIRST_WAIT_S)
 
     async def _fetch(self) -> None:
-        """Serve one connection to its end, which is an exception."""
+        """Serve one connection; its end is an exception."""
         host, port = self._options.address
         reach = partial(_reach, host, port, self._options.tls)
         connected, context = await aside(reach, lambda orphan: orphan[0].close())
@@ -191,7 +191,7 @@ class NtripClient:
             if upward is not None:
                 upward.cancel()
                 await asyncio.gather(upward, return_exceptions=True)
-            writer.transport.abort()  # nothing of ours is worth waiting for
+            writer.transport.abort()  # nothing that we sent must be waited for
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         reply, stream, budget = CasterReply(), _Frames(self._counters), ByteBudget()
@@ -206,14 +206,14 @@ class NtripClient:
                         now_s = loop.time()
                         silence.reschedule(now_s + SILENT_S)
                         began_s = now_s if began_s is None else began_s
-                        if now_s - began_s > LONGEST_WAIT_S:  # else who closes at once is hammered
+                        if now_s - began_s > LONGEST_WAIT_S:  # not one that closes at once
                             self._backoff.reset()
                         self._set_state("running", "")
                     for frame in frames:
                         self._counters["ntrip_write_refused"] += not self._write(frame)
                     if reply.over is not None:
                         raise reply.over
-                    # Without a wait a reader that has more gives nobody else a turn.
+                    # Without a wait, reading of waiting data would not let other tasks run.
                     await asyncio.sleep(budget.spend(len(data)))
                 raise EOFError
         except TimeoutError:

@@ -1,4 +1,4 @@
-"""NTRIP on the wire: the request, and a parser of the caster's reply. No I/O, no clock.
+"""NTRIP: the request, and a parser of the caster's reply. No I/O, no clock.
 
 NTRIP 1.0 (RTCM 10410.0) answers `ICY 200 OK`, and the corrections follow; NTRIP 2.0 (RTCM 10410.1)
 is HTTP/1.1, as a rule in chunks (RFC 9112, section 7.1). A mountpoint that the caster lacks is
@@ -18,7 +18,7 @@ _SOURCE_TABLE = "gnss/sourcetable"
 
 
 class CasterRefusedError(Exception):
-    """The caster gives no corrections: why, in words."""
+    """Error: the caster gives no corrections; the text is the reason."""
 
 
 def mountpoint_request(host: str, port: int, mountpoint: str, user: str, password: str) -> bytes:
@@ -27,7 +27,7 @@ def mountpoint_request(host: str, port: int, mountpoint: str, user: str, passwor
         f"GET /{mountpoint} HTTP/1.1",
         f"Host: {host}:{port}",
         "Ntrip-Version: Ntrip/2.0",
-        "User-Agent: NTRIP fusiond",  # 1.0 serves only those whose name begins so
+        "User-Agent: NTRIP fusiond",  # casters of 1.0 serve only user agents that begin so
         "Connection: close",
     ]
     if user:
@@ -37,9 +37,9 @@ def mountpoint_request(host: str, port: int, mountpoint: str, user: str, passwor
 
 
 class CasterReply:
-    """Parser of a caster's reply: `feed` bytes of the connection, get the corrections among them.
+    """Parser of a caster's reply: `feed` its bytes to get the corrections among them.
 
-    Raises CasterRefusedError where the answer is another than corrections.
+    Raises CasterRefusedError for any reply but corrections.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class CasterReply:
         """Missing bytes of the chunk, its closing CR LF included."""
 
     def feed(self, data: bytes) -> bytes:
-        """The corrections that `data` brings."""
+        """Corrections in `data`."""
         self._buffer += data
         if not self.accepted and not self._head():
             return b""
@@ -65,7 +65,7 @@ class CasterReply:
         return found
 
     def _head(self) -> bool:
-        """Take the head off the buffer; whether it is whole."""
+        """Remove the head from the buffer; true once it is complete."""
         ends = b"\r\n" if self._buffer.startswith(b"ICY ") else b"\r\n\r\n"
         end = self._buffer.find(ends, self._sought)
         found = end >= 0
@@ -108,7 +108,7 @@ class CasterReply:
 
 
 def _size(line: bytes) -> int | None:
-    """Size in a chunk's first line; None where that is no size."""
+    """Size in a chunk's first line; None if invalid."""
     digits = line.partition(b";")[0].strip()
     return int(digits, 16) if _HEXADECIMAL.fullmatch(digits) else None
 

@@ -5,12 +5,11 @@
     B-CNAV2  one message in 9 words: PRN 6, type 6, second of week 18, data 234, CRC 24
     A        A_ref + dA,  A_ref 27,906,100 m of a MEO, 42,162,200 m of an IGSO
 
-The ionosphere is in page 1 of subframe 3 and in message 30.
-The receiver has undone LDPC code and interleaving, and fills the last word with zeros. Subframe 2
-is an ephemeris with its clock and delays; health is in subframe 3. Messages 10, 11 and 30 are one
-when the low byte of IODC is IODE; 11 has no issue number and follows its 10 by 3 s. The clock
-refers to B3I, as that of D1. Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0
-sections 6 and 7.
+The ionosphere is in page 1 of subframe 3 and in message 30. The receiver has undone LDPC code and
+interleaving, and fills the last word with zeros. Subframe 2 is an ephemeris with its clock and
+delays; health is in subframe 3. Messages 10, 11 and 30 belong together if the low byte of IODC is
+IODE; 11 has no issue number and follows its 10 by 3 s. The clock refers to B3I, as that of D1.
+Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0 sections 6 and 7.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ REFERENCE_AXIS_M = {2: 42_162_200.0, 3: 27_906_100.0}
 
 
 def _orbit(at: int) -> Table:
-    """Ephemeris I, 203 bits, but for the axis."""
+    """Ephemeris I, 203 bits, without the axis."""
     return {
         "toe_s": u(at, 11, 0, 300.0),
         "semi_major_rate": s(at + 39, 25, -21),
@@ -90,7 +89,7 @@ IONOSPHERE_PAGE = 1
 
 
 def _checked(words: tuple[int, ...], length: int) -> Bits:
-    """The first `length` bits. RefusedError `crc_bad`."""
+    """First `length` bits, checked. RefusedError `crc_bad`."""
     value = 0
     for word in words:
         value = value << 32 | word
@@ -102,8 +101,8 @@ def _checked(words: tuple[int, ...], length: int) -> Bits:
 
 
 def _sqrt_a(bits: Bits, at: int) -> float:
-    """Root of the axis of Ephemeris I that begins at `at`. RefusedError for an impossible
-    satellite."""
+    """Root of the semi-major axis of Ephemeris I at bit `at`. RefusedError for an impossible
+    satellite type."""
     reference = REFERENCE_AXIS_M.get(bits.unsigned(at + _TYPE, 2))
     if reference is None:
         raise RefusedError("ephemeris_implausible")
@@ -118,7 +117,7 @@ class Bcnav1Decoder:
         self._healthy: bool | None = None
 
     def decode(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """Result of a subframe: an ephemeris as soon as both 2 and 3 have been heard, and the
+        """Result of a subframe: an ephemeris once both 2 and 3 have been received, and the
         ionosphere of 3. RefusedError by name."""
         number = SUBFRAMES.get(len(subframe.words))
         if number is None:

@@ -4,8 +4,8 @@
     words 2-10   11 bits | 11 bits | 4 parity of the first | 4 parity of the second
     g(x)         x^4 + x + 1; a good code word is a multiple of it
 
-The interleaving of BDS-SIS-ICD-B1I-3.0 section 5.1.3 is undone by the receiver. The code could
-correct one bit of fifteen; a word in doubt is refused instead.
+The receiver undoes the interleaving of BDS-SIS-ICD-B1I-3.0 section 5.1.3. The code could correct
+one bit of fifteen; here a damaged word is refused.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _GOOD = _remainders()
 
 
 def information(words: tuple[int, ...], count: int) -> Bits:
-    """The information bits of the first `count` words. RefusedError `subframe_short`,
-    `parity_bad`, `preamble_bad`."""
+    """Information bits of the first `count` words. RefusedError `subframe_short`, `parity_bad`,
+    `preamble_bad`."""
     if len(words) < WORDS:
         raise RefusedError("subframe_short")
     if not _GOOD[words[0] & 0x7FFF]:
@@ -79,11 +79,11 @@ def beidou_ephemeris(
     tow_s: int,
     weeks: WeekReference,
 ) -> Ephemeris:
-    """The ephemeris of D1 or D2. RefusedError by name.
+    """Make the ephemeris of D1 or D2. RefusedError by name.
 
-    `numbers`: what the message's own table reads; `first`: subframe 1 (D1) or page 1 (D2) without
-    its header, in which both hold health, ages, accuracy, week and delays at the same bits;
-    `tow_s`: BDT at which the first began.
+    `numbers`: values by the message's own table. `first`: subframe 1 (D1) or page 1 (D2) without
+    its header; both hold health, ages, accuracy, week and delays at the same bits. `tow_s`: BDT at
+    which `first` began.
     """
     if numbers["toe_s"] != numbers["toc_s"]:
         raise RefusedError("ephemeris_mixed")

@@ -3,9 +3,9 @@
     value = n * 2^exponent            n: `length` bits from bit `at`, most significant first,
                                       two's complement where signed; angles times PI
 
-A table names each number once: where it starts, how long it is, and what its last bit weighs. Bits
-count from 0, in a string from which parity and headers were taken out, so that a number which the
-message splits over two words or pages is in one piece.
+A table has the start, the length and the weight of the last bit of each number. Bits count from 0
+in a string without parity and headers, so that a number which the message splits over two words or
+pages is in one piece.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Bits:
         return n - (1 << length) if n >> (length - 1) else n
 
     def cut(self, start: int, end: int) -> Bits:
-        """The bits from `start` to before `end`."""
+        """Bits from `start` to before `end`."""
         return Bits(self.unsigned(start, end - start), end - start)
 
     @classmethod
@@ -53,7 +53,7 @@ class Bits:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number of a message: see the module."""
+    """Number in a message: see the module."""
 
     at: int
     length: int
@@ -89,7 +89,7 @@ Table = dict[str, Number]
 
 
 def read(bits: Bits, table: Table) -> dict[str, Any]:
-    """The numbers of `table` by name, as floats."""
+    """Numbers of `table` by name, as floats."""
     return {name: number.read(bits) for name, number in table.items()}
 
 

@@ -3,8 +3,8 @@
     preamble 8, PRN 6, type 6, TOW 17, alert 1, data 238, CRC 24: 300 bits in ten words of 32
     type 30: T_GD and ISC of L1 C/A, L2C, L5 I5, L5 Q5, 13 bits of 2^-35 s each from bit 127 on
 
-A number that has only its highest bit set is not known. Other types are sound, and not read: LNAV
-has the same orbit and clock. Source: IS-GPS-200N 30.3.3.3.1 and figure 30-3; IS-GPS-705J 20.3.3.3.
+A number with only its highest bit set is unknown. Other types are checked but not read: LNAV has
+the same orbit and clock. Source: IS-GPS-200N 30.3.3.3.1 and figure 30-3; IS-GPS-705J 20.3.3.3.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class CnavDecoder:
         for word in subframe.words[:WORDS]:
             value = value << 32 | word
         bits = Bits(value, 32 * WORDS).cut(0, LENGTH)
-        # 276 bits are no whole bytes: zeros in front change no remainder that begins with zero.
+        # 276 bits are no whole bytes: leading zeros do not change a remainder that begins with
+        # zero.
         if crc24q(bits.unsigned(0, COVERED).to_bytes(35, "big")) != bits.unsigned(COVERED, 24):
             raise RefusedError("crc_bad")
         if bits.unsigned(8, 6) != subframe.prn:

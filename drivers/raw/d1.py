@@ -64,7 +64,7 @@ class D1Decoder:
         found: Decoded = []
         if number == 1:
             found.append(klobuchar(subframe, body, _IONOSPHERE))
-        # Subframes of another frame are no fault: the receiver joined in the middle, or lost one.
+        # Subframes of two frames are normal: the receiver joined in the middle, or lost one.
         self._parts.add(frame_s, number, body)
         if len(self._parts.found) == 3:
             found.append(self._ephemeris(subframe, frame_s, weeks))

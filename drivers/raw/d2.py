@@ -1,9 +1,9 @@
 """BeiDou D2 (GEO, 500 bit/s): ten pages of subframe 1, one every 3 s, make an ephemeris.
 
-A page uses the first five words, 114 information bits; its header takes 42 of them. What a number
-leaves over goes on in the next page, so the pages are laid end to end without their spare bits.
-Page n of a set begins 3 (n - 1) s after page 1, and toe must equal toc. Page 2 has the ionosphere.
-Source: BDS-SIS-ICD-B1I-3.0, section 5.3.3 and figure 5-14.
+A page uses the first five words, 114 information bits, of which its header takes 42. A number may
+continue in the next page, so the pages are joined without their spare bits. Page n of a set begins
+3 (n - 1) s after page 1, and toe must equal toc. Page 2 has the ionosphere. Source:
+BDS-SIS-ICD-B1I-3.0, section 5.3.3 and figure 5-14.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bytes of a receiver's raw output in, observations and ephemerides out: no I/O, no clock.
+"""Decoder of a receiver's raw output into observations and ephemerides: no I/O, no clock.
 
 Every verified frame ends in exactly one of these counters:
 
@@ -7,9 +7,9 @@ Every verified frame ends in exactly one of these counters:
     RTCM 3  msm, week_unknown, rtcm_ephemerides, rtcm_ssr, ..._not_used, rtcm_unreadable,
             ssr_unreadable, and the refusals of an ephemeris
 
-A subframe's name is `subframes_lnav`, `_cnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where
-it was used, a message that is not decoded (`fnav_not_used`), or the reason of its refusal
-(`parity_bad`). See `docs/gnss-raw.md`.
+The counter of a subframe is `subframes_lnav`, `_cnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or
+`_inav` if it was used, `fnav_not_used` for a message that is not decoded, or the reason of its
+refusal (`parity_bad`). See `docs/gnss-raw.md`.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ _GALILEO_INAV, _GALILEO_FNAV = frozenset({0, 1, 5}), frozenset({3, 4})
 
 
 class RawDecoder:
-    """`feed` bytes, get events; `flush` at the end of the file.
+    """Decoder: `feed` bytes to get events; `flush` at the end of the file.
 
-    `earliest` resolves a 10-bit GPS week where the stream gives no fuller one; set it back to read
-    an old RTCM log. With `rtcm` off, RTCM 3 frames are counted as `rtcm_not_used`; with it on, the
-    first one needs pyrtcm: PermanentDriverError where it is not installed.
+    `earliest` resolves a 10-bit GPS week if the stream has no longer one; set it back to read an
+    old RTCM log. With `rtcm` off, RTCM 3 frames are counted as `rtcm_not_used`. With it on, the
+    first frame raises PermanentDriverError if pyrtcm is not installed.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class RawDecoder:
         """Last ionosphere by model."""
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[RawEvent]:
-        """The events that `data`, seen at `t_seen_ns`, completes. Sentences are left out."""
+        """Events that `data`, seen at `t_seen_ns`, completes. Sentences are ignored."""
         found: list[RawEvent] = []
         self._t_seen_ns = t_seen_ns
         for item in self._splitter.feed(data):
@@ -113,7 +113,7 @@ class RawDecoder:
         return found
 
     def flush(self) -> list[RawEvent]:
-        """The stream ended, or broke: everything that can still be had from what came."""
+        """End the stream; return what its last bytes still complete."""
         found: list[RawEvent] = []
         for item in self._splitter.finish():
             if isinstance(item, Frame):
@@ -126,15 +126,15 @@ class RawDecoder:
         return self._rtcm is not None and self._rtcm.epoch_open
 
     def flush_epoch(self) -> list[RawEvent]:
-        """No more of an epoch of MSM will come."""
+        """End an open epoch of MSM, of which nothing more will come."""
         return [] if self._rtcm is None else self._rtcm.flush()
 
     def note_utc(self, utc: int) -> None:
-        """UTC (POSIX ns) from another source, to be believed: it dates MSM epochs."""
+        """Note trusted UTC (POSIX ns) from another source, to date MSM epochs."""
         self._weeks.note_utc(utc, self.leap_seconds)
 
     def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
-        """Decode a verified RTCM 3 frame from another source than the receiver."""
+        """Decode a verified RTCM 3 frame that is not the receiver's."""
         return [] if self._rtcm is None else self._rtcm.decode(frame, t_seen_ns)
 
     def decode(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
@@ -215,14 +215,15 @@ class RawDecoder:
         return [event for event in decoded if self._is_news(event)]
 
     def _is_news(self, event: NavigationMessage) -> bool:
-        """True for every whole ephemeris, whose health and age matter; for an ionosphere once."""
+        """True for every complete ephemeris, since its health and age count, and for a new
+        ionosphere."""
         if isinstance(event, Ephemeris):
             self.counters["ephemerides"] += 1
             return True
         if isinstance(event, SignalDelays):
             self.counters["signal_delays"] += 1
             return True
-        assert not isinstance(event, Correction)  # of no subframe
+        assert not isinstance(event, Correction)  # not of a subframe
         model = "bdgim" if isinstance(event, Bdgim) else event.system
         last = self._ionosphere.get(model)
         if last is not None and replace(last, t_seen_ns=event.t_seen_ns) == event:
@@ -233,9 +234,9 @@ class RawDecoder:
 
 
 def message_of(sfrbx: Sfrbx) -> str:
-    """The message in a SFRBX: a key of the decoders, or the counter of what is not decoded.
+    """Message type in a SFRBX: the key of its decoder, or the counter of one that is not decoded.
 
-    Receivers before generation 9 leave sigId 0; the satellite or the words then tell.
+    Receivers before generation 9 leave sigId 0; then satellite or words decide.
     """
     signal = sfrbx.signal_id
     if sfrbx.gnss_id == 0:

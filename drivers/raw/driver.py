@@ -1,4 +1,4 @@
-"""A GNSS receiver's line with raw observations, NMEA and UBX mixed: see `docs/gnss-raw.md`."""
+"""Driver `gnss`: a receiver's line with raw observations, NMEA and UBX, see `docs/gnss-raw.md`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ at least 50 ms apart."""
 
 
 class GnssOptions(NmeaOptions):
-    """Options of a `driver = "gnss"` source: those of `nmea`, and which of the stream to use."""
+    """Options of a `driver = "gnss"` source: those of `nmea`, and the parts of the stream to
+    use."""
 
     use_nmea_fix: bool = True
     """Hand over the receiver's own fixes too, of NMEA or UBX-NAV. They are made of the same
@@ -53,7 +54,7 @@ ALIVE_BY = ("sentences", "ubx_frames", "rtcm_frames")
 class GnssDecoder:
     """Decoders of one stream: for sentences, for UBX-NAV, and for all other frames.
 
-    Counts `nmea_fix_superseded`: the same fix comes by UBX-NAV, too.
+    Counts `nmea_fix_superseded`: fixes that UBX-NAV has, too.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class GnssDecoder:
         return self._nmea.epoch_open or self._ubx.epoch_open or raw
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Found]:
-        """Result of `data`, seen at `t_seen_ns`."""
+        """Measurements and messages that `data`, seen at `t_seen_ns`, completes."""
         self._t_seen_ns = t_seen_ns
         found: list[Found] = []
         for item in self._splitter.feed(data):
@@ -127,7 +128,7 @@ class GnssDecoder:
         return found
 
     def correct(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
-        """Result of a frame of a service beside the receiver."""
+        """Corrections in a frame of a service beside the receiver."""
         return [] if self._raw is None else self._raw.correct(frame, t_seen_ns)
 
     def silence(self) -> list[Found]:
@@ -140,7 +141,7 @@ class GnssDecoder:
         return found
 
     def flush(self) -> list[Found]:
-        """The stream ended, or broke: everything that can still be had from what came."""
+        """End the stream; return what its last bytes still complete."""
         found: list[Found] = []
         for item in self._splitter.finish():
             self._take(item, found)
@@ -169,7 +170,7 @@ class GnssDecoder:
             found.append(measurement)
 
     def _own_fix(self, fix: PositionFix) -> bool:
-        """True if a fix by NMEA is handed over."""
+        """True if a fix by NMEA is to be handed over."""
         if not self._use_nmea_fix:
             return False
         if self._ubx_fix_ns is not None and self._t_seen_ns - self._ubx_fix_ns < UBX_FIX_NS:
@@ -239,7 +240,7 @@ class GnssDecoder:
 class GnssDriver(ReceiverDriver):
     """Driver for raw observations, with the output of the NMEA driver.
 
-    PermanentDriverError when RTCM 3 is to be decoded and pyrtcm is not installed.
+    PermanentDriverError if RTCM 3 is to be decoded and pyrtcm is not installed.
     """
 
     Options: ClassVar[type[GnssOptions]] = GnssOptions

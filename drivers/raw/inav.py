@@ -1,13 +1,13 @@
-"""Galileo I/NAV from UBX-RXM-SFRBX: a page, its even and its odd half of 120 bits each.
+"""Galileo I/NAV from UBX-RXM-SFRBX: pages of an even and an odd half, 120 bits each.
 
     even, words 0-3    0 | type | data 112 | tail 6
     odd,  words 4-7    1 | type | data 16 | reserved 64 | CRC 24 | reserved 8 | tail 6
     CRC-24Q            over the first 114 bits of the even half and the first 82 of the odd one
 
-Data word types 1 to 4 carry IODnav and must agree in it; type 5 (delays, health, week) has none and
-belongs to the issue that is being gathered: it is taken only behind a word of it, and an issue
-changes at the start of a subframe, which holds all five. Source: Galileo OS SIS ICD 2.1, sections
-4.3.2 and 4.3.5.
+Data word types 1 to 4 carry IODnav, which must be the same in all. Type 5 (delays, health, week)
+has none: it is taken only behind a word of the issue being collected, and belongs to it, since an
+issue changes at the start of a subframe, which holds all five. Source: Galileo OS SIS ICD 2.1,
+sections 4.3.2 and 4.3.5.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ _DELAYS = (s(47, 10, -32), s(57, 10, -32))
 
 
 def data_word(words: tuple[int, ...]) -> Bits:
-    """The 128 data bits of a page. RefusedError `subframe_short`, `half_page` (not an even half
-    and its odd one), `alert_page`, `crc_bad`."""
+    """Data bits (128) of a page. RefusedError `subframe_short`, `half_page` (not an even half and
+    its odd one), `alert_page`, `crc_bad`."""
     if len(words) < WORDS:
         raise RefusedError("subframe_short")
     value = 0

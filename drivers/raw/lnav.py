@@ -3,10 +3,10 @@
     word     D29* D30* | d1 ... d24 | D25 ... D30     bits 31-30, 29-6, 5-0 of a U4
     D25..29  parity, IS-GPS-200 table 20-XIV
 
-The receiver has already turned the data's polarity, and leaves the last two bits of the word before
-as they came in bits 31-30: all words of a recording verify so. Subframes 1, 2 and 3 make an
-ephemeris when IODE of 2 and 3 and the low byte of IODC agree; page 18 of subframe 4 (data ID 56)
-has the ionosphere. Source: IS-GPS-200, 20.3.3 and figure 20-1.
+The receiver has already corrected the data's polarity, and leaves the last two bits of the previous
+word in bits 31-30: all words of a recording verify so. Subframes 1, 2 and 3 make an ephemeris if
+IODE of 2 and 3 and the low byte of IODC agree; page 18 of subframe 4 (data ID 56) has the
+ionosphere. Source: IS-GPS-200, 20.3.3 and figure 20-1.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def parity(word: int) -> int:
 
 
 def subframe_bits(words: tuple[int, ...]) -> Bits:
-    """The 240 bits between the parities. RefusedError `subframe_short`, `parity_bad`,
+    """Data bits (240) without parity. RefusedError `subframe_short`, `parity_bad`,
     `preamble_bad`."""
     if len(words) < WORDS:
         raise RefusedError("subframe_short")

@@ -1,10 +1,9 @@
 """Raw messages of a GNSS receiver: observations, broadcast ephemerides, ionosphere models.
 
-Angles are rad, times s, lengths m; every field is in the unit that the orbit equations take, and
-semicircles, scale factors and week rollovers end in the decoders. Systems are the letters of
-RINEX: G GPS, E Galileo, C BeiDou (others are counted and left out). Signals are RINEX 3
-observation codes without their type: "1C" GPS L1 C/A, "2I" BeiDou B1I, "6I" B3I, "1P" B1C pilot,
-"5P" B2a pilot.
+Angles are rad, times s, lengths m: the units of the orbit equations. The decoders resolve
+semicircles, scale factors and week rollovers. Systems are the letters of RINEX: G GPS, E Galileo, C
+BeiDou (others are counted and left out). Signals are RINEX 3 observation codes without their type:
+"1C" GPS L1 C/A, "2I" BeiDou B1I, "6I" B3I, "1P" B1C pilot, "5P" B2a pilot.
 
 A system's own time: GPS and Galileo weeks count from 1980-01-06 (Galileo's are given in GPS
 weeks, 1024 more than its own count) and agree to nanoseconds; BeiDou's count from 2006-01-01 and
@@ -47,9 +46,9 @@ CARRIER_HZ: dict[tuple[System, str], float] = {
 class RawSignal:
     """Signal of one satellite. Range rate is positive while the distance grows.
 
-    `sd_*` are what the receiver states, None where it does not; `cno_db_hz` likewise. A carrier
-    with half a cycle open is None. It has been followed for `lock_s` (s) at least, as the receiver
-    says: infinite where it says nothing, or no more than that its count is full.
+    `sd_*` and `cno_db_hz` are the receiver's, None if it states none. A carrier with an unresolved
+    half cycle is None. `lock_s` (s) is the least time of tracking by the receiver: infinite if it
+    states none, or if its counter is full.
     """
 
     system: System
@@ -73,7 +72,7 @@ class RawSignal:
 class RawGnssEpoch:
     """Signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
 
-    `stamp` is the same instant in UTC where the receiver knows the leap seconds.
+    `stamp` is the same instant in UTC, if the receiver knows the leap seconds.
     """
 
     source: str
@@ -181,12 +180,12 @@ CorrectionPart = Literal["orbit", "clock", "fast_clock", "bias", "accuracy"]
 class Correction:
     """Correction of a satellite's ephemeris by a service (RTCM SSR).
 
-    It holds at GPS time `week`, `tow_s`, and comes anew every `interval_s`. Parts of one `solution`
+    It is valid at GPS time `week`, `tow_s`, and updated every `interval_s`. Parts of one `solution`
     (provider, number, issue) belong together. `values`: of the orbit radial, along, across (m,
     broadcast minus true) and their rates (m/s); of the clock C0, C1, C2 (m, m/s, m/s^2, true minus
     broadcast), or what the fast one adds to C0; biases (m), added to the ranges of `signals`; the
-    accuracy as one sigma of a range (m). `issue` of the ephemeris that an orbit is of: GPS's IODE,
-    Galileo's IODnav, of BeiDou (toe / 8 s) modulo 1024; -1 of other parts.
+    accuracy as one sigma of a range (m). `issue` is that of the ephemeris which an orbit part
+    corrects: GPS's IODE, Galileo's IODnav, BeiDou's (toe / 8 s) modulo 1024; -1 for other parts.
     """
 
     source: str

@@ -1,13 +1,12 @@
-"""RINEX 3 and 4 observation files: header and epochs. Text in, epochs out; no I/O.
+"""RINEX 3 and 4 observation files: text to epochs; no I/O.
 
     > yyyy mm dd hh mm ss.sssssss  flag  n        epoch; flag 0 or 1 has n satellites, 2 to 6 events
     Gnn + 16 characters an observable             F14.3, loss of lock, strength
     rate = -D c / f                               a positive Doppler approaches
 
 An observable is C, L, D or S and a signal's code. BeiDou's B1I, "1I" in 3.02, is "2I" here as in
-all others. Epochs may be in GPS, Galileo or BeiDou time. A value that is blank or 0 was not
-measured.
-Source: RINEX 3.05 and 4.01, sections 5 and A2.
+all others. Epochs may be in GPS, Galileo or BeiDou time. A blank or 0 means not measured. Source:
+RINEX 3.05 and 4.01, sections 5 and A2.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ class _Header:
     listed: str = ""
 
     def read(self, line: str) -> None:
-        """A header line, of the file's head or of an event. ValueError where it cannot be read."""
+        """Read a header line, of the file's head or of an event. ValueError if invalid."""
         label = line[LABEL].strip()
         if label == "SYS / # / OBS TYPES":
             if line[:1] != " ":
@@ -104,7 +103,7 @@ class _Header:
 
 @dataclass(slots=True)
 class _Columns:
-    """Columns of C, L, D and S of each signal of a system, None where absent."""
+    """Columns of C, L, D and S of each signal of a system, None if absent."""
 
     signals: list[tuple[str, list[int | None]]]
     factors: list[float]
@@ -159,7 +158,8 @@ class ObservationReader:
             self._counters["lines_unreadable"] += 1
 
     def _pass_event(self, number: int) -> None:
-        """Header lines of a changed site or receiver, cycle slips: they may rename observables."""
+        """Skip an event (changed site or receiver, cycle slips), but read its header lines, which
+        may rename observables."""
         self._counters["events_passed"] += 1
         for _ in range(number):
             line = next(self._lines, "")
@@ -248,7 +248,7 @@ class ObservationReader:
 
 
 def _flags(line: str, k: int | None) -> int:
-    """The loss-of-lock indicator of a carrier; 0 where there is none."""
+    """Loss-of-lock indicator of a carrier; 0 without one."""
     if k is None:
         return 0
     text = line[3 + _WIDTH * k + 14 : 3 + _WIDTH * k + 15]
@@ -256,7 +256,7 @@ def _flags(line: str, k: int | None) -> int:
 
 
 def _value(line: str, column: int | None, factors: list[float]) -> float | None:
-    """An observable; None where it was not measured. ValueError where it is no number."""
+    """Value of an observable; None if not measured. ValueError if it is no number."""
     if column is None:
         return None
     start = 3 + _WIDTH * column

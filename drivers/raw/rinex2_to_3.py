@@ -1,4 +1,4 @@
-"""RINEX 2 files in the words of RINEX 3: `as_version_3`. Text in, text out; no I/O.
+"""Conversion of RINEX 2 files to RINEX 3, text to text; no I/O.
 
     observations   C1 L1 P2 L2 D1 S1 ...      16 characters an observable as in 3, five a line
     epochs         yy mm dd hh mm ss.sssssss flag n and twelve satellites a line
@@ -78,7 +78,7 @@ def _observations(lines: Iterator[str], system: str) -> Iterator[str]:
             flag, number = int(line[28:29].strip() or "0"), int(line[29:32])
             when = _date(line) if flag <= 1 or line[1:26].strip() else ""
         except ValueError:
-            yield line  # the reader counts what is no epoch
+            yield line  # the reader counts lines that are no epoch
             continue
         if flag == 6:  # cycle slips, in the form of observations
             for _ in range(len(_satellites(line, number, lines, system)) * a_satellite):
@@ -176,6 +176,6 @@ def _navigation(lines: Iterator[str]) -> Iterator[str]:
             when = f"{_year(line[2:5])} {month:02} {day:02} {hour:02} {minute:02}"
             second = round(float(line[17:22]))
         except ValueError:
-            yield f"X{line}"  # the reader counts what is no record
+            yield f"X{line}"  # the reader counts lines that are no record
             continue
         yield f"G{prn:02} {when} {second:02}{line[22:]}"

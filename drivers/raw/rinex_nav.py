@@ -1,13 +1,13 @@
-"""RINEX 3 and 4 navigation files: ephemerides and ionosphere. Text in, records out; no I/O.
+"""RINEX 3 and 4 navigation files: text to ephemerides and ionospheres; no I/O.
 
     3    Gnn yyyy mm dd hh mm ss, then numbers of 19 characters, four a line behind four blanks
     4    > EPH Gnn LNAV, > ION Gnn LNAV and so on before the same lines
 
-Of RINEX 3 a Galileo record says in `data sources` whether its clock is of I/NAV or F/NAV; BeiDou's
-are D1 or D2 by the satellite. RINEX 4 names the message: LNAV, INAV, FNAV, D1, D2, CNV1 and CNV2 of
-BeiDou are read, of GPS's CNAV the delays, the others counted. Weeks are not read: a record's toc
-has a full date, and toe is the nearest. Source: RINEX 3.05, table A5 and following; RINEX 4.01,
-tables A9 to A24.
+In RINEX 3 a Galileo record has the source of its clock, I/NAV or F/NAV, in `data sources`; BeiDou's
+are D1 or D2 by the satellite. RINEX 4 names the message: LNAV, INAV, FNAV, D1, D2, and BeiDou's
+CNV1 and CNV2 are read, and of GPS's CNAV the delays; others are counted. Weeks are not read: toc
+has a full date, and toe is the instant nearest to it. Source: RINEX 3.05, table A5 and following;
+RINEX 4.01, tables A9 to A24.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _LINES, _LINES_CNAV, _LINES_GPS_CNAV = 8, 10, 9
 _TGD, _ISC = 25, 27
 """Places of delays in a record of GPS CNAV, after the clock's three numbers."""
 
-# Where numbers stand, the clock's three before them; all messages share what comes first.
+# Places of numbers behind the clock's three; the first ones are the same in all messages.
 _ORBIT = (
     ("crs", 4), ("mean_motion_correction", 5), ("mean_anomaly", 6), ("cuc", 7),
     ("eccentricity", 8), ("cus", 9), ("sqrt_a", 10), ("toe_s", 11), ("cic", 12),
@@ -71,14 +71,14 @@ _ORBIT = (
 
 
 class Broadcast(NamedTuple):
-    """Message of a satellite, and when (GPS time, s since 1980-01-06)."""
+    """Message of a satellite and its instant (GPS time, s since 1980-01-06)."""
 
     gps_s: float
     message: NavigationMessage
 
 
 def navigation(source: str, text: str, counters: Counter[str]) -> list[Broadcast]:
-    """Messages of a file in order. RinexError for another file.
+    """Messages of a file in order. RinexError for any other file.
 
     Counts `ephemerides`, `ionospheres`, `records_unreadable`, `ephemeris_implausible`,
     `satellite_unknown`, and `<system>_not_used` or `<message>_not_used`.
@@ -152,7 +152,7 @@ def _taken(
 
 
 def _numbers(record: list[str], first: int, wanted: int) -> list[float]:
-    """The numbers of a record, the first line's from character `first` on; blanks are 0."""
+    """Numbers of a record, in the first line from character `first` on; blanks are 0."""
     found: list[float] = []
     for k, line in enumerate(record):
         start = first if k == 0 else 4
@@ -195,7 +195,7 @@ def _ephemeris(source: str, system: System, prn: int, message: str, record: list
     )
     check_orbit(found)
     at_toe = toe_week * WEEK_S + toe_s + (BDT_BEHIND_GPS_S if system == "C" else 0)
-    # A transmission that cannot be of this ephemeris is a filler, 0.9999e9 among them.
+    # A transmission time that cannot belong to this ephemeris is a filler, such as 0.9999e9.
     near = abs(sent_s - toe_s) < HALF_WEEK_S and sent_s != 0.0
     return Broadcast(at_toe + (sent_s - toe_s if near else 0.0), found)
 

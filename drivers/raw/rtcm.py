@@ -6,12 +6,11 @@
     epoch        DF004, DF248: GPS time; DF427: BeiDou time, 14 s behind it; ms of week
     angles       semicircles, times PI
 
-The messages of one epoch become one `RawGnssEpoch`: it ends with the message whose multiple-message
-bit (DF393) is off, whatever its system, or with the next epoch. Where a system sends several kinds
-of MSM the highest counts, and never two at once: they need not be of the same receiver clock (in a
-public log MSM6 and MSM7 are 108 km apart). The week is not sent; it is the one that puts the epoch
-nearest to the last instant known in full. pyrtcm takes the payloads apart; it is imported with the
-first of them. Source: RTCM 10403.3, section 3.5.
+The messages of one epoch become one `RawGnssEpoch`. It ends with the message whose multiple-message
+bit (DF393) is off, whatever its system, or with the next epoch. If a system sends several kinds of
+MSM, only the highest is used: kinds may differ in the receiver clock (by 108 km between MSM6 and
+MSM7 in a public log). The week is not sent; it is the one nearest to the last full instant. pyrtcm
+parses the payloads; it is imported with the first frame. Source: RTCM 10403.3, section 3.5.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ _NO_RANGE_MS = 255
 _NO_RATE_M_S = -8192
 _EPOCH_FIELD: dict[System, str] = {"G": "DF004", "E": "DF248", "C": "DF427"}
 
-# What a field that says "not valid" reads as: its most negative number.
+# Value of a field that is marked invalid: its most negative number.
 _NO_FINE_RANGE_MS = {"DF400": -(2.0**-10), "DF405": -(2.0**-10)}
 _NO_FINE_CARRIER_MS = {"DF401": -(2.0**-8), "DF406": -(2.0**-8)}
 _NO_FINE_RATE_M_S = -1.6384
@@ -113,8 +112,8 @@ def message_number(frame: bytes) -> int:
 
 
 def load_pyrtcm() -> Parse:
-    """The parser of a verified frame: it does not look at the CRC again, which takes it longer than
-    all else. PermanentDriverError when pyrtcm is not installed."""
+    """Import the parser of verified frames. It skips the CRC, which would take longer than the
+    rest. PermanentDriverError if pyrtcm is not installed."""
     try:
         pyrtcm = importlib.import_module("pyrtcm")
     except ImportError as error:
@@ -125,7 +124,8 @@ def load_pyrtcm() -> Parse:
 
 
 class RtcmDecoder:
-    """Verified frames in, events out. Counts every frame by one name, and refused signals."""
+    """Decoder of verified frames into events. Counts every frame under one name, and refused
+    signals."""
 
     def __init__(self, source: str, weeks: WeekReference, counters: Counter[str]) -> None:
         self.leap_seconds: int | None = None
@@ -209,12 +209,12 @@ class RtcmDecoder:
             self._weeks.note(0, (day - MJD_1980_01_06) * 86_400 + second + leap)
 
     def _message(self, frame: bytes) -> Any | None:
-        """pyrtcm's view of the frame; None when it cannot read it, whatever it raises."""
+        """Frame as parsed by pyrtcm; None for any error of pyrtcm."""
         if self._parse is None:
             self._parse = load_pyrtcm()
         try:
             return self._parse(frame)
-        except Exception:  # it indexes what a damaged or newer message does not have
+        except Exception:  # it may raise anything for a damaged or newer message
             return None
 
     # ----------------------------------------------------------------- observations
@@ -222,7 +222,7 @@ class RtcmDecoder:
     def _observe(
         self, system: System, kind: int, message: Any, t_seen_ns: int, found: list[RawEvent]
     ) -> None:
-        # Whole ms until the end: the same instant from BDT and from GPS time has to compare equal.
+        # Whole ms until the end, so that equal instants in BDT and GPS time compare equal.
         tow_ms = int(getattr(message, _EPOCH_FIELD[system]))
         if system == "C":
             tow_ms = (tow_ms + BDT_BEHIND_GPS_S * 1000) % (WEEK_S * 1000)
@@ -329,7 +329,7 @@ class RtcmDecoder:
 
 
 def _signals(system: System, message: Any, counters: Counter[str]) -> list[RawSignal]:
-    """The cells of an MSM that are good; the others counted."""
+    """Good cells of an MSM; the others are counted."""
     satellites = {
         getattr(message, f"PRN_{i:02d}"): (
             getattr(message, f"DF397_{i:02d}"),
@@ -384,8 +384,8 @@ def _signals(system: System, message: Any, counters: Counter[str]) -> list[RawSi
 
 
 def _lock_s(indicator: int, name: str) -> float:
-    """The least time (s) that a lock time indicator stands for: DF402, 0 or 2^(i + 4) ms; DF407,
-    2^k (i - 32 k) ms with k = i / 32 - 1, not below 0 (RTCM 10403.3, tables 3.5-74 and 3.5-75)."""
+    """Least lock time (s) of an indicator: DF402, 0 or 2^(i + 4) ms; DF407, 2^k (i - 32 k) ms with
+    k = i / 32 - 1, not below 0 (RTCM 10403.3, tables 3.5-74 and 3.5-75)."""
     if name == "DF402":
         return float(1 << (indicator + 4)) * 1e-3 if indicator else 0.0
     k = max(indicator // 32 - 1, 0)

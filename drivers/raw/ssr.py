@@ -1,4 +1,4 @@
-"""RTCM 3 state space representation: corrections of orbits, clocks and code biases, by satellite.
+"""RTCM 3 state space representation: orbit, clock and code bias corrections by satellite.
 
     1057 to 1062 GPS, 1240 to 1245 Galileo, 1258 to 1263 BeiDou:
     orbit, clock, code bias, orbit and clock, accuracy (URA), high-rate clock
@@ -12,16 +12,16 @@
     accuracy   satellite 6, class 3 and value 3: 3^class (1 + value / 4) - 1 mm
     high rate  satellite 6, clock 22 in 0.1 mm
 
-The issue is GPS's IODE (8), Galileo's IODnav (10), BeiDou's (toe / 8 s) modulo 1024 (10) with 8
-more bits, in streams by an older draft 24: the message's length tells which. A number that has only
-its highest bit set is not known. They hold from half an interval behind the epoch; an interval of
-the least index, 1 s, from the epoch itself.
+The issue is GPS's IODE (8), Galileo's IODnav (10), or BeiDou's (toe / 8 s) modulo 1024 (10) with 8
+more bits, 24 more by an older draft: the message's length decides. A number with only its highest
+bit set is unknown. The reference instant is half an interval after the epoch; with the shortest
+interval, 1 s, it is the epoch.
 
-What was not used has a counter: `ssr_not_known`, `ssr_implausible`, `ssr_unreadable`,
+Counters of unused contents: `ssr_not_known`, `ssr_implausible`, `ssr_unreadable`,
 `ssr_glonass_not_used`, `ssr_not_used` (QZSS, SBAS, ionosphere, phase biases), `signal_unknown`.
 
-Source: RTCM 10403.3, 3.5.12 and tables 3.5-42 to 3.5-48 (GPS); of Galileo and BeiDou the proposal
-SSR_1_Gal_QZSS_SBAS_BDS_v08u, which the numbers of pyrtcm are of.
+Source: RTCM 10403.3, 3.5.12 and tables 3.5-42 to 3.5-48 (GPS); proposal
+SSR_1_Gal_QZSS_SBAS_BDS_v08u (Galileo, BeiDou), as in pyrtcm.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Head(NamedTuple):
 
 
 class _UnreadableError(Exception):
-    """Error: a message shorter than it states."""
+    """Error: a message is shorter than it states."""
 
 
 _Found = list[tuple[int, CorrectionPart, int, tuple[float, ...], tuple[str, ...]]]
@@ -95,7 +95,7 @@ _Found = list[tuple[int, CorrectionPart, int, tuple[float, ...], tuple[str, ...]
 
 
 class SsrDecoder:
-    """Messages in, corrections out."""
+    """Decoder of messages into corrections."""
 
     def __init__(self, source: str, weeks: WeekReference, counters: Counter[str]) -> None:
         self._source = source
@@ -191,7 +191,7 @@ class SsrDecoder:
         of: tuple[int, CorrectionPart, int],
         found: _Found,
     ) -> int:
-        """Place of the next; those that can be are kept."""
+        """Add the plausible numbers of a satellite; return the position of the next one."""
         values, known = [], True
         for length, scale in fields:
             if at + length > bits.length:
@@ -243,7 +243,7 @@ class SsrDecoder:
 
 
 def _layout(system: System, kind: int, bits: Bits, head: _Head) -> tuple[int, int]:
-    """Bits of an issue and behind it, by the length of the message."""
+    """Lengths of the issue and of the bits behind it, by the message's length."""
     rest = sum(length for length, _ in _ORBIT) + 6
     if kind == COMBINED:
         rest += sum(length for length, _ in _CLOCK)

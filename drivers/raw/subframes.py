@@ -1,7 +1,7 @@
-"""Collection of one satellite's subframes into an ephemeris: the common part of every message.
+"""Common part of message decoders: collection of one satellite's subframes into an ephemeris.
 
-A decoder of a message takes one verified block (a subframe, page or word) at a time and returns
-what it completes. What it refuses it names by raising `RefusedError`.
+The decoder of a message takes one verified block (a subframe, page or word) at a time and returns
+what the block completes. It raises `RefusedError` with a name for a refused block.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SQRT_A_M = (4000.0, 7000.0)
 
 
 class RefusedError(Exception):
-    """A block that cannot be used; the message is the counter's name."""
+    """Error: a block cannot be used; the text is the counter's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,13 @@ class Subframe:
 
 @dataclass(slots=True)
 class Parts:
-    """Blocks by number that share a `key`; another key starts a new set."""
+    """Blocks by number with the same `key`; another key starts a new set."""
 
     key: Any = None
     found: dict[int, Any] = field(default_factory=dict)
 
     def add(self, key: Any, number: int, block: Any) -> bool:
-        """Keep `block`; whether it made earlier ones of another key useless."""
+        """Add a block; true if it discards earlier ones of another key."""
         mixed = bool(self.found) and key != self.key
         if mixed:
             self.found.clear()
@@ -71,7 +71,7 @@ def ephemeris(
     accuracy_m: float | None,
     healthy: bool,
 ) -> Ephemeris:
-    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so.
+    """Make the `Ephemeris` of `subframe`'s satellite. RefusedError for an impossible orbit.
 
     `sent`: week and time of week at which the message began; `delays`: the bits with the group
     delays, and their table.
@@ -96,7 +96,7 @@ def ephemeris(
 
 
 def klobuchar(subframe: Subframe, bits: Bits, table: KlobucharTable) -> Klobuchar:
-    """The ionosphere that `table` (drivers.raw.bits.klobuchar_table) finds in `bits`."""
+    """Make the ionosphere model of `bits` by `table` (drivers.raw.bits.klobuchar_table)."""
     (a0, a1, a2, a3), (b0, b1, b2, b3) = ([n.read(bits) for n in row] for row in table)
     return Klobuchar(
         subframe.source, subframe.t_seen_ns, subframe.system, (a0, a1, a2, a3), (b0, b1, b2, b3)
@@ -104,7 +104,8 @@ def klobuchar(subframe: Subframe, bits: Bits, table: KlobucharTable) -> Klobucha
 
 
 def bdgim(subframe: Subframe, bits: Bits, table: tuple[Number, ...]) -> list[NavigationMessage]:
-    """BeiDou-3's ionosphere in `bits`; none where all is zero, as of a satellite that has none."""
+    """Make BeiDou-3's ionosphere model of `bits`; None if all are zero: the satellite sends
+    none."""
     a1, a2, a3, a4, a5, a6, a7, a8, a9 = (n.read(bits) for n in table)
     alpha = (a1, a2, a3, a4, a5, a6, a7, a8, a9)
     return [Bdgim(subframe.source, subframe.t_seen_ns, alpha)] if any(alpha) else []
@@ -120,7 +121,7 @@ def check_orbit(found: Ephemeris) -> None:
 
 
 def week_of_toe(week: int, tow_s: float, toe_s: float) -> int:
-    """Week of `toe_s`, given `week` and `tow_s` of the transmission: toe is never half a week
+    """Week of `toe_s`, by `week` and `tow_s` of the transmission: toe is less than half a week
     away."""
     if toe_s - tow_s > HALF_WEEK_S:
         return week - 1
@@ -138,7 +139,7 @@ def ura_m(index: int) -> float | None:
 
 
 def sisa_m(index: int) -> float | None:
-    """Sigma of Galileo by index (OS SIS ICD 5.1.12, table 90): None where none is predicted."""
+    """Sigma of Galileo by index (OS SIS ICD 5.1.12, table 90); None without a prediction."""
     for first, last, base_m, step_m in (
         (0, 49, 0.0, 0.01),
         (50, 74, 0.5, 0.02),

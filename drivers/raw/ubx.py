@@ -1,4 +1,4 @@
-"""UBX-RXM-RAWX and UBX-RXM-SFRBX, little endian, out of verified frames.
+"""Parser of UBX-RXM-RAWX and UBX-RXM-SFRBX, little endian, in verified frames.
 
     RAWX   rcvTow R8 s, week U2, leapS I1, numMeas U1, recStat X1, 3 bytes; then numMeas times
            prMes R8 m, cpMes R8 cycles, doMes R4 Hz, gnssId, svId, sigId, freqId U1, locktime U2 ms,
@@ -69,7 +69,7 @@ _SUBFRAME = struct.Struct("<BBBxBxBx")
 _LEAP_KNOWN, _CLOCK_RESET = 1, 2
 _RANGE_VALID, _CARRIER_VALID, _HALF_KNOWN = 1, 2, 4
 
-# Per signal what one measurement needs: system, RINEX code, metres per second and hertz.
+# By signal: system, RINEX code, and wavelength (m).
 _BY_SIGNAL = {
     (gnss, sig): (
         SYSTEM_BY_ID[gnss],
@@ -100,13 +100,13 @@ class Sfrbx:
 
 
 def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
-    """The epoch; None where the length does not fit or the time is no number.
+    """Parse an epoch; None if the length is wrong or the time is no number.
 
-    Every measurement is counted as `measured_G`, `measured_E`, `measured_C`, or with the name of
-    another system, and again where one of the three is refused: `signal_unknown`, `prn_unknown`,
+    Every measurement is counted as `measured_G`, `measured_E`, `measured_C` or under another
+    system's name, and a refused one of the three also as `signal_unknown`, `prn_unknown`,
     `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `rate_implausible`,
-    `signal_repeated`. A carrier with half a cycle open is left out: `half_cycle_open`. A leap
-    second count that cannot be is counted as `leap_seconds_implausible` and not known.
+    `signal_repeated`. A carrier with an unresolved half cycle is left out: `half_cycle_open`. An
+    impossible leap second count is unknown: `leap_seconds_implausible`.
     """
     if len(payload) < _HEADER.size:
         return None
@@ -187,7 +187,7 @@ def _signal(
 
 
 def parse_sfrbx(payload: bytes) -> Sfrbx | None:
-    """The words of a subframe; None where the length does not fit."""
+    """Parse the words of a subframe; None if the length is wrong."""
     if len(payload) < _SUBFRAME.size:
         return None
     gnss, prn, sig, count, _version = _SUBFRAME.unpack_from(payload)

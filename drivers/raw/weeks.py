@@ -3,8 +3,8 @@
     full week = the one nearest to a reference that equals the sent count modulo its range
     UTC       = 1980-01-06 + week * 604800 s + tow - leap seconds
 
-The reference is the newest full instant that the stream gave: RXM-RAWX, a 13-bit BeiDou or 12-bit
-Galileo week (which do not roll over before 2163 and 2078), or what the caller notes from elsewhere.
+The reference is the newest full instant: from the stream's RXM-RAWX, a 13-bit BeiDou or 12-bit
+Galileo week (which do not roll over before 2163 and 2078), or from the caller.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def week_of(day: date) -> int:
 
 
 def leap_seconds(week: int, tow_s: float = 0.0) -> int:
-    """GPS time minus UTC at a GPS time, by the table; before 1999 what held then."""
+    """GPS time minus UTC at a GPS time, by the table; its first entry serves earlier times."""
     gps_s = week * WEEK_S + tow_s
     found = LEAP_SECONDS[0][1]
     for since, seconds in LEAP_SECONDS[1:]:
@@ -79,7 +79,7 @@ class WeekReference:
         self._assumed = False
 
     def note_tow(self, week: int, tow_s: float) -> None:
-        """Note an instant whose week comes from `week_of_tow`, as good as the reference."""
+        """Note an instant with a week by `week_of_tow`, which is as good as the reference."""
         self._gps_s = week * WEEK_S + tow_s
 
     def note_utc(self, t_utc_ns: int, leap_s: int | None = None) -> None:
@@ -88,7 +88,7 @@ class WeekReference:
         self.note(0, utc_s + (leap_seconds(0, utc_s) if leap_s is None else leap_s))
 
     def gps_week(self, count: int, tow_s: float) -> int:
-        """The full week of GPS's ten bits, transmitted at about `tow_s`."""
+        """Full week of GPS's ten bits, transmitted at about `tow_s`."""
         if self._gps_s is None or self._assumed:
             week = self._earliest_week + (count - self._earliest_week) % 1024
             self._gps_s, self._assumed = week * WEEK_S + tow_s, True
@@ -100,7 +100,7 @@ class WeekReference:
         return self._wide(count, 8192, BDT_WEEK, tow_s)
 
     def galileo_week(self, count: int, tow_s: float) -> int:
-        """The GPS week of Galileo's twelve bits, transmitted at about `tow_s`."""
+        """GPS week of Galileo's twelve bits, transmitted at about `tow_s`."""
         return self._wide(count, 4096, GALILEO_WEEK, tow_s) + GALILEO_WEEK
 
     def week_of_tow(self, tow_s: float) -> int | None:
@@ -110,7 +110,7 @@ class WeekReference:
         return round((self._gps_s - tow_s) / WEEK_S)
 
     def _wide(self, count: int, modulus: int, offset: int, tow_s: float) -> int:
-        """Week of a long count, which serves as the reference without a better one."""
+        """Week of a long count, which becomes the reference if there is no better one."""
         if self._gps_s is None or self._assumed:
             self.note(count + offset, tow_s)
             return count

@@ -6,10 +6,10 @@
           10  n  payload
         10+n  1  XOR of everything before
 
-There is no terminator and `$` may occur inside a payload. Numbers with a sign are sign and
-magnitude. Public copies of the interface agree on
-the above; where they disagree (sign bits of H and xi, the wait of FKXX flag 4, the fraction of T)
-the reading is tolerant and says so at its place.
+There is no terminator, and `$` may occur inside a payload. Signed numbers are sign and magnitude.
+Public copies of the interface agree on the above. They disagree on the sign bits of H and xi, the
+wait of FKXX flag 4, and the fraction of T: there the decoder accepts all readings, see the
+comments.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _text_kind(payload: bytes, code: bool) -> TextEncoding:
 
 
 def _odd_digits(bits: int, text: bytes, encoding: TextEncoding) -> bool:
-    """True if a code ends with half a byte. FieldError where the length is not the text's."""
+    """True if a code ends with half a byte. FieldError if the stated length is not the text's."""
     if (bits + 7) // 8 != len(text):
         raise FieldError(f"{bits} bits of text in {len(text)} bytes")
     return encoding == "code" and 0 < bits % 8 <= 4
@@ -202,8 +202,8 @@ def _clock(user: int, p: bytes) -> Message:
 
 
 def _wait_s(extra: bytes) -> float | None:
-    """Flag 4: public code holds five encodings of the wait. One non-zero byte is that many
-    seconds, wherever it stands; else big-endian. None: no wait stated.
+    """Wait (s) of flag 4, of which public code has five encodings: a single non-zero byte is the
+    number of seconds, wherever it stands; otherwise big-endian. None: no wait stated.
     """
     nonzero = [b for b in extra if b]
     if not nonzero:
@@ -232,8 +232,8 @@ def _fix(user: int, p: bytes) -> Message:
     if high:
         height, anomaly = int.from_bytes(p[16:19], "big"), 0
     else:
-        # Sign of H: bit 15 in the wording, bit 14 in public code; of xi: bit 15, 14 or 8. Any of
-        # them is read as minus: safe while |H| <= 16383 m and |xi| <= 255 m.
+        # Sign of H: bit 15 in the text, bit 14 in public code; of xi: bit 15, 14 or 8. Any of them
+        # is read as minus, which is safe for |H| <= 16383 m and |xi| <= 255 m.
         raw_h, raw_xi = struct.unpack(">HH", p[16:20])
         height = -(raw_h & 0x3FFF) if raw_h & 0xC000 else raw_h
         anomaly = -(raw_xi & 0xFF) if raw_xi & 0xC100 else raw_xi & 0xFF
@@ -278,7 +278,7 @@ _DECODE: dict[str, Callable[[int, bytes], Message]] = {
 
 
 class Decoder(FrameDecoder):
-    """Bytes in, messages out, both directions. Buffers at most one frame.
+    """Decoder of bytes into messages, of both directions. Buffers at most one frame.
 
     Counters: `frames`, `unknown` (well-formed, not read here), `bad_checksum`, `bad_length`,
     `bad_name`, `bad_field` (good checksum, impossible value), `other_family` (a text sentence),

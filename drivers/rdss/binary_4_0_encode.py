@@ -1,4 +1,4 @@
-"""RDSS terminal interface, family 4.0: messages to frames. The format stands in `binary_4_0`."""
+"""RDSS terminal interface, family 4.0: messages to frames. `binary_4_0` describes the format."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ MAX_ORDINARY_ANTENNA_M = 400.0
 
 
 def frame(name: str, user: int, payload: bytes) -> bytes:
-    """A whole frame around a payload. EncodeError for a name that must never be sent."""
+    """Make a frame of a payload. EncodeError for a name that must never be sent."""
     if name in FORBIDDEN:
         raise EncodeError(f"{name} is never sent")
     if len(name) != 4 or not (name.isascii() and name.isalpha() and name.isupper()):

@@ -1,6 +1,6 @@
 """Actions of an RDSS terminal's states at their deadlines: reads, requests, messages.
 
-The states are those of `drivers.rdss.request_state_machine`, and all that is sent is sent here.
+`drivers.rdss.request_state_machine` describes the states. Only this module sends.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _BLOCKED_POLLS: tuple[Callable[[int], Request], ...] = (SelfTestRequest, BeamPow
 
 
 class DeadlineActions:
-    """Deadlines of one terminal. Its counters are those of `Terminal`."""
+    """Actions of one terminal. Its counters are those of `Terminal`."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class DeadlineActions:
         self._session.deadline_ns = t_ns + POLL_NS
 
     def _due_beams(self, t_ns: int, actions: list[Action]) -> None:
-        """CHECKING and NO_BEAM: read the beams until they allow a request."""
+        """In CHECKING and NO_BEAM, read the beams until they allow a request."""
         session = self._session
         if session.beam_reads >= BEAM_ATTEMPTS:
             self.counters["beams_unknown"] += 1
@@ -138,7 +138,7 @@ class DeadlineActions:
         self._session.enter(State.READY, None)
 
     def _due_blocked(self, t_ns: int, actions: list[Action]) -> None:
-        """HOLDING, SUPPRESSED and SILENT: reads only, until the hold is over if it has an end."""
+        """In HOLDING, SUPPRESSED and SILENT, only read until the hold is over, if it has an end."""
         session = self._session
         until = session.blocked_until_ns
         if until is not None and t_ns >= until:
@@ -173,7 +173,7 @@ class DeadlineActions:
     def _send(
         self, message: Outgoing, user: int, family: Family, t_ns: int, actions: list[Action]
     ) -> bool:
-        """Write a message; False if it cannot be sent from this card, which is its end."""
+        """Write a message; False, and the message ends, if this card cannot send it."""
         session = self._session
         wording = session.outbox.wording(message)
         if wording is None:

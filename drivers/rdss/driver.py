@@ -1,8 +1,8 @@
 """Driver of a BeiDou RDSS user terminal on a serial line, family 4.0 or 2.1.
 
-Ties the codecs and the request cycle to a `SerialLine`. Emits `DelayedFix` for every own fix,
-`TimeReport` for the terminal's clock, `Mail` for short messages and other cards' places,
-`DeviceEvent` for what an operator should know.
+It connects the codecs and the request cycle to a `SerialLine`, and emits `DelayedFix` for every own
+fix, `TimeReport` for the terminal's clock, `Mail` for short messages and other cards' places, and
+`DeviceEvent` for the operator.
 """
 
 from __future__ import annotations
@@ -94,14 +94,15 @@ class RdssOptions(DriverOptions):
 
 
 def _utc_ns(clock: DeviceClock) -> int:
-    """POSIX ns of a device clock taken as UTC; a leap second repeats the count of the last."""
+    """POSIX ns of a device's clock, taken as UTC; a leap second repeats the previous second's
+    count."""
     time_of_day_s = clock.time_of_day_s - (clock.time_of_day_s >= 86400)
     midnight = calendar.timegm((clock.year, clock.month, clock.day, 0, 0, 0))
     return midnight * SECOND + round(time_of_day_s * SECOND)
 
 
 class RdssDriver:
-    """See the module. `counters` joins the line's, the codec's and the request cycle's."""
+    """Driver of a terminal. `counters` joins those of line, codec and request cycle."""
 
     Options: ClassVar[type[DriverOptions]] = RdssOptions
 
@@ -166,16 +167,16 @@ class RdssDriver:
     def height_hint(
         self, height_m: float, sd_m: float, t_ns: int, centre_sd_m: float | None = None
     ) -> None:
-        """Set the ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one
-        sigma; `centre_sd_m` is that of the centre's own height, if known."""
+        """Set the antenna's ellipsoidal height by the solution at `t_ns`, with one sigma;
+        `centre_sd_m` is the sigma of the centre's own height, if known."""
         self._terminal.height.hint(height_m, sd_m, t_ns, centre_sd_m)
 
     def pressure_hint(self, pressure_pa: float, t_ns: int) -> None:
-        """Pressure of the vehicle's own barometer."""
+        """Set the pressure of the vehicle's own barometer."""
         self._terminal.height.pressure(pressure_pa, t_ns)
 
     def request_now(self, t_ns: int) -> str:
-        """Ask for a fix as soon as the card's spacing allows; when, or why not, in words."""
+        """Request a fix as soon as the card's spacing allows; return when, or why not, in words."""
         text = self._terminal.request_now(t_ns).text
         self._wake.set()
         return text
@@ -191,7 +192,7 @@ class RdssDriver:
         self._posted(t_ns)
 
     def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
-        """Queue a position report, in place of one that waits. Raises `MessageRefusedError`."""
+        """Queue a position report, in place of a waiting one. Raises `MessageRefusedError`."""
         self._terminal.post_report(key, receiver, report, t_ns)
         self._posted(t_ns)
 
@@ -290,7 +291,8 @@ class RdssDriver:
         self._say_status()
 
     def _say_status(self) -> None:
-        """Set `silent` once every baud rate has been probed in vain, or replies have ended."""
+        """Set the state to `silent` once every baud rate was probed without a reply, or replies
+        have ended."""
         state: State = "starting"
         absent = self._line.detail or self._why_closed
         if not self._open:
@@ -314,7 +316,7 @@ class RdssDriver:
     # ------------------------------------------------------------------ messages and actions
 
     def _decoder(self, family: Family) -> Decoder:
-        """Codecs that only guess keep their counters to themselves."""
+        """Decoder of a family; until the family is known, its counters are not published."""
         counters = self.counters if len(self._families) == 1 else None
         return binary_4_0.Decoder(counters) if family == "4.0" else text_2_1.Decoder(counters)
 
@@ -357,7 +359,7 @@ class RdssDriver:
         self.report_stages(t_ns)
 
     def _listen(self) -> None:
-        """Start afresh for every family that may speak: what came before means nothing now."""
+        """Restart the decoders of all families, and forget earlier input."""
         self._decoders = {family: self._decoder(family) for family in self._families}
         self._overdue_ns = None
 
@@ -380,8 +382,8 @@ class RdssDriver:
         )
 
     def _report_time(self, clock: DeviceClock, t_ns: int) -> None:
-        """SJXX names no zone and no lock: its report is never trusted. BDZDA prints UTC, as NMEA
-        0183 ZDA does, and is trusted while it says that it is locked."""
+        """Report the terminal's time. SJXX states neither zone nor lock, so it is never trusted.
+        BDZDA has UTC, like ZDA of NMEA 0183, and is trusted while it states a lock."""
         self.counters["time_reports"] += 1
         self._emit(TimeReport(self.name, t_ns, _utc_ns(clock), trusted=clock.locked is True))
 

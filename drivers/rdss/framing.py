@@ -1,7 +1,7 @@
-"""Framing of both wire families: how frames are found in a stream, and their checksum.
+"""Framing of both families: search for frames in a stream, and their checksum.
 
-A frame begins with `$`, which may also occur inside one, so every failure advances one byte and
-looks for the next `$`: a good frame is found whatever stands before it.
+A frame begins with `$`, which may also occur inside a frame. So after a failure the search
+continues one byte further with the next `$`: it finds a good frame whatever precedes it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def encode_frame(say: Callable[[Message], bytes], message: Message) -> bytes:
 
 
 class FrameDecoder(ABC):
-    """Bytes in, messages out, both directions. Buffers at most one frame.
+    """Decoder of bytes into messages, of both directions. Buffers at most one frame.
 
     Counters: `frames`, `unknown` (well-formed, not read here), `bad_field` (good checksum,
     impossible value), `abandoned` (frame whose rest never came), `garbage_bytes`, and the faults
@@ -93,7 +93,7 @@ class FrameDecoder(ABC):
         return messages
 
     def _judge(self, read: Callable[[], Message | None] | None, unknown: Unknown) -> Message | None:
-        """Message of a verified frame, counted; `unknown` where nobody reads it."""
+        """Message of a verified frame, counted; `unknown` for an unsupported kind."""
         try:
             message = read() if read is not None else None
         except ValueError:
@@ -104,9 +104,9 @@ class FrameDecoder(ABC):
 
     @abstractmethod
     def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
-        """Length of the frame whose `$` stands at `at`, and the name of its fault or "".
+        """Length of the frame at `at`, and the name of its fault or "".
 
-        While the length is unknown, the greatest number of bytes that determines it.
+        While the length is unknown, the largest number of bytes needed to find it.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Received short messages: their senders, their contents and the receipts that they request."""
+"""Received short messages: senders, contents, and requested receipts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Seen = tuple[int, int, int]
 
 
 class Inbox:
-    """Inbox; it passes on all messages, damaged ones too. `seen` are the texts that requested a
+    """Inbox, which passes on all messages, even damaged ones. `seen` has the texts that requested a
     receipt, to recognise repetitions."""
 
     def __init__(self, session: RequestCycleState) -> None:
@@ -94,7 +94,7 @@ class Inbox:
         )
 
     def place(self, fix: Fix, t_ns: int) -> MailReady | None:
-        """Position of another card by the centre; None for a fix that names no other."""
+        """Position of another card by the centre; None for a fix of this card."""
         own = self._session.identity
         card = fix.queried or fix.user
         if fix.kind == "own" or own is None or card in (0, own.user):
@@ -113,7 +113,7 @@ class Inbox:
         )
 
     def _asks(self, sender: int, receipted: Receipt, t_ns: int) -> bool:
-        """Queue the receipt for a text; whether the text came before."""
+        """Queue the receipt for a text; true if the text came before."""
         session = self._session
         if session.options.transmit:
             session.outbox.post_receipt(sender, receipted, t_ns)
@@ -129,7 +129,7 @@ class Inbox:
 
 
 def _opened(wording: EncodedText) -> tuple[Envelope | None, Fault]:
-    """Envelope, or the name of its fault."""
+    """Decoded envelope, or the name of its fault."""
     try:
         return envelope_from_text(wording), ""
     except EnvelopeLengthError:

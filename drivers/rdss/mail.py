@@ -1,6 +1,6 @@
-"""Short messages of an RDSS driver: those received, and the state of those sent.
+"""Mail of an RDSS driver: received short messages, and stages of sent ones.
 
-It stands by itself: a daemon without a terminal loads no more than this.
+A separate module, since a daemon without a terminal loads only this one.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ bytes."""
 
 @immutable()
 class MessageReceived:
-    """A short message that the terminal has received.
+    """Short message that the terminal has received.
 
-    `text` is None for other bytes. `minute_of_day` is the centre's, in the terminal's zone.
-    `report` is the position report that it holds, `repeated` says that it came before.
+    `text` is None for bytes that are no text. `minute_of_day` is the centre's, in the terminal's
+    zone. `report` is the position report in the message; `repeated`: the message came before.
     """
 
     source: str
@@ -72,7 +72,8 @@ class MessageReceived:
 
 @immutable()
 class MessageStage:
-    """Stage of a sent message: `key` is the sender's name for it, `why` the reason as text."""
+    """Stage of a sent message: `key` is the sender's name for the message, `why` the reason as
+    text."""
 
     source: str
     t_seen_ns: int
@@ -94,7 +95,7 @@ class MessageStage:
 
 @immutable()
 class FleetFix:
-    """Position of another card by the centre, queried or reported.
+    """Position of another card from the centre, queried or reported.
 
     Degrees, metres; `time_of_day_s` in the terminal's zone, without a date.
     """
@@ -110,7 +111,7 @@ class FleetFix:
 
 
 class MessageRefusedError(ValueError):
-    """A message that cannot be queued; the text says why, `counter` names it."""
+    """Error: a message cannot be queued; the text is the reason, `counter` its counter."""
 
     def __init__(self, counter: str, text: str) -> None:
         super().__init__(text)

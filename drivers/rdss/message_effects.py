@@ -1,7 +1,8 @@
-"""Effect of each message from the terminal on the request cycle.
+"""Effects of the terminal's messages on the request cycle.
 
-Refusals lead where the table `REFUSALS` says; suppression, silence, a low battery and a missing
-card count whenever they are told. A fix counts once, for the last request written.
+The table `REFUSALS` has the consequence of each refusal. Suppression, silence, a low battery and a
+missing card take effect whenever reported. A fix belongs to the last request written, and counts
+once.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from drivers.rdss.state_tables import (
 
 
 class MessageEffects:
-    """Effect of messages on a `RequestCycleState`; the counters are listed at `Terminal`."""
+    """Changes of a `RequestCycleState` by messages; `Terminal` lists the counters."""
 
     def __init__(self, session: RequestCycleState) -> None:
         self._session = session
@@ -57,7 +58,7 @@ class MessageEffects:
         self._refused: Counter[Outcome] = Counter()
 
     def take(self, message: Message, t_ns: int, family: Family) -> list[Action]:
-        """A message that the codec of `family` decoded."""
+        """Process a message that the codec of `family` decoded."""
         actions: list[Action] = []
         session = self._session
         if isinstance(message, Unknown) or session.state is State.CLOSED:
@@ -154,7 +155,7 @@ class MessageEffects:
         if test.faults != self._faults:
             self._faults = test.faults
             actions.append(Notice("rdss_self_test", f"faults: {', '.join(test.faults) or 'none'}"))
-        if any(test.levels):  # all zero: not filled in, or no beam, which the next GLZK says
+        if any(test.levels):  # all zero: not filled in, or no beam; the next GLZK decides
             said = self._session.beams_said or BeamPower(())
             self._session.beams_said = replace(said, levels=test.levels)
             self._on_levels(test.levels, t_ns, actions)
@@ -173,7 +174,7 @@ class MessageEffects:
         elif feedback.command not in POSITION_COMMANDS or session.state not in IN_FLIGHT:
             session.counters["feedback_unmatched"] += 1
             if outcome is Outcome.OK and feedback.command in INBOUND_COMMANDS:
-                # Somebody else's message or request left the antenna: it uses up the spacing.
+                # Another program's message or request was transmitted, so the spacing starts again.
                 session.pace.wait(t_ns, None)
         elif outcome is Outcome.OK:
             session.counters["accepted"] += 1
@@ -185,7 +186,7 @@ class MessageEffects:
             self._on_refusal(feedback, t_ns, actions)
 
     def _on_message(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> bool:
-        """True if a feedback concerns a message of ours; applies its effect."""
+        """Apply the feedback on a message of ours; False if it is not."""
         session = self._session
         awaited = session.state is State.AWAIT_MESSAGE
         outcome = feedback.outcome
@@ -231,7 +232,7 @@ class MessageEffects:
             session.hold(t_ns, refusal.text)
 
     def _forget_refused(self) -> None:
-        """Forget a request that was refused before acceptance, which will have no fix."""
+        """Forget a request that was refused before acceptance, and so brings no fix."""
         if self._session.state is State.AWAIT_FEEDBACK:
             self._session.answerable = False
 

@@ -1,8 +1,8 @@
 """Messages between RDSS terminal and host, for both wire families.
 
 Both codecs (`binary_4_0`, `text_2_1`) decode to these classes and encode from them, in both
-directions. `user` is the card number in the frame's address field, 0 where the frame has none or
-means "this terminal". A field that one family does not carry has a default.
+directions. `user` is the card number in the frame's address field, 0 without one or for "this
+terminal". A field that one family lacks has a default.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class TextRequest:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """ICXX frame 0, BDICI: the card. `user` 0 says that there is none."""
+    """ICXX frame 0, BDICI: the card. `user` 0: no card."""
 
     user: int
     service_frequency_s: int
@@ -178,7 +178,8 @@ class BeamPower:
 
     @property
     def serving(self) -> int | None:
-        """The beam that answers, from 1: the one that the terminal names, else the strongest."""
+        """Number of the serving beam, from 1: the one that the terminal names, else the
+        strongest."""
         if self.response_beam:
             return self.response_beam
         best = max(self.levels, default=0)
@@ -256,9 +257,9 @@ class Outcome(StrEnum):
 class Feedback:
     """FKXX, BDFKI. `command` as printed ("DWSQ", "DWA"), None where the frame names none.
 
-    `wait_s` is the stated remaining wait; `code` the flag or reason as sent. `inhibited` is what
-    BDFKI says of transmission (suppression, silence, battery), None where it says nothing.
-    `time_of_day_s` is set in, and only in, the BDS-3 form of BDFKI.
+    `wait_s` is the stated remaining wait; `code` the flag or reason as sent. `inhibited` is BDFKI's
+    state of transmission (suppression, silence, battery), None without one. Only the BDS-3 form of
+    BDFKI has `time_of_day_s`.
     """
 
     outcome: Outcome
@@ -301,7 +302,7 @@ class Fix:
 class Text:
     """TXXX, BDTXR: a short message received; `minute_of_day` as printed, `odd` as in TextRequest.
 
-    `user` is whom it is for, 0 where the frame does not say (2.1).
+    `user` is the receiver, 0 if the frame does not name it (2.1).
     """
 
     sender: int
@@ -339,23 +340,23 @@ Message = Request | Reply | Unknown
 
 
 class Decoder(Protocol):
-    """A codec's receiving side: bytes in, messages out; never raises for what the bytes are."""
+    """Receiving side of a codec: bytes to messages. No bytes make it raise."""
 
     counters: Counter[str]
 
     @property
     def awaited_bytes(self) -> int:
-        """Largest length of the incomplete frame, 0 for none."""
+        """Largest possible length of the incomplete frame, 0 for none."""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Feed received bytes; the complete messages."""
+        """Add received bytes; return the messages that they complete."""
 
     def expire(self) -> list[Message]:
-        """Give up the overdue frame and search behind its `$`."""
+        """Give up the overdue frame, and search behind its `$`."""
 
 
 def ascii_name(raw: bytes) -> str:
-    """A frame name already known to be ASCII letters."""
+    """Frame name, already checked to be ASCII letters."""
     return raw.decode("ascii")
 
 

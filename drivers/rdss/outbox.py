@@ -1,8 +1,8 @@
-"""Messages on their way out: their order, attempts, receipts and ends. No I/O and no clock.
+"""Queue of messages to send: order, attempts, receipts and ends. No I/O and no clock.
 
-Every message ends with a stage of `mail.Stage`; each change is handed over. What blocks a terminal
-(no beam, suppression, a low battery, the card's spacing) is no attempt: the message waits, until it
-expires. Receipts go first, then texts, then reports, of which the latest counts.
+Every message ends in a stage of `mail.Stage`, and each change of stage is reported. While the
+terminal is blocked (no beam, suppression, a low battery, the card's spacing) a message waits until
+it expires, without an attempt. Receipts are sent first, then texts, then the latest report.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ BLOCKED = frozenset(
 class Outgoing:
     """Outgoing message. `wordings` in order of preference: the first that the card allows is sent.
 
-    `receipted` is what its receipt will name, None where it asks for none. Instants are monotonic
-    ns; `stage` is `queued`, or `sent` while the receipt is awaited.
+    `receipted` is the contents of the awaited receipt, None if none is requested. Instants are
+    monotonic ns; `stage` is `queued`, or `sent` while it waits for the receipt.
     """
 
     key: str
@@ -78,7 +78,7 @@ class Outgoing:
 
 @dataclass(slots=True)
 class StageChange:
-    """A message's change of stage, or its return to the queue, as it was then."""
+    """Change of a message's stage, or its return to the queue, with the message at that time."""
 
     message: Outgoing
     stage: Stage
@@ -87,7 +87,8 @@ class StageChange:
 
 @dataclass(slots=True)
 class Outbox:
-    """See the module. `changes` are those that nobody has taken yet; `number` the last given."""
+    """Queue of messages: see the module. `changes` has the changes not yet taken, `number` the last
+    number used."""
 
     counters: Counter[str]
     expiry_ns: int
@@ -118,7 +119,7 @@ class Outbox:
         self._queue(Outgoing(key, receiver, "text", (wording,), t_ns, text, receipted))
 
     def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
-        """Queue a report in place of one that waits. Raises `MessageRefusedError`."""
+        """Queue a report in place of a waiting one. Raises `MessageRefusedError`."""
         try:
             full = encode_envelope(REPORT, encode_report(report))
             short = encode_envelope(SHORT_REPORT, encode_short(report))
@@ -132,7 +133,7 @@ class Outbox:
         self._queue(Outgoing(key, receiver, "report", wordings, t_ns))
 
     def post_receipt(self, receiver: int, receipted: Receipt, t_ns: int) -> None:
-        """Queue the receipt for a message that came; the same one again waits once."""
+        """Queue the receipt for a received message, unless the same receipt waits already."""
         key = f"receipt-{receiver}-{receipted.number}-{receipted.crc:04x}"
         if any(m.key == key for m in self.waiting):
             self.counters["receipt_waiting"] += 1
@@ -183,13 +184,13 @@ class Outbox:
     # ------------------------------------------------------------------ sending
 
     def next(self, t_ns: int) -> Outgoing | None:
-        """Next message in turn."""
+        """Message to send next."""
         due = [m for m in self.waiting if m.stage == "queued" and m.not_before_ns <= t_ns]
         return min(due, key=lambda m: (RANKS[m.kind], m.attempts > 0, m.created_ns), default=None)
 
     @property
     def next_ns(self) -> int | None:
-        """Next instant of work: a message, a receipt that did not come, an end."""
+        """Next instant of work: a message to send, a missing receipt, an expiry."""
         return min((min(m.not_before_ns, self._end_ns(m)) for m in self.waiting), default=None)
 
     def wording(self, message: Outgoing) -> EncodedText | None:
@@ -271,7 +272,7 @@ class Outbox:
         """End expired messages, and requeue those without a receipt."""
         for message in [m for m in self.waiting if m is not self.in_flight]:
             if t_ns >= self._end_ns(message):
-                # Written before: it may have left, or arrived.
+                # It was written before, so it may have been transmitted or have arrived.
                 stage: Stage = "unconfirmed" if message.attempts else "expired"
                 self._end(message, stage, f"its time is over; {message.why or 'never sent'}")
             elif message.stage == "sent" and t_ns >= message.not_before_ns:
@@ -311,8 +312,8 @@ class StrideScheduler:
     """Order of fixes and messages while both wait: messages get `share` of the turns.
 
     Stride scheduling (Waldspurger and Weihl, MIT/LCS/TM-528, 1995): each turn costs its class the
-    inverse of its share, and the class that has spent less goes next. Who does not want turns does
-    not save them up.
+    inverse of its share, and the class that has spent less goes next. An idle class does not save
+    up turns.
     """
 
     def __init__(self, share: float) -> None:
@@ -321,11 +322,11 @@ class StrideScheduler:
 
     @property
     def message_first(self) -> bool:
-        """True if the message goes first; at equal cost the fix does."""
+        """True if the message goes first; at equal cost the fix goes first."""
         return self._spent["message"] < self._spent["fix"]
 
     def took(self, message: bool, other_waits: bool) -> None:
-        """A turn was used."""
+        """Charge a turn to its class."""
         mine, other = ("message", "fix") if message else ("fix", "message")
         if not other_waits:
             self._spent[other] = max(self._spent[other], self._spent[mine])

@@ -1,7 +1,7 @@
 """Permission to transmit: the card's spacing, suppression, radio silence.
 
-Suppression (by the system) and silence (by the operator) are never lifted from here; what lifts
-them is noticed here.
+This module never lifts suppression (by the system) or silence (by the operator); it only notes that
+they were lifted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drivers.rdss.state_tables import (
 
 
 class TransmitPermit:
-    """`silent`, and `suppressed_until_ns`: None, or the end of the hold if nobody lifts it."""
+    """Permission: `silent`, and `suppressed_until_ns`, the latest end of a suppression, or None."""
 
     def __init__(self, hold_s: float) -> None:
         self.silent = False
@@ -34,7 +34,8 @@ class TransmitPermit:
         return not self.silent and self.suppressed_until_ns is None
 
     def grant(self) -> None:
-        """Lift the suppression: by its authority, after the hold time, or for another card."""
+        """Note the end of a suppression: by its authority, after the hold time, or with another
+        card."""
         self.silent, self.suppressed_until_ns = False, None
 
     def suppress(self, t_ns: int) -> bool:
@@ -52,7 +53,7 @@ class TransmitPermit:
         return news
 
     def accepted(self) -> None:
-        """A request was accepted: the inbound state last read is that of a free terminal."""
+        """Note an accepted request: the inbound state last read is that of a free terminal."""
         self._inbound_free = self._inbound
 
     def lifted_by_feedback(self, feedback: Feedback, t_ns: int, written_ns: int | None) -> bool:
@@ -71,10 +72,10 @@ class TransmitPermit:
         return feedback.inhibited is False
 
     def lifted_by_self_test(self, inbound_state: int | None) -> bool:
-        """True if ZJXX says so.
+        """True if ZJXX shows that transmission is allowed again.
 
-        The bits of its inbound state differ by vendor. Back to the value it had while requests were
-        accepted, after another one, means the same everywhere."""
+        The bits of its inbound state differ by vendor. With every vendor, a return to the value
+        that it had while requests were accepted means that transmission is allowed."""
         self._inbound = inbound_state
         if self.granted or self._inbound_free is None:
             return False
@@ -85,13 +86,13 @@ class TransmitPermit:
 
 
 class TransmissionSpacing:
-    """The spacing of transmissions, requests and messages alike: the card's service frequency, from
-    the last byte of the one before.
+    """Spacing of transmissions, requests and messages alike: the card's service interval after the
+    last byte of the previous one.
 
-    `service_s` is the card's (None: not read yet), `requested_ns` when the last request for a fix
-    was written, `written_ns` when the last transmission of any kind. `asap` waives the wanted
-    interval of fixes once, never the card's. The margin is small, and grows when the terminal
-    finds a transmission too early.
+    `service_s` is the card's interval (None: not read yet). `requested_ns` and `written_ns` are the
+    instants at which the last request for a fix, and the last transmission of any kind, were
+    written. `asap` waives the configured interval of fixes once, never the card's. A small margin
+    is added; it grows when the terminal refuses a transmission as too early.
     """
 
     def __init__(self, interval_s: float | None) -> None:
@@ -124,7 +125,7 @@ class TransmissionSpacing:
         return max(self.free_ns, self.requested_ns + self._interval_ns)
 
     def written(self, t_ns: int, size: int, baud: int, *, fix: bool) -> None:
-        """Note that a transmission of so many bytes was written."""
+        """Note that a transmission of a number of bytes was written."""
         self.written_ns = t_ns
         self._wire_ns = size * BITS_A_BYTE * SECOND // baud
         if fix:
@@ -137,15 +138,15 @@ class TransmissionSpacing:
     def too_early(self, t_ns: int, stated_s: float | None) -> None:
         """Wait and increase the margin after a refusal for the spacing.
 
-        Not where seconds are left to wait: then somebody else has used the card.
+        The margin stays if seconds are left to wait: then another program has used the card.
         """
         if stated_s is None or stated_s <= 1.0:
             self.margin_ns = min(2 * self.margin_ns, MOST_MARGIN_NS)
         self.wait(t_ns, stated_s)
 
     def wait(self, t_ns: int, stated_s: float | None) -> None:
-        """Wait the stated whole seconds and one more. An absent or implausible wait, above twice
-        the service interval, is the service interval (PROTOCOLS 1.2)."""
+        """Wait one second more than stated. A missing or implausible wait (above twice the service
+        interval) is taken as the service interval (PROTOCOLS 1.2)."""
         service = self.service_s or DEFAULT_SERVICE_S
         wait_s = stated_s if stated_s is not None and stated_s <= 2 * service else service
         self.not_before(t_ns + int(wait_s * SECOND) + WAIT_MARGIN_NS)

@@ -11,12 +11,13 @@
     20  2  speed, 0.01 m/s
     22  2  course, 360 deg / 2^16
 
-All big-endian. The full one has 4.7 mm of latitude and 9.3 mm of longitude, 4 ms of time; the short
-one, for a card of level 1, 1.2 m, 2.4 m and 1 s, without date, height and velocity.
+All numbers are big-endian. The full report resolves 4.7 mm of latitude, 9.3 mm of longitude and 4
+ms. The short one, for a card of level 1, resolves 1.2 m, 2.4 m and 1 s, without date, height and
+velocity.
 
-A sigma is a power: the k-th of the full report 0.01 m 2^(k/12) (to 22 km, by 6 %), of the short one
-1 m 2^k (to 8 km). It is rounded up, so that no report claims more than its solution; the last
-step means unknown. Height, speed and course are unknown with all bits of their field set.
+A sigma is sent as the exponent k: 0.01 m 2^(k/12) in the full report (to 22 km, in steps of 6 %), 1
+m 2^k in the short one (to 8 km). It is rounded up, so that no report claims more than its solution;
+the last step means unknown. Height, speed and course are unknown with all bits of their field set.
 """
 
 from __future__ import annotations
@@ -150,7 +151,7 @@ def _clipped(steps: float, greatest: int) -> int:
 
 
 def _course(course_deg: float) -> int:
-    """Encode a course: 360 deg less half a step is north, and the last step means unknown."""
+    """Encode a course: within half a step of 360 deg it is 0, since the last step means unknown."""
     step = round(course_deg / 360.0 * 2**16) % 2**16
     return step if step != UNKNOWN_16 else 0
 
@@ -158,7 +159,7 @@ def _course(course_deg: float) -> int:
 def _sigma_step(sd_m: float | None, least_m: float, an_octave: int, steps: int) -> int:
     if sd_m is None or not sd_m >= 0.0:
         return steps
-    # A step that was read must give itself again.
+    # A decoded step must encode to itself.
     k = math.ceil(an_octave * math.log2(max(sd_m / least_m, 1.0)) - 1e-9)
     return min(k, steps)
 

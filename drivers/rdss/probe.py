@@ -1,4 +1,4 @@
-"""Finding a terminal: which baud rate, which family."""
+"""Search for a terminal's baud rate and family."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ENCODE: dict[Family, Callable[[Message], bytes]] = {
 class Probe:
     """Probe of baud rates, each with a request for the card in every family: harmless reads only.
 
-    `in_vain` after a whole round without an answer; it goes on all the same.
+    `in_vain` is true after a round without a reply; probing continues.
     """
 
     def __init__(self, bauds: tuple[int, ...], families: tuple[Family, ...]) -> None:
@@ -36,11 +36,11 @@ class Probe:
         return self._asked > len(self._bauds)
 
     def restart(self) -> None:
-        """Begin with the rate that was last in use."""
+        """Restart with the rate that was last in use."""
         self._asked = 0
 
     def next(self) -> list[Action]:
-        """Request at this rate, or after a request at the next one."""
+        """Next request: each family at this rate, then the next rate."""
         actions: list[Action] = []
         if self._asked:
             self._at = (self._at + 1) % len(self._bauds)

@@ -59,12 +59,12 @@ class RequestCycleState:
 
     @property
     def answered(self) -> bool:
-        """A terminal with a known family is on the line."""
+        """True if a terminal of a known family has replied."""
         return self.state not in OFFLINE
 
     @property
     def beams(self) -> str:
-        """The beams in words."""
+        """Beams in words."""
         return f"strongest level {max(self.levels)}" if self.levels else "beam levels unknown"
 
     @property
@@ -78,10 +78,10 @@ class RequestCycleState:
             case _:
                 return None
 
-    # ------------------------------------------------------------------ moves
+    # ------------------------------------------------------------------ transitions
 
     def enter(self, state: State, deadline_ns: int | None) -> None:
-        """Be in `state`, with something to do at `deadline_ns`."""
+        """Enter `state`, with the next action at `deadline_ns`."""
         self.state = state
         self.deadline_ns = deadline_ns
 
@@ -91,7 +91,7 @@ class RequestCycleState:
         self.enter(State.PROBING, t_ns)
 
     def proceed(self, t_ns: int) -> None:
-        """Continue with the card known and nothing in flight: to the next request, or to a wait."""
+        """Continue to the next request or wait; the card is known and nothing is in flight."""
         if self.permit.silent:
             self.enter(State.SILENT, t_ns)
         elif not self.permit.granted:
@@ -101,13 +101,13 @@ class RequestCycleState:
             self.enter(State.CHECKING, t_ns)
 
     def hold(self, t_ns: int, why: str) -> None:
-        """No request for a while."""
+        """Send no request for a while."""
         self.hold_why, self.hold_until_ns = why, t_ns + HOLD_NS
         self.enter(State.HOLDING, t_ns)
 
     def abandon(self) -> None:
-        """Stop waiting for the request in flight, whose delayed reply the next one avoids, or for
-        the feedback on a message."""
+        """Stop waiting for the request in flight or for the feedback on a message. The next request
+        waits, to avoid a delayed reply."""
         if self.state is State.AWAIT_MESSAGE:
             self.outbox.unanswered()
         if self.state in IN_FLIGHT and self.pace.requested_ns is not None:

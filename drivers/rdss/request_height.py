@@ -14,11 +14,11 @@ limit of 20 bits of 0.1 Pa; 4 % above the highest mean pressure at any shore."""
 
 
 class HeightSource:
-    """Height for a request: the solution's while fresh and better than the centre's, else the
-    configured one, else the pressure of the vehicle's barometer, else none: the centre then uses
-    its terrain model and the antenna's height above the ground.
+    """Source of the height in a request: the solution while it is fresh and better than the
+    centre's, else the configured height, else the pressure of the vehicle's barometer, else none.
+    Without one the centre uses its terrain model and the antenna's height above the ground.
 
-    `given_sd_m` is the sigma of the height of the last request, None where it is not known.
+    `given_sd_m` is the sigma of the last request's height, None if unknown.
     """
 
     def __init__(self, options: TerminalOptions) -> None:
@@ -40,7 +40,7 @@ class HeightSource:
         self._pressure = pressure_pa, t_ns
 
     def request(self, user: int, t_ns: int) -> PositionRequest:
-        """A single, ordinary request."""
+        """Make a single, ordinary request."""
         height, self.given_sd_m = self._options.height_m, None
         if self._options.use_solution_height and self._hint is not None:
             hint, sd, at = self._hint
@@ -57,7 +57,8 @@ class HeightSource:
         return PositionRequest(user, HeightMode.NONE, antenna_height_m=antenna)
 
     def _by_pressure(self, user: int, pressure_pa: float, antenna_m: float) -> PositionRequest:
-        """No sensor measures the temperature; the standard atmosphere's here is used."""
+        """Request with the pressure; the temperature is the standard atmosphere's, as no sensor
+        measures it."""
         temperature_c = T0_K - LAPSE_K_M * pressure_height_m(pressure_pa) - ZERO_CELSIUS_K
         return PositionRequest(
             user,

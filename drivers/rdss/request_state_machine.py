@@ -10,11 +10,10 @@ the actions they return, and `next_deadline_ns`, when to call `tick` next. Only 
                  ▼              ▼                              ▼
               NO_CARD        NO_BEAM            NO_BEAM, HOLDING, SUPPRESSED, SILENT, READY
 
-What is never sent: a lift of radio silence, an emergency request; a request or a message while
-another is in flight, earlier than the card's service frequency after the one before, while the
-terminal has said that it is suppressed or silent, or at all without the option `transmit`. Where a
-request and a message both wait, `outbox.StrideScheduler` says which goes.
-Figures: PROTOCOLS 1.1 and 1.5.
+Never sent are a lift of radio silence and an emergency request. A request or a message is not sent
+while another is in flight, before the card's service interval has passed since the previous one,
+while the terminal is suppressed or silent, or without the option `transmit`. If a request and a
+message both wait, `outbox.StrideScheduler` decides. Figures: PROTOCOLS 1.1 and 1.5.
 """
 
 from __future__ import annotations
@@ -53,7 +52,8 @@ from drivers.rdss.state_tables import (
 
 
 class Terminal:
-    """See the module. `state`, `detail` (in words) and `counters` say what it is doing.
+    """State machine of one terminal: see the module. `state`, `detail` (in words) and `counters`
+    show its activity.
 
     Counters: `requested`, `accepted`, `fixes`, `late_fix` (after giving up, still used),
     `slow_fix` (over 5 s), `multi_value` (handed on, marked); refused `foreign_fix`, `unsolicited`;
@@ -82,20 +82,20 @@ class Terminal:
     # ------------------------------------------------------------------ inputs
 
     def opened(self, t_ns: int) -> list[Action]:
-        """The line is open: look who is there."""
+        """Note that the line is open, and probe for a terminal."""
         self._t_ns = t_ns
         self._session.search(t_ns)
         return []
 
     def closed(self, t_ns: int) -> list[Action]:
-        """The line is gone. Spacing, suppression and silence outlive it."""
+        """Note that the line is gone. Spacing, suppression and silence stay in force."""
         self._t_ns = t_ns
         self._session.abandon()
         self._session.enter(State.CLOSED, None)
         return []
 
     def received(self, message: Message, t_ns: int, family: Family) -> list[Action]:
-        """A message that the codec of `family` decoded."""
+        """Process a message that the codec of `family` decoded."""
         self._t_ns = t_ns
         if isinstance(message, Reply) and not isinstance(message, Feedback | Fix | Text):
             self._deadlines.quiet_until_ns = min(self._deadlines.quiet_until_ns, t_ns)
@@ -107,7 +107,7 @@ class Terminal:
         self._t_ns = t_ns
         self.outbox.settle(t_ns)
         actions: list[Action] = []
-        for _ in State:  # each state hands on at most once in one call
+        for _ in State:  # each state passes to the next at most once in a call
             due = self.next_deadline_ns
             if due is None or t_ns < due:
                 break
@@ -121,7 +121,7 @@ class Terminal:
         return actions
 
     def request_now(self, t_ns: int) -> Notice:
-        """An operator asks for a fix: as soon as the card's spacing allows, or why not."""
+        """Request a fix as soon as the card's spacing allows; return when, or why not, in words."""
         session = self._session
         self._t_ns = t_ns
         code = "rdss_request"
@@ -153,7 +153,7 @@ class Terminal:
 
     @property
     def outbox(self) -> Outbox:
-        """The messages that wait."""
+        """Waiting messages."""
         return self._session.outbox
 
     @property
@@ -199,7 +199,7 @@ class Terminal:
 
     @property
     def answered(self) -> bool:
-        """A terminal with a known family is on the line."""
+        """True if a terminal of a known family has replied."""
         return self._session.answered
 
     @property

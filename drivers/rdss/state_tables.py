@@ -1,6 +1,6 @@
-"""The tables of the request cycle: states, time-outs, actions, and what a refusal leads to.
+"""Tables of the request cycle: states, time-outs, actions, and consequences of refusals.
 
-Figures come from PROTOCOLS 1.1 and 1.5 unless they say otherwise.
+Figures are from PROTOCOLS 1.1 and 1.5 unless another source is named.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ class SetBaud:
 
 @dataclass(frozen=True, slots=True)
 class FixReady:
-    """An own fix: its time of day (s, zone unknown), the bound of what the fraction leaves open
-    (s), when its request was written, whether that gave a height (or a pressure), and the height's
-    sigma where it is known."""
+    """Own fix: time of day (s, zone unknown) with the bound of its error (s), instant at which the
+    request was written, whether the request gave a height or pressure, and that height's sigma if
+    known."""
 
     fix: Fix
     time_of_day_s: float
@@ -106,7 +106,7 @@ class FixReady:
 
 @dataclass(frozen=True, slots=True)
 class MailReady:
-    """A short message that came, or another card's place."""
+    """Received short message, or another card's place."""
 
     mail: Mail
 
@@ -124,8 +124,8 @@ Action = Send | SetBaud | FixReady | MailReady | Notice
 
 @dataclass(frozen=True, slots=True)
 class TerminalOptions:
-    """`bauds` and `families` are tried in order. None: not given, or no limit of our own. `source`
-    is the driver's name."""
+    """Options of a terminal. `bauds` and `families` are tried in order; None: not given, or no own
+    limit. `source` is the driver's name."""
 
     bauds: tuple[int, ...] = PROBE_BAUDS
     families: tuple[Family, ...] = ("4.0", "2.1")
@@ -147,8 +147,8 @@ class TerminalOptions:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Consequence of a rejected request. `notice` once, until a request is accepted; after
-    `retries` in a row the state is HOLDING."""
+    """Consequence of a refused request. `notice` is reported once until a request is accepted;
+    after `retries` in a row the state becomes HOLDING."""
 
     counter: str
     state: State

@@ -2,8 +2,8 @@
 
     $ talker(2) formatter(3) , fields * XOR of what stands between $ and *, two hex digits, CR LF
 
-Talker CC speaks to the terminal, BD from it. The same port may carry ordinary GNSS sentences (any
-talker): they pass as `Unknown`. A raw Chinese text may hold bytes of 0x80 and more.
+Talker CC is from host to terminal, BD from terminal to host. The same port may carry ordinary GNSS
+sentences (any talker), which become `Unknown`. A raw Chinese text may hold bytes of 0x80 and more.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _count(fields: Fields, *allowed: int) -> None:
 
 
 def _int(field: str, low: int, high: int) -> int:
-    """A plain decimal integer; an empty field is 0."""
+    """Decimal integer of a field; 0 for an empty one."""
     if field and not (field.lstrip("+-").isdigit() and field.isascii()):
         raise FieldError(f"{field!r} is no integer")
     value = int(field or "0")
@@ -166,7 +166,7 @@ def _fix(f: Fields) -> Message:
 
 
 def _feedback(f: Fields) -> Message:
-    """Letters in field 1: the old form; digits: the BDS-3 form."""
+    """Feedback, in the old form (letters in field 1) or the BDS-3 form (digits)."""
     _count(f, 5)
     if f[0].isdigit():
         executed, reason = _choice(f[2], "Y", "N"), _int(f[3], 0, 99)
@@ -225,7 +225,8 @@ def _beam_power(f: Fields) -> Message:
 
 
 def _clock(f: Fields) -> Message | None:
-    """RDSS form: 11 fields, the first one digit. Six fields are the GNSS receiver's ZDA: None."""
+    """Clock of the RDSS form: 11 fields, the first one digit. None for six fields, a GNSS
+    receiver's ZDA."""
     if len(f[0]) != 1:
         return None
     _count(f, 11)
@@ -245,7 +246,7 @@ def _clock(f: Fields) -> Message | None:
 
 
 def _self_test(f: Fields) -> Message | None:
-    """Self test, in the form with 8 fields only; the count differs between vendors."""
+    """Self test, only of the form with 8 fields; the number differs between vendors."""
     if len(f) != 8:
         return None
     remaining = f[7]
@@ -312,7 +313,7 @@ _DECODE: dict[str, Callable[[Fields], Message | None]] = {
 
 
 class Decoder(FrameDecoder):
-    """Bytes in, messages out, both directions. Buffers at most one sentence.
+    """Decoder of bytes into messages, of both directions. Buffers at most one sentence.
 
     Counters: `frames`, `unknown` (well-formed, not read here), `bad_checksum`, `bad_length` (no
     end), `bad_name`, `bad_field` (good checksum, impossible value), `other_family` (a binary
@@ -348,7 +349,7 @@ class Decoder(FrameDecoder):
 
 
 def _header_fault(header: bytes) -> str:
-    """Fault of the possibly incomplete name and comma behind `$`."""
+    """Fault of the name and comma behind `$`, which may be incomplete."""
     if len(header) >= 5 and header[:4].isalpha() and header[:4].isupper() and header[4] == 0:
         return "other_family"
     name = header[:5]

@@ -1,4 +1,4 @@
-"""RDSS terminal interface, family 2.1: messages to sentences. The format stands in `text_2_1`."""
+"""RDSS terminal interface, family 2.1: messages to sentences. `text_2_1` describes the format."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ MAX_SENTENCE = 512
 
 
 def sentence(name: str, fields: bytes) -> bytes:
-    """A whole sentence. EncodeError for a name never to be sent or a field that breaks it."""
+    """Make a sentence. EncodeError for a name that must never be sent, or a field that cannot be in
+    a sentence."""
     if name in FORBIDDEN:
         raise EncodeError(f"{name} is never sent")
     if not _is_name(name.encode()) or any(b < 0x20 or b in b"$*" for b in fields):
@@ -199,5 +200,5 @@ def _encode(m: Message) -> bytes:
 
 
 def encode(message: Message) -> bytes:
-    """The sentence that says `message`. EncodeError if 2.1 cannot say it or it must not be sent."""
+    """Sentence of a message. EncodeError for a message that 2.1 lacks or that is forbidden."""
     return encode_frame(_encode, message)

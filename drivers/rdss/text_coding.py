@@ -4,10 +4,10 @@
     code      decimal digits, two a byte              4 bits a digit
     mixed     0xA4, then any bytes; a text in GB 18030   8 bits a byte, 0xA4 included
 
-The most that a card may send at once is set by its communication level, 1 to 4. Public code has two
-tables, for plain and for encrypted cards, and reads the card's flag for that in opposite ways: the
-lesser of both is what either kind may send. A card of level 0 may send none. A level above 4 is of
-a later system, and has the most of level 4.
+A card's communication level, 1 to 4, limits the length of a message. Public code has two tables,
+for plain and for encrypted cards, and interprets the card's flag for that in opposite ways; so the
+smaller limit is used. A card of level 0 may send nothing. A level above 4 belongs to a later system
+and has the limit of level 4.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MIXED = b"\xa4"
 
 
 class EncodedText(NamedTuple):
-    """Payload for TXSQ and CCTXA; `odd` as in `TextRequest`."""
+    """Encoded text: payload for TXSQ and CCTXA; `odd` as in `TextRequest`."""
 
     payload: bytes
     encoding: TextEncoding
@@ -39,12 +39,12 @@ class EncodedText(NamedTuple):
 
 
 def card_level_bits(comm_level: int) -> int:
-    """Greatest length (bits) of a message from a card of this level."""
+    """Longest message (bits) from a card of this level."""
     return LEVEL_BITS[min(comm_level, len(LEVEL_BITS) - 1)]
 
 
 def encode_shortest(text: str) -> EncodedText:
-    """Text in the shortest encoding. Raises ValueError for characters outside GB 18030."""
+    """Encode a text as short as possible. Raises ValueError for characters outside GB 18030."""
     if text and text.isascii() and text.isdigit():
         return encode_digits(text)
     try:
@@ -57,12 +57,12 @@ def encode_shortest(text: str) -> EncodedText:
 
 
 def encode_bytes(data: bytes) -> EncodedText:
-    """Bytes in mixed encoding."""
+    """Encode bytes as mixed."""
     return EncodedText(MIXED + data, "mixed")
 
 
 def encode_digits(text: str) -> EncodedText:
-    """Decimal digits, two a byte."""
+    """Encode decimal digits, two a byte."""
     odd = len(text) % 2 == 1
     return EncodedText(bytes.fromhex(text + "0" * odd), "code", odd)
 
@@ -80,6 +80,6 @@ def printable_text(wording: EncodedText) -> str | None:
 
 
 def _printable(text: str) -> str | None:
-    """Text without line ends and tabs; None with other control characters, which no text has."""
+    """Text without line ends and tabs; None if other control characters show that it is no text."""
     flat = text.replace("\r", " ").replace("\n", " ").replace("\t", " ")
     return flat if flat.isprintable() else None

@@ -1,13 +1,12 @@
-"""Septentrio's SBF in, measurements out: epochs by time of week, judged. No I/O, no clock.
+"""Decoder of Septentrio's SBF into measurements: epochs by time of week, judged. No I/O, no clock.
 
-    4007 PVTGeodetic       mode, place, velocity; accuracies where it is of revision 2
-    5906 PosCovGeodetic, 5908 VelCovGeodetic    variances; they stand for the accuracies
-    4001 DOP, 5914 ReceiverTime (leap seconds), 5921 EndOfPVT
-    5938 AttEuler, 5939 AttCovEuler             heading of two antennas
-    HAccuracy              twice the root of the mean square of the horizontal distance
-    VAccuracy              twice the sigma of the height
+    4007 PVTGeodetic       mode, place, velocity; accuracies in revision 2 5906 PosCovGeodetic, 5908
+    VelCovGeodetic    variances; they replace the accuracies 4001 DOP, 5914 ReceiverTime (leap
+    seconds), 5921 EndOfPVT 5938 AttEuler, 5939 AttCovEuler             heading of two antennas
+    HAccuracy              twice the root of the mean square of the horizontal distance VAccuracy
+    twice the sigma of the height
 
-Do-not-use values (-2e10, 65535, ...) are not given. Source: Septentrio AsteRx SB3 Reference Guide,
+Do-not-use values (-2e10, 65535, ...) become None. Source: Septentrio AsteRx SB3 Reference Guide,
 section 4.2.
 """
 
@@ -122,7 +121,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
                 self._report_heading(math.radians(math.sqrt(variance)) if good else None, found)
 
     def _group(self, block: Block, when: tuple[int, int], found: list[Measurement]) -> bool:
-        """True if a block is taken into an epoch."""
+        """True if a block belongs to an epoch."""
         if not self._belongs(when, block.number, found):
             return False
         epoch = self._epoch or _Epoch()

@@ -1,4 +1,4 @@
-"""A Septentrio receiver that sends SBF: see `docs/gnss-sbf.md`."""
+"""Driver `sbf`: a Septentrio receiver that sends SBF, see `docs/gnss-sbf.md`."""
 
 from __future__ import annotations
 

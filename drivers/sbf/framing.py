@@ -1,11 +1,12 @@
-"""Blocks of the Septentrio Binary Format out of a byte stream: no I/O.
+"""Splitter of a byte stream into blocks of the Septentrio Binary Format: no I/O.
 
     $ @ crc16 id16 length16 body     CRC-16-CCITT (1021 hex, from 0) from id to the end
     id       bits 0 to 12 the block's number, 13 to 15 its revision
     length   of the whole block, a multiple of 4
 
-NMEA and all else on the line is passed over. A header that is none, or a block that does not
-verify, costs its two sync bytes. Source: Septentrio AsteRx SB3 Reference Guide, section 4.1.
+NMEA and everything else on the line is skipped. After a false header or a block that does not
+verify, only its two sync bytes are skipped. Source: Septentrio AsteRx SB3 Reference Guide, section
+4.1.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _HEADER = 8
 
 
 class Block(NamedTuple):
-    """A verified block: number, revision, and what follows the header."""
+    """Verified block: number, revision, and contents behind the header."""
 
     number: int
     revision: int
@@ -30,7 +31,7 @@ class Block(NamedTuple):
 
 
 class BlockSplitter(Splitter[Block]):
-    """Bytes in, verified blocks out, whatever the splits.
+    """Splitter of bytes, in pieces of any size, into verified blocks.
 
     Counts `sbf_blocks`; refused `sbf_damaged`, `sbf_cut` (the stream ended inside it); and
     `other_bytes`, all that belonged to no good block.

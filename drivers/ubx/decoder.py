@@ -1,4 +1,4 @@
-"""UBX-NAV frames of a receiver in, measurements out: epochs by iTOW, judged. No I/O, no clock.
+"""Decoder of UBX-NAV frames into measurements: epochs by iTOW, judged. No I/O, no clock.
 
 An epoch closes with NAV-EOE, or as `drivers.epoch_ends` finds.
 """
@@ -32,7 +32,7 @@ RTK = {1: 5, 2: 4}
 
 
 class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
-    """See `SolutionDecoder`. Who splits the stream himself hands over frames (`decode`).
+    """See `SolutionDecoder`. A caller that splits the stream itself passes frames to `decode`.
 
     Every NAV frame ends in one counter: `nav_messages`, `nav_unreadable`, `late_message` (its epoch
     was closed), `relposned`, or `ubx_not_used`, which takes all other classes too. Of baselines
@@ -47,7 +47,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
         return StreamSplitter(self.counters)
 
     def decode(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
-        """Result of a UBX frame that `StreamSplitter` verified."""
+        """Measurements that a frame, verified by `StreamSplitter`, completes."""
         self._t_seen_ns = t_seen_ns
         found: list[Measurement] = []
         self._frame(raw, found)
@@ -119,7 +119,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
         if baseline.refusal is not None:
             self.counters[baseline.refusal] += 1
             return
-        # It comes when the base's observations have: of an older epoch than the one that is open.
+        # It waits for the base's observations, so it belongs to an older epoch than the open one.
         utc_ns = self._utc_of(baseline.itow_ms)
         epoch = self._epoch
         if epoch is not None and epoch.itow_ms == baseline.itow_ms and epoch.utc_ns is not None:

@@ -1,4 +1,4 @@
-"""A u-blox receiver that sends UBX navigation messages: see `docs/gnss-ubx.md`."""
+"""Driver `ubx`: a u-blox receiver that sends UBX navigation messages, see `docs/gnss-ubx.md`."""
 
 from __future__ import annotations
 

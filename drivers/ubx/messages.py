@@ -1,4 +1,4 @@
-"""Parser of UBX-NAV messages, little endian, from verified frames into their epoch.
+"""Parser of UBX-NAV messages, little endian, in verified frames, into an epoch.
 
     PVT 0x07      everything; POSLLH 0x02, VELNED 0x12 and HPPOSLLH 0x14 parts of it, finer
     SOL 0x06      what PVT was before generation 7: ECEF, GPS time
@@ -34,10 +34,10 @@ NO_DOP = 99.0
 
 @dataclass(slots=True)
 class NavEpoch:
-    """Messages of one iTOW; None where none did.
+    """Contents of the messages of one iTOW; None for what none of them has.
 
-    `rank`: of what the position is (SOL 1, POSLLH 2, PVT 3, HPPOSLLH 4), `utc_rank` of what the
-    time is: the higher takes the place of the lower.
+    `rank` is the source of the position (SOL 1, POSLLH 2, PVT 3, HPPOSLLH 4), `utc_rank` that of
+    the time: a higher one replaces a lower one.
     """
 
     itow_ms: int
@@ -79,13 +79,14 @@ class NavEpoch:
             self.v_rank, self.v_ned_m_s, self.sd_v_m_s = rank, v, sd_m_s * _EVEN_3
 
     def whole(self) -> None:
-        """Complete the epoch: convert all that needs its position."""
+        """Complete the epoch: convert the values that depend on its position."""
         if self.v_ecef_m_s is not None and self.lat_rad is not None and self.lon_rad is not None:
             v, sd_m_s = self.v_ecef_m_s
             self.velocity(1, north_east_down(v, self.lat_rad, self.lon_rad), sd_m_s)
 
     def status(self, fix: int, flags: int, carrier: int, rank: int) -> None:
-        """gnssFixOK and diffSoln are the lowest bits of `flags` in every message."""
+        """Set the status: gnssFixOK and diffSoln are the lowest bits of `flags` in every
+        message."""
         if self.fix is not None and rank < 3:
             return
         self.fix, self.fix_ok, self.differential = fix, bool(flags & 1), bool(flags & 2)
@@ -97,7 +98,7 @@ class NavEpoch:
 
 
 class UnreadableError(ValueError):
-    """A field of a verified message cannot be."""
+    """Error: an impossible field in a verified message."""
 
 
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHH")
@@ -275,10 +276,10 @@ class Baseline:
 
 
 def parse_relposned(payload: bytes) -> Baseline | None:
-    """The baseline; None where the length does not fit, or a version without heading.
+    """Parse a baseline; None if the length is wrong, or for a version without heading.
 
-    The direction to a base station that stands is no heading: only a moving base's is, and only
-    with its ambiguities fixed.
+    The baseline is a heading only from a moving base, and only with fixed ambiguities; the
+    direction to a stationary base is none.
     """
     if len(payload) < _RELPOSNED.size or payload[0] < 1:
         return None

@@ -1,7 +1,8 @@
-"""The daemon's own process: `python -m fusiond.live CONFIG [DIR]`, recording all into DIR.
+"""Process of the daemon: `python -m fusiond.live CONFIG [DIR]`; with DIR it records everything
+there.
 
-`fusiond run` reads the command line and becomes this program under the same process id: what reads
-command lines takes 2 MB that a daemon would hold for as long as it lives.
+`fusiond run` parses the command line, then replaces itself by this program under the same process
+id. The parser's 2 MB would otherwise stay in memory as long as the daemon runs.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ none."""
 
 
 def main(path: Path, record: Path | None = None) -> None:
-    """Serve until SIGTERM. A mistake in the configuration goes to standard error, with exit status
-    78."""
+    """Serve until SIGTERM. A mistake in the configuration is printed to standard error, with exit
+    status 78."""
     gc.set_threshold(COLLECT_AFTER_IMPORTS)
     from fusiond.configuration.load import EXIT_CONFIG, ConfigError, load_config  # noqa: PLC0415
 
@@ -43,10 +44,9 @@ def main(path: Path, record: Path | None = None) -> None:
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
         widths = None
-        with suppress(ConfigError):  # the daemon's own will say so
+        with suppress(ConfigError):  # the daemon reports it
             widths = kernel_widths(Navigator(config))
-    # What imports left in cycles, 2 MB, is used again by what follows; what lives is looked through
-    # no more.
+    # Free the 2 MB that imports left in cycles, and exempt all live objects from later collections.
     gc.collect()
     gc.freeze()
     gc.set_threshold(COLLECT_AFTER)
@@ -54,7 +54,7 @@ def main(path: Path, record: Path | None = None) -> None:
 
 
 def recorded(config: Config, folder: Path | None) -> Config:
-    """The configuration, with all recorded into `folder` if there is one."""
+    """Configuration that records everything into `folder`; unchanged without one."""
     if folder is None:
         return config
     update = {"directory": folder.absolute(), "when": "always"}
@@ -67,6 +67,6 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
-        # The interpreter's last two collections would look through all that was imported, a quarter
-        # of a second for nothing: the process and its memory end.
+        # At exit the interpreter would examine all imported objects twice: a quarter of a second to
+        # free memory that ends with the process.
         gc.freeze()

@@ -1,4 +1,4 @@
-"""The calibration on disk: taken up at the start, renewed on the drive and at the end."""
+"""Calibration on disk: restored at the start, written during the drive and at its end."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from fusiond.navigator.state_file import DamagedStateError, RefusedStateError, s
 
 log = logging.getLogger("fusiond")
 
-# A parameter takes minutes to settle; a power cut loses five of them, and flash is written 12 times
-# an hour.
+# Parameters settle over minutes. At this interval a power cut loses five minutes at most, and flash
+# is written 12 times an hour.
 SAVE_EVERY_S = 300
 
 
@@ -88,7 +88,7 @@ class CalibrationKeeper:
             await asyncio.to_thread(_write, self._path, saved)
 
     def _of(self, navigator: Navigator) -> SavedCalibration | None:
-        # How a spare sits on the vehicle says nothing of the unit that the next run begins with.
+        # The spare's mounting is not that of the unit with which the next run starts.
         spare = published_of_spare(navigator.estimator, navigator.config.imu)
         if navigator.started is None or navigator.trial.on_trial or spare:
             return None

@@ -33,15 +33,15 @@ The oldest are dropped."""
 
 
 class Innovations:
-    """Collector of outcomes in the tick. Constraints of the filter are left out: they are many, and
-    have no verdict."""
+    """Collector of measurement outcomes for `innovations`. The filter's own constraints are left
+    out: they are many and have no verdict."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._ended: dict[Key, Entry] = {}
 
     def add(self, entry: Entry) -> None:
-        """A measurement has ended; one that a rewind brings again is there already."""
+        """Store a measurement's outcome; after a rewind the new outcome replaces the first."""
         if entry.measurement.constraint:
             return
         self._ended[entry.key] = entry
@@ -108,9 +108,9 @@ class Chain:
         self._ticked_ns = 0
 
     def _report(self, source: str, code: str, text: str) -> None:
-        """An event of a device or of the navigator."""
+        """Report an event of a device or of the navigator."""
         self.events.report(source, code, text)
-        if self._on_code is not None:  # not yet while the parts are made
+        if self._on_code is not None:  # None while the parts are made
             self._on_code(code)
 
     def _ended(self, entry: Entry) -> None:
@@ -119,11 +119,12 @@ class Chain:
             self._on_outcome(entry)
 
     def may_wait(self, t_ns: int) -> bool:
-        """True if a tick at `t_ns` without a reader of its solution may leave its samples to the
+        """True if the tick at `t_ns`, whose solution nobody reads, may leave its samples to the
         next.
 
-        The filter's state does not depend on the number of samples at once, but decisions of a tick
-        do: so a tick may wait only if nothing but samples has arrived and the vehicle navigates.
+        How many samples the filter processes at once does not change its state, but it changes the
+        decisions of a tick. So a tick may wait only if nothing but samples has arrived and the
+        vehicle navigates.
         """
         sources = self.sources
         return (

@@ -91,13 +91,15 @@ class Daemon:
         saved = self._state.load()
         self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
         self.navigator = navigator = self._chain.navigator
-        # None is linked inside a tick. Of those by the width of a covariance 10 MB are for others.
+        # Load now, so that no tick links a kernel; only the covariance widths in use, which saves
+        # 10 MB.
         load_kernels(kernel_widths(navigator))
         self.navigator.timeline.keeps_raw = config.recording.directory is not None
         self.sources = self._chain.sources
         self._calibration.restore_into(self.navigator)
         if saved is None or "saved" not in config.alignment.heading:
-            # A vehicle that stood knows more by what it kept then.
+            # The state saved at rest, if there is one, holds a better heading than the one in
+            # memory.
             self._warm.restore_into(self.navigator)
         messages = self._messages.load(self._chain.messaging)
         self._restored = RestoredState(
@@ -129,7 +131,7 @@ class Daemon:
         return self._chain.solution
 
     def _completed(self, outputs: dict[str, Output]) -> dict[str, Output]:
-        """Outputs with callbacks into the navigator's parts."""
+        """Outputs connected to the chain and the recorder."""
         mqtt = outputs.get("mqtt")
         if isinstance(mqtt, MqttPublisher):
             mqtt.on_confirmed = self._chain.messaging.confirm
@@ -142,8 +144,8 @@ class Daemon:
             output.publish(EVENT, message)
 
     async def reload_when(self, again: asyncio.Event, read: Callable[[], Config]) -> None:
-        """Call `reload` whenever `again` is set, until cancelled; several settings during a reload
-        count once."""
+        """Call `reload` whenever `again` is set, until cancelled; requests during a reload cause
+        one more."""
 
         async def wait() -> None:
             while True:
@@ -154,8 +156,8 @@ class Daemon:
         await supervise("reload", wait, partial(self._events.report, "daemon", "reload_fault"))
 
     async def reload(self, read: Callable[[], Config]) -> None:
-        """Apply outputs, gates and log level of the configuration from `read`; a mistake in it
-        changes nothing. Events report the result."""
+        """Apply outputs, gates and log level of the configuration from `read`. A mistake changes
+        nothing; events report the result."""
         self.service.reloading()
         try:
             await self._reload(await asyncio.to_thread(read))
@@ -170,7 +172,7 @@ class Daemon:
         found = difference(self.config, read)
         kept = {n: o for n, o in self.outputs.items() if n not in found.outputs}
         made = self._front.make_outputs(found.config, kept)
-        # Nothing is refused from here on.
+        # From here on nothing can be refused.
         self.config = found.config
         made = self._completed(made)
         await self._output_tasks.stop(found.outputs)
@@ -243,12 +245,13 @@ class Daemon:
         self._messages.keep(t_ns, self._chain.messaging)
 
     def _nobody_reads(self, t_ns: int) -> bool:
-        """True if the solution of this tick goes nowhere: a log has each of them."""
+        """True if nobody reads this tick's solution. A log holds every tick, so recording counts as
+        a reader."""
         unread = self._on_solution is None and not self.recorder.active
         return unread and self._second.waits(t_ns) and self._publishing.waits(t_ns)
 
     def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
-        """Log a state from which a part of the log can be replayed, at intervals."""
+        """Write the state into the log at intervals, so that a replay can start there."""
         if self.recorder.state_due(t_ns):
             state = self._warm.state(solution, self.navigator)
             if state is not None:
@@ -258,7 +261,7 @@ class Daemon:
         self.recorder.innovation(entry)
 
     def _carry_out(self, command: Command) -> str | Awaitable[str]:
-        """Execute an operator's command; its result. Raises `CommandRefusedError`."""
+        """Execute an operator's command and return its result. Raises `CommandRefusedError`."""
         try:
             match command:
                 case StartRecording():
@@ -301,7 +304,7 @@ def run_daemon(
     to run."""
     written = handler()
     logging.basicConfig(level=logging.INFO, handlers=[written])
-    logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
+    logging.getLogger("can").setLevel(logging.WARNING)  # it logs a line for every attempt to open
     log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
     sys.setswitchinterval(SWITCH_S)
@@ -322,7 +325,7 @@ def run_daemon(
             if stop.is_set():
                 await front.close()
                 return
-            for load in missing:  # links them; compiles here what could not be kept on disk
+            for load in missing:  # links them, and compiles those that could not be stored
                 load()
         daemon = Daemon(config, front=front)
         release_start_memory()
@@ -338,7 +341,7 @@ def run_daemon(
             for load in missing:
                 load()
             missing = ()
-        # The children are forked while nothing else runs in this process.
+        # Fork the children before this process starts a thread or an event loop.
         with ForkedJobs(missing, load_compiler) if missing else nullcontext() as compiling:
             asyncio.run(main(compiling))
     except ConfigError as error:

@@ -1,5 +1,5 @@
-"""Front of the daemon: events, the service manager, outputs. It is there before the navigator, and
-answers while kernels compile."""
+"""Services that start before the navigator: events, service manager, outputs. They answer while
+kernels compile."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from fusiond.workers.forked import ForkedJobs
 
 log = logging.getLogger("fusiond")
 
-# Readiness is told when every device sends, or after this long with what there is: an absent
-# receiver, or a compiler, must not keep the vehicle's other services waiting.
+# READY is sent when every device sends, or after this time at the latest: an absent receiver or a
+# long compilation must not hold up the vehicle's other services.
 READY_AFTER_S = 10.0
-# As often as the navigator's own status goes out, and the journal's line while kernels compile.
+# Period of `status`, as later from the navigator, and of the journal's line while kernels compile.
 STATUS_EVERY_S, LINE_EVERY_NS = 1.0, 5 * SECOND_NS
 _NO_TICK = SchedulerStatus(0, 0, 0.0, 0.0, 0.0, 0.0, (), 0, 0, 0.0)
 
 
 class Front:
-    """Outputs of one vehicle before the daemon is ready. `on_command` executes an operator's
-    command once possible."""
+    """Services of one vehicle from its start on. `on_command` executes an operator's command; until
+    the daemon sets it, commands are refused."""
 
     def __init__(self, config: Config, clock: Clock) -> None:
         self.config = config
@@ -53,7 +53,7 @@ class Front:
         self.ready = False
 
     def make_outputs(self, config: Config, kept: Mapping[str, Output]) -> dict[str, Output]:
-        """The outputs of `config`; those of `kept` are there already."""
+        """Make the outputs of `config`, except `kept`, which exist."""
         return make_outputs(
             config,
             on_event=self.events.report,
@@ -107,7 +107,7 @@ class Front:
         log.info("compiled %d of %d kernels in %.0f s", compiling.done, compiling.total, spent_s)
 
     async def close(self) -> None:
-        """Close the services; no successor follows."""
+        """Stop the outputs before the daemon exits."""
         self.service.stopping()
         await self.output_tasks.stop()
         self.service.close()

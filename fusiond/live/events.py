@@ -1,4 +1,4 @@
-"""Events for the operator, logged and passed to listeners."""
+"""Events for the operator: logged, and passed to listeners."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fusiond.outputs.messages.event_catalogue import entry_of
 
 log = logging.getLogger("fusiond")
 
-# Events of a start before the outputs are there: each part reports little.
+# Most events stored before the outputs listen; each part reports only a few at the start.
 MOST_UNHEARD = 32
 
 

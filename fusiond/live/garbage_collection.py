@@ -1,9 +1,9 @@
 """Schedule of the cyclic garbage collector, which runs in the slack after a tick.
 
-A collection takes some 0.1 us for each object of its generation. CPython starts one when many more
-objects were made than freed; a daemon with full queues makes as many as it frees, so the count
-stays while the youngest generation grows, to 50,000 objects and 0.1 s when measured. Here
-collections are timed: the few objects of a tick are examined after it.
+A collection takes about 0.1 us for each object of its generation. CPython starts one when far more
+objects were made than freed. A daemon with full queues frees as many as it makes, so CPython's
+count stays low while the youngest generation grows: 50,000 objects, 0.1 s when measured. So this
+schedule goes by time: after each tick it examines the few objects that the tick made.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _SLACK_MARGIN_NS = 500_000
 
 
 class Collector:
-    """`now` (ns) is the scheduler's clock. `forced` collections did not fit the slack."""
+    """Scheduled collector. `now` (ns) is the scheduler's clock; `forced` counts collections that
+    did not fit the slack."""
 
     def __init__(self, now: Callable[[], int]) -> None:
         self._now = now
@@ -40,7 +41,7 @@ class Collector:
         self.max_ns = 0
 
     def start(self) -> None:
-        """Move the objects of the start-up out of the collector's sight."""
+        """Exempt the objects of the start-up from all later collections."""
         gc.collect()
         gc.freeze()
         gc.disable()

@@ -1,7 +1,7 @@
 """Injected faults: `cmd/inject` falsifies a source's data and reports it.
 
-It stands between drivers and clock, so that all later parts treat the fault like a real one. Its
-effect depends only on command and input: a recording of both reproduces it.
+Injection stands between drivers and clock, so all later parts treat the fault like a real one. Its
+effect depends only on command and input: a replay of both reproduces it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _VALUES = {
 
 
 class Injection:
-    """The faults that are in force. `on_event(source, code, text)` receives `injected` and
+    """Active faults by source. `on_event(source, code, text)` receives `injected` and
     `injection_ended`."""
 
     def __init__(self, on_event: Callable[[str, str, str], None]) -> None:
@@ -66,20 +66,20 @@ class Injection:
         """Active faults by source."""
 
     def inject(self, command: Inject, t_ns: int) -> str:
-        """Start a fault at `t_ns`, replacing one of the same source; a description."""
+        """Start a fault at `t_ns` in place of the source's earlier one; return its description."""
         self.faults[command.source] = Fault(command, t_ns)
         self._on_event(command.source, "injected", _description(command))
         return f"{command.source}: {_description(command)}"
 
     @property
     def active(self) -> tuple[str, ...]:
-        """The faults in force, in words."""
+        """Descriptions of the active faults."""
         return tuple(
             f"{n}: {_description(f.command)}" for n, f in self.faults.items() if not f.over
         )
 
     def pass_on(self, item: Emitted) -> Iterator[Emitted]:
-        """Items that remain after a fault."""
+        """Pass on an item as the source's fault leaves it: unchanged, falsified, or not at all."""
         fault = self.faults.get(item.source)
         if fault is None or fault.over or isinstance(item, DeviceEvent | Mail):
             yield item
@@ -87,7 +87,7 @@ class Injection:
             yield from fault.pass_on(item)
 
     def tick(self, t_ns: int) -> Iterator[Emitted]:
-        """Items held back that are due at `t_ns`; faults whose time is over end."""
+        """Release delayed items that are due at `t_ns`, and end faults whose time is over."""
         for source, fault in tuple(self.faults.items()):
             yield from fault.due(t_ns)
             if not fault.over and t_ns >= fault.end_ns:
@@ -106,7 +106,7 @@ class Fault:
         self.end_ns = t_ns + round(command.duration_s * SECOND_NS)
         self.over = False
         self.held: list[tuple[int, Emitted]] = []
-        # The instant is recorded with the command: the same noise comes in a replay.
+        # The seed is the command's instant, which is recorded: a replay makes the same noise.
         self._random = np.random.default_rng(t_ns)
         self._frozen: dict[type, dict[str, Any]] = {}
 
@@ -146,7 +146,7 @@ class Fault:
         return size
 
     def _off(self, item: Emitted) -> Emitted:
-        """The item with the error of `jump`, `drift` or `noise`."""
+        """Item with the error of `jump`, `drift` or `noise` added."""
         c = self.command
         match item:
             case ImuSample():
@@ -155,7 +155,7 @@ class Fault:
                     return replace(item, gyro_rad_s=_plus(item.gyro_rad_s, c, math.radians(error)))
                 return replace(item, accel_m_s2=_plus(item.accel_m_s2, c, error))
             case PositionFix() | DelayedFix():
-                # Noise has no direction: it comes on both axes.
+                # Noise has no direction: both axes get it.
                 towards = math.radians(c.direction_deg)
                 error = self._error(item.t_seen_ns)
                 north, east = error * math.cos(towards), error * math.sin(towards)
@@ -201,6 +201,6 @@ def _plus(
 
 
 def _description(c: Inject) -> str:
-    """A fault in words."""
+    """Describe a fault in words."""
     size = f" {c.size:g}" if c.fault in ("delay", "jump", "drift", "noise") else ""
     return f"{c.fault}{size} for {c.duration_s:g} s"

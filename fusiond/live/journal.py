@@ -25,7 +25,7 @@ PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
 
 
 def fields(source: str, code: str) -> dict[str, str]:
-    """`extra` of a record that is about an event."""
+    """`extra` of a log record for an event."""
     return {"fusiond_source": source, "fusiond_code": code}
 
 
@@ -70,8 +70,9 @@ def _field(name: str, value: str) -> bytes:
 
 
 def handler(environ: Mapping[str, str] = os.environ) -> logging.Handler:
-    """Log handler for the journal where standard error goes there (JOURNAL_STREAM,
-    systemd.exec(5)), else for standard error; limited to a few lines a minute of one cause."""
+    """Log handler: the journal if standard error is connected to it (JOURNAL_STREAM,
+    systemd.exec(5)), else standard error. Either is limited to a few lines a minute of one
+    cause."""
     found = _handler(environ)
     found.addFilter(LogLimit())
     return found
@@ -81,7 +82,7 @@ def _handler(environ: Mapping[str, str]) -> logging.Handler:
     try:
         err = os.fstat(sys.stderr.fileno())
         journal = environ.get("JOURNAL_STREAM") == f"{err.st_dev}:{err.st_ino}" and SOCKET.exists()
-    except (OSError, ValueError):  # standard error is closed, or no file
+    except (OSError, ValueError):  # standard error is closed or not a file
         journal = False
     if journal:
         return JournalHandler()

@@ -1,7 +1,7 @@
 """Rate limit of the log: a few lines a minute for one cause, then their number.
 
-A cause is the event's source and code, or the place in the code that logs; the rest of the line may
-vary. Errors are no exception: a storm of tracebacks fills a disk.
+A cause is the event's source and code, or the line of code that logs; the text may vary. Errors are
+limited like other lines, since repeated tracebacks would fill a disk.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class _Cause:
 
 
 class LogLimit(logging.Filter):
-    """A filter for a handler; `left_out` counts all lines that it has kept back."""
+    """Rate limit of a log handler; `left_out` counts all omitted lines."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -37,8 +37,8 @@ class LogLimit(logging.Filter):
         self.left_out = 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """True if the record is to be written; one after omitted records states their number. Below
-        level `info` nothing is omitted."""
+        """True if the record is to be written; the first one after omitted records states their
+        number. Records below level `info` are never omitted."""
         if record.levelno < logging.INFO:
             return True
         now_s = self._now()

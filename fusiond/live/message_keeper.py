@@ -1,7 +1,7 @@
-"""Short messages on disk: waiting and unreported ones outlive the process.
+"""Short messages on disk, so that waiting and unreported ones survive a restart.
 
-Written after each change, in a thread and atomically; later changes are written next. The sender of
-a message gets the reply when it is on disk.
+A thread writes the file atomically after each change; changes during a write follow in the next. A
+command to send a message is answered once the message is on disk.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from fusiond.navigator.state_file import (
     write_state,
 )
 
-if TYPE_CHECKING:  # a vehicle without a terminal does without them
+if TYPE_CHECKING:  # a vehicle without a terminal never loads them
     from fusiond.live.stored_messages import KeptBox, KeptMessages
 
 log = logging.getLogger("fusiond")
 
 
 class MessageKeeper:
-    """Store of one vehicle's messages, beside its saved state, if that is configured.
+    """Store of one vehicle's messages, beside its saved state; unused without a configured state
+    file.
 
     `on_event(code, text)` receives `messages_damaged`, and `messages_not_kept` once a row of
     failures."""
@@ -54,8 +55,8 @@ class MessageKeeper:
         self._working: asyncio.Task[None] | None = None
 
     def load(self, messaging: Messaging) -> str | None:
-        """Restore the last run's messages, aged by the time since; the stored JSON, None without
-        one."""
+        """Restore the last run's messages, aged by the time since then. Returns the stored JSON, or
+        None."""
         if self._path is None or not os.path.lexists(self._path):
             return None
         from fusiond.live.stored_messages import KEPT_MESSAGES  # noqa: PLC0415
@@ -86,7 +87,7 @@ class MessageKeeper:
         self._working = asyncio.create_task(self._write(self._path, revision, text))
 
     async def kept(self, revision: int, messaging: Messaging) -> str:
-        """Wait until this revision is on disk; "" or the reason of failure."""
+        """Wait until this revision is on disk. Returns "", or why it could not be written."""
         if self._path is None:
             return "not kept over a restart: no state_file"
         while self._written < revision and not self._error:

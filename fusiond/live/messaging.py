@@ -1,8 +1,8 @@
 """Short messages of the RDSS terminals: queues, position reports and published results.
 
-The queues belong to the drivers (drivers.rdss.outbox). This part fills them, by an operator's
-command and by `[position_reports]`, and builds `message` and `fleet` from the results. It depends
-only on the drivers' output, commands and ticks, like the rest of the chain.
+The queues belong to the drivers (drivers.rdss.outbox). This module fills them by operators'
+commands and by `[position_reports]`, and builds `message` and `fleet` from the results. Like the
+rest of the chain it depends only on the drivers' output, commands and ticks.
 """
 
 from __future__ import annotations
@@ -30,16 +30,17 @@ from fusiond.outputs.messages.fleet import FleetMessage, of_centre, of_report
 from fusiond.outputs.messages.short_message import ShortMessage, of_received, of_stage
 from fusiond.outputs.topics import MESSAGE, Topic, fleet
 
-if TYPE_CHECKING:  # a vehicle without a terminal does without them
+if TYPE_CHECKING:  # a vehicle without a terminal never loads them
     from drivers.rdss.driver import RdssDriver
     from fusiond.live.stored_messages import KeptMessages
 
 MOST_UNCONFIRMED = 40
-"""Messages that a broker has yet to confirm: what a minute of all cards brings at the most."""
+"""Most messages that wait for the broker's confirmation: the most that all cards can send in a
+minute."""
 MOST_CARDS = 256
 """Retained topics at the broker, one each; a command terminal lists 100 (ICXX)."""
 AHEAD_NS = 60 * SECOND_NS
-"""Lead over our clock from which a report is of the day before."""
+"""An undated report that is further ahead of our clock than this is from the day before."""
 
 
 class Messaging:
@@ -58,7 +59,7 @@ class Messaging:
         self._terminals: dict[str, RdssDriver] = {
             name: driver for name, driver in drivers.items() if hasattr(driver, "post_text")
         }
-        if self._terminals:  # 10 ms that no tick has to spare when the first message comes
+        if self._terminals:  # takes 10 ms: too long for the tick that handles the first message
             import fusiond.live.stored_messages  # noqa: F401, PLC0415
         self._waiting: deque[tuple[Topic, Message]] = deque()
         self._unconfirmed: OrderedDict[int, ShortMessage] = OrderedDict()
@@ -79,8 +80,7 @@ class Messaging:
     # ------------------------------------------------------------------ out
 
     def send(self, command: SendMessage, t_ns: int) -> str:
-        """Queue an operator's message; return a text on the result. Raises
-        `CommandRefusedError`."""
+        """Queue an operator's message and describe the result. Raises `CommandRefusedError`."""
         name = self._terminal(command.source)
         try:
             self._terminals[name].post_text(
@@ -104,7 +104,7 @@ class Messaging:
         return wanted
 
     def note_event(self, code: str) -> None:
-        """An event of a device or of the navigator."""
+        """Remember an event that asks for a position report."""
         if code in self._options.events:
             self._report_due = code
 
@@ -126,7 +126,7 @@ class Messaging:
             self._terminals[name].post_report(key, self._options.card, report, t_ns)
             self._refused.clear()
         except (MessageRefusedError, CommandRefusedError) as error:
-            if str(error) not in self._refused:  # said once, until one is queued again
+            if str(error) not in self._refused:  # reported once, until a report is queued again
                 self._refused.add(str(error))
                 self._on_event("position_reports", "report_refused", str(error))
 
@@ -181,7 +181,7 @@ class Messaging:
         self._waiting.append((MESSAGE, message))
 
     def _place(self, message: FleetMessage) -> None:
-        """The latest place of a card counts; a report may overtake another."""
+        """Publish a card's place unless a later one is known: reports may overtake each other."""
         card, t_ms = message.card, message.t_ms
         if card not in self._places and len(self._places) >= MOST_CARDS:
             self._count(message.source, "fleet_full")
@@ -194,15 +194,15 @@ class Messaging:
     def _count(self, source: str, counter: str) -> None:
         self._terminals[source].counters[counter] += 1
 
-    # ------------------------------------------------------------------ told and kept
+    # ------------------------------------------------------------------ published and stored
 
     def take_waiting(self) -> Iterator[tuple[Topic, Message]]:
-        """Messages to publish, since the last call."""
+        """Take the messages to publish that came since the last call."""
         while self._waiting:
             yield self._waiting.popleft()
 
     def confirm(self, message: object) -> None:
-        """Note that a broker has confirmed a message, or that none exists."""
+        """Note that a broker has confirmed a message, or that there is no broker to confirm it."""
         if isinstance(message, ShortMessage) and message.serial in self._unconfirmed:
             del self._unconfirmed[message.serial]
             self.revision += 1
@@ -243,7 +243,7 @@ def _known(value: float) -> float | None:
 
 
 def _utc_of(report: PositionReport, seen_utc_ns: int | None) -> int | None:
-    """Instant of validity of a report's position; a report without a date is of the last day."""
+    """UTC of a report's position (ns). A report without a date is from the last 24 hours."""
     if report.dated:
         return round(report.t_s * SECOND_NS)
     if seen_utc_ns is None:

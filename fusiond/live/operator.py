@@ -20,7 +20,7 @@ from fusiond.outputs.commands import (
     SetPosition,
 )
 
-EARTH_RADIUS_M = 6.371e6  # mean; the distance is told to people
+EARTH_RADIUS_M = 6.371e6  # mean radius: for distances that only people read
 
 
 class Operator:
@@ -35,8 +35,8 @@ class Operator:
         self._injection = injection
 
     def carry_out(self, command: Command, t_ns: int) -> str:
-        """Result of a command at `t_ns`. Raises `CommandRefusedError` for what cannot be done
-        now."""
+        """Execute a command at `t_ns` and describe its result. Raises `CommandRefusedError` for a
+        command that cannot be executed now."""
         match command:
             case Inject():
                 if command.source not in self._sources.all:

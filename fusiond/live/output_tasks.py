@@ -1,4 +1,4 @@
-"""The outputs at work: a supervised task each, which can be ended one by one."""
+"""Tasks of the outputs: one supervised task each, stopped one by one."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class ProcessUsage:
         self._wall_ns, self._cpu_ns = wall_ns, cpu_ns
         try:
             resident_pages = int(STATM.read_text(encoding="ascii").split()[1])
-        except (OSError, ValueError, IndexError):  # no /proc, none that may be read, none like it
+        except (OSError, ValueError, IndexError):  # no /proc, no permission, or another format
             return percent, None
         return percent, resident_pages * self._page_bytes / 1e6
 
@@ -41,23 +41,23 @@ _M_ARENA_MAX = -8
 
 
 def share_one_heap() -> None:
-    """Limit glibc to one heap for all threads, before any starts: further ones cost a megabyte or
-    more each for a thread that writes ten times a second (mallopt(3), M_ARENA_MAX)."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none
+    """Limit glibc to one heap for all threads (mallopt(3), M_ARENA_MAX); call it before any starts.
+    Each further heap costs a megabyte or more, for a thread that writes ten times a second."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl lacks it
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
 
 
 _MOST_DESCRIPTORS = 16_384
-"""Descriptors that the table is made for at most: 128 kB of the kernel's memory."""
+"""Largest size of the table: 128 kB of the kernel's memory."""
 
 
 def widen_descriptor_table() -> None:
-    """Make the kernel's table of descriptors as large as it may become, before there are threads.
+    """Enlarge the kernel's table of descriptors to its final size, before there are threads.
 
-    The table grows at 64, 256, 512 and so on, and in a process of several threads each growth
-    waits for all processors (Linux, fs/file.c, expand_fdtable: synchronize_rcu): 7 to 20 ms on an
-    idle computer, in the very call that takes in the next guest. It never becomes smaller.
+    The table grows at 64, 256, 512 and so on, and never shrinks. In a process with several threads
+    each growth waits for all processors (Linux, fs/file.c, expand_fdtable: synchronize_rcu): 7 to
+    20 ms on an idle computer, within the `accept` of the next client.
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_DESCRIPTORS if soft == resource.RLIM_INFINITY else min(soft, _MOST_DESCRIPTORS)
@@ -66,9 +66,9 @@ def widen_descriptor_table() -> None:
 
 
 def release_start_memory() -> None:
-    """Release memory that only the start needed: pages of libraries, among them LLVM's, 45 MB,
-    unused once the kernels are loaded, and 13 MB of others; bitcode, 7 MB; objects in cycles; freed
-    memory, 1 MB.
+    """Release memory that only the start needed: 45 MB of LLVM's pages, unused once the kernels are
+    loaded; 13 MB of other libraries' pages; 7 MB of bitcode; objects in cycles; 1 MB of freed
+    memory.
 
     madvise(2), MADV_DONTNEED: unmodified pages of a mapping are clean copies of the file and are
     read again when used. malloc_trim(3) is glibc's.
@@ -77,19 +77,19 @@ def release_start_memory() -> None:
     for start, end in _clean_mappings():
         libc.madvise(ctypes.c_void_p(start), ctypes.c_size_t(end - start), _MADV_DONTNEED)
     release_bitcode()
-    gc.collect()  # what linking left: what was imported is frozen
-    trim = getattr(libc, "malloc_trim", None)  # musl has none
+    gc.collect()  # objects left by linking; those left by imports are frozen
+    trim = getattr(libc, "malloc_trim", None)  # musl lacks it
     if trim is not None:
         trim(0)
 
 
 def _clean_mappings() -> Iterator[tuple[int, int]]:
-    """Addresses of read-only mappings of libraries without a written page.
+    """Address ranges of libraries' read-only mappings without a modified page.
 
-    The linker writes to a page when it resolves addresses; the file has no copy of that."""
+    Pages in which the linker resolved addresses are modified: the file has no copy of them."""
     try:
         lines = SMAPS.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:  # the pages stay
+    except OSError:  # without the list the pages stay in memory
         return
     addresses: str | None = None
     for line in lines:

@@ -35,16 +35,16 @@ from fusiond.outputs.topics import (
 from fusiond.outputs.tracker_schedule import Tracking
 
 STATUS_EVERY_S = 1
-# A calibration moves over minutes; a state that changes goes out at once.
+# A calibration changes over minutes. A change of a parameter's state is published at once.
 CALIBRATION_EVERY_S = 30
 
 
 Make = Callable[[int, int | None], tuple[Topic, Message] | None]
-"""A message of the instant (monotonic ns, UTC ns), where there is anything to say."""
+"""Factory of a message for an instant (monotonic ns, UTC ns); None without contents."""
 
 
 class Publishing:
-    """Builder of a vehicle's messages in the tick, which hands them to every output."""
+    """Publisher of a vehicle's messages: builds them in the tick and hands them to every output."""
 
     def __init__(
         self,
@@ -84,9 +84,10 @@ class Publishing:
     def tick(self, t_ns: int, solution: Solution) -> None:
         """Publish the messages due at the tick of `t_ns`, and the status at every change of mode.
 
-        The large messages of a second are made and go out a tick each, in ticks that have half of
-        their period left: the filter may have gone back for a late fix, and a broker hands a
-        message to all its clients before the next, so that the next solution would wait."""
+        The large messages that are due once a second are made one a tick, in ticks with half of
+        their period left: a rewind for a delayed fix may have used the rest. One at a time, because
+        a broker passes each message to all clients before the next one, and the next `nav` would
+        wait."""
         changed = solution.mode is not self._mode
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
@@ -202,7 +203,7 @@ def _health(output: Output) -> OutputHealth:
 
 
 def _totals(navigator: Navigator) -> tuple[int, int]:
-    """Measurements fused and rejected, of all sources since the start."""
+    """Numbers of measurements of all sources, fused and rejected, since the start."""
     fused = rejected = 0
     for outcomes in navigator.outcomes().values():
         fused += outcomes["fused"]

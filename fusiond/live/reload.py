@@ -1,8 +1,8 @@
-"""Reload of a configuration; what needs a restart.
+"""Reload of a configuration, and the keys that need a restart.
 
 A reload applies the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every
-measurement) and `log_level`, which can change without a loss of the solution. All other keys are
-used when the model, the buffers and the drivers are made.
+measurement) and `log_level`: they can change without losing the solution. All other keys need a
+restart, since the model, the buffers and the drivers are made of them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MQTT = "mqtt"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Result of a reload: `config` is valid from now on. Dotted keys: `taken` ones, and ones that
-    need a `restart`."""
+    """Result of a reload: `config` is the new configuration. `taken` and `restart` are dotted keys:
+    those applied, and those that need a restart."""
 
     config: Config
     taken: tuple[str, ...]
@@ -35,7 +35,7 @@ class Difference:
 
 
 def difference(running: Config, read: Config) -> Difference:
-    """Compare the running configuration with the file. Raises `ConfigError` where accepted changes
+    """Compare the running configuration with the file. Raises `ConfigError` if the applied changes
     conflict with those that need a restart."""
     before, after = dict(_flat(running.model_dump())), dict(_flat(read.model_dump()))
     changed = sorted(
@@ -78,7 +78,7 @@ def _can_be_taken(key: str, gates: Mapping[str, float]) -> bool:
 
 
 def _restarted(running: Config, read: Config) -> frozenset[str]:
-    """An output is made for one section and one broker: those through it go with it."""
+    """Outputs to restart: their section has changed, or the broker through which they publish."""
     before, after = running.outputs.served, read.outputs.served
     found = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
     if running.outputs.geoid_separation_m != read.outputs.geoid_separation_m:

@@ -1,4 +1,4 @@
-"""Data loaded from earlier runs; a replay starts from the same data."""
+"""State loaded from earlier runs, from which a replay starts, too."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fusiond.navigator.saved_state import SavedState
 
 @dataclass(frozen=True, slots=True)
 class RestoredState:
-    """State restored from disk; None where nothing was usable."""
+    """State restored from disk; None for each part that had nothing usable."""
 
     saved: SavedState | None = None
     warm: KeptState | None = None
@@ -24,7 +24,7 @@ class RestoredState:
     """Stored messages, as JSON of `fusiond.live.stored_messages`."""
 
     def restore_into(self, chain: Chain) -> None:
-        """Restore the rest into a chain that was made with `saved`. Raises `DamagedStateError`
+        """Restore everything but `saved`, with which the chain was made. Raises `DamagedStateError`
         for a state of another model."""
         chain.navigator.calibration = self.calibration
         if self.messages is not None:

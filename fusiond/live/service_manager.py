@@ -1,4 +1,4 @@
-"""The service manager's side of the daemon: sd_notify(3)."""
+"""Notifications to the service manager: sd_notify(3)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 class ServiceManager:
     """State notifications to systemd over NOTIFY_SOCKET; does nothing without one.
 
-    Nothing here raises or blocks: a service manager that does not listen is counted in `failed`.
+    No method raises or blocks: `failed` counts notifications that the service manager did not take.
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
@@ -41,7 +41,7 @@ class ServiceManager:
             self.failed += 1
 
     def ready(self, status: str = "") -> None:
-        """Start-up is over."""
+        """Report that the start is complete."""
         self._send("READY=1" + (f"\nSTATUS={_one_line(status)}" if status else ""))
 
     def status(self, text: str) -> None:
@@ -49,7 +49,7 @@ class ServiceManager:
         self._send(f"STATUS={_one_line(text)}")
 
     def reloading(self) -> None:
-        """The configuration is read again, until `ready`."""
+        """Report that the configuration is being reloaded, until `ready`."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
@@ -57,7 +57,8 @@ class ServiceManager:
         self._send("STOPPING=1")
 
     def feed_watchdog(self, t_ns: int) -> None:
-        """A tick was on time at `t_ns` (monotonic); sends at a quarter of the period at most."""
+        """Note a tick on time at `t_ns` (monotonic); notifies at most four times a watchdog
+        period."""
         if self._watchdog_ns is None:
             return
         if self._fed_ns is None or t_ns - self._fed_ns >= self._watchdog_ns // 4:

@@ -1,7 +1,8 @@
-"""The daemon's devices: one supervised task for each driver, and their `health`.
+"""Devices of the daemon: one supervised task for each driver, and their `health`.
 
-A driver's exception restarts that driver, never the daemon. A driver's output is processed here: a
-stamp becomes an instant, an IMU sample waits for the next tick, a time report goes to the clock.
+A driver's exception restarts that driver, never the daemon. This module processes the drivers'
+output: it resolves stamps to instants, stores IMU samples for the next tick, and passes time
+reports to the clock.
 """
 
 from __future__ import annotations
@@ -115,7 +116,8 @@ class Sources:
             self._receive(left)
 
     def poll(self) -> None:
-        """Read the buses: before a tick, which is then the only wake for their frames."""
+        """Read the CAN buses before a tick, so that their frames never wake the process between
+        ticks."""
         for poll in self._polls:
             poll()
 
@@ -125,7 +127,7 @@ class Sources:
             self._receive(item)
 
     def _receive(self, item: Emitted) -> None:
-        if not isinstance(item, ImuSample):  # of which there are most
+        if not isinstance(item, ImuSample):  # the most frequent, so tested first
             if isinstance(item, DeviceEvent):
                 self._on_event(item.source, item.code, item.text)
                 return
@@ -155,15 +157,15 @@ class Sources:
         self._navigator.add(item, instant.t_valid_ns, instant.sd_s, item.t_seen_ns)
 
     def take_imu(self, t_ns: int) -> tuple[NDArray[np.int64], Array] | None:
-        """Samples since the last call, (m,) ns and (m, 6); None without any. If the spare takes
-        over, the navigator is informed first."""
+        """Samples since the last call, (m,) ns and (m, 6); None without any. A change to the spare
+        is reported to the navigator first."""
         navigator = self._navigator
         if self.imu.changes(t_ns, navigator.imu.latest_ns if navigator.imu.end else None):
             navigator.change_imu()
         return self.imu.samples()
 
     def catch_up(self) -> None:
-        """Hand over the samples that ticks have left, before the next input."""
+        """Hand over the samples that earlier ticks left, before any other input."""
         if self.behind:
             self.behind = False
             if (left := self.imu.samples()) is not None:
@@ -178,14 +180,14 @@ class Sources:
 
     @property
     def inputs(self) -> dict[str, Inputs]:
-        """Inputs that move each driver from outside; not of those that have no such door."""
+        """External inputs by driver; drivers without `inputs` are left out."""
         found = {name: getattr(s.driver, "inputs", None) for name, s in self.all.items()}
         return {name: inputs for name, inputs in found.items() if inputs is not None}
 
     def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Send the antenna's height in the solution to the terminals that use it.
+        """Send the solution's antenna height to the terminals that use it.
 
-        Of the lever arm only its upward part counts: tilt moves a roof antenna by centimetres.
+        Only the upward part of the lever arm is used: tilt moves a roof antenna by centimetres.
         """
         for name, source in self.all.items():
             hint = getattr(source.driver, "height_hint", None)
@@ -203,20 +205,20 @@ class Sources:
                 hint(standard_pressure_pa(barometer.height_m), barometer.t_seen_ns)
 
     def request_fix(self, t_ns: int) -> list[str]:
-        """Request a fix of every terminal; return their answers. Empty without a terminal."""
+        """Request a fix of every terminal and return their replies; empty without a terminal."""
         asks = (getattr(s.driver, "request_now", None) for s in self.all.values())
         return [ask(t_ns) for ask in asks if ask is not None]
 
     def faults(self, now_ns: int) -> tuple[FaultReport, ...]:
-        """Faults of the vehicle, those of the inertial unit under the name of the one in use; the
-        latest last."""
+        """Faults of the vehicle, the latest last. Faults of the IMU have the name of the unit in
+        use."""
         return tuple(
             fault_report(f.finding, f.finding.kind.device or self.imu.used or "imu", now_ns)
             for f in self._navigator.service.faults(now_ns)
         )
 
     def _diagnosed(self, now_ns: int) -> Callable[[str], dict[str, Any]]:
-        """Service and latest fault of a source for `health`."""
+        """Lookup of a source's service states and latest fault for `health`."""
         service = self._navigator.service
         pairs = list(zip(service.faults(now_ns), self.faults(now_ns), strict=True))
 
@@ -233,8 +235,8 @@ class Sources:
         return of
 
     def health(self, now_ns: int) -> dict[str, SourceHealth]:
-        """`health` by source; the filter's own measurements (`zero_velocity`) have a line of their
-        own."""
+        """`health` by source; each of the filter's own measurements (`zero_velocity`) has an entry,
+        too."""
         navigator = self._navigator
         outcomes = navigator.outcomes()
         diagnosed = self._diagnosed(now_ns)

@@ -1,8 +1,8 @@
-"""The navigation state in memory that outlives the process: for a start moments after its end.
+"""Navigation state in memory that survives the process, for a restart within moments.
 
-The file is in systemd's runtime directory, a tmpfs: at two writes a second of 6 kB (45 MB an hour)
-it would wear out flash, and a power cut makes it useless, because its clock restarts. A thread
-writes; a tick only copies the arrays.
+The file is in systemd's runtime directory, a tmpfs: two writes a second of 6 kB (45 MB an hour)
+would wear out flash. Nothing is lost by that: after a power cut the state is useless, because the
+monotonic clock restarts. A thread writes; a tick only copies the arrays.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from fusiond.navigator.state_file import (
 
 log = logging.getLogger("fusiond")
 
-# The age of the snapshot is part of the gap that a restart has to cross; half a second is small
-# against the start of the process.
+# A restart has to bridge the age of the snapshot, too; half a second is little beside the start of
+# the process.
 SNAPSHOT_NS = SECOND_NS // 2
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
 class KeptState:
-    """State that outlives the process: the filter's state, and UTC on the monotonic clock."""
+    """State that survives the process: the filter's, and UTC on the monotonic clock."""
 
     navigation: WarmState
     utc: tuple[UtcKnown, ...] = ()
@@ -86,7 +86,7 @@ class WarmKeeper:
         """State offered to the navigator."""
 
     def restore_into(self, navigator: Navigator) -> None:
-        """Restore the last run's clock and navigator, if the boot is the same."""
+        """Restore the last run's clock and navigator, unless the computer was rebooted since."""
         if self._path is None:
             return
         try:
@@ -112,7 +112,7 @@ class WarmKeeper:
             self._working = asyncio.create_task(asyncio.to_thread(self._write, self._path, state))
 
     async def close(self, solution: Solution | None, navigator: Navigator) -> None:
-        """Write the last state, after a pending write has ended; a `restart` is a gap, too."""
+        """Write the last state, after a pending write has ended, also before a `restart`."""
         if self._working is not None:
             await asyncio.wait([self._working])
         state = None if solution is None else self.state(solution, navigator)
@@ -120,8 +120,8 @@ class WarmKeeper:
             await asyncio.to_thread(self._write, self._path, state)
 
     def state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
-        """Present state; None if not worth storing. Axes and biases of a spare do not fit the unit
-        of the next run's start."""
+        """Present state; None if the solution is too poor to store, or if the spare is in use: its
+        axes and biases are not those of the unit that the next run starts with."""
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.trial.on_trial or not usable:
             return None
@@ -152,7 +152,7 @@ class WarmKeeper:
             self._report(f"warm state not kept: {error}")
 
     def _report(self, text: str) -> None:
-        """Report a failed write, once a series; it would repeat twice a second."""
+        """Report the first of a series of failed writes; they would repeat twice a second."""
         if not self._failing:
             self._failing = True
             log.warning("%s", text)
@@ -167,7 +167,7 @@ def _boot_id() -> str:
 
 
 def _asleep_ns() -> int:
-    """Suspended time of this boot (ns), during which the monotonic clock stood still."""
+    """Time that the computer was suspended since boot (ns): the monotonic clock stops meanwhile."""
     asleep = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(
         time.CLOCK_MONOTONIC
     )

@@ -1,6 +1,6 @@
 """State on disk: stored while the vehicle is at rest, removed once it drives.
 
-Only the heading of a vehicle at rest lasts until the next start.
+A vehicle that is driven leaves no state: only a heading at rest is still true at the next start.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from fusiond.navigator.state_file import DamagedStateError, RefusedStateError, s
 
 log = logging.getLogger("fusiond")
 
-# The state on disk is renewed this often while the vehicle stands: a power cut loses a minute.
+# Period of writes at rest: a power cut loses a minute.
 SAVE_EVERY_S = 60
-# Beyond this speed (m/s) the vehicle does not stand, and its heading is not worth keeping.
+# Largest speed (m/s) of a vehicle at rest; above it no heading is saved.
 SAVE_MAX_SPEED_M_S = 0.2
-# Beyond this one (m/s) it drives for certain, whatever the velocity's sigma (0.05 m/s aided): the
-# heading on disk is no longer its own, and a power cut must not bring it back.
+# Above this speed (m/s) the vehicle certainly drives, whatever the velocity's sigma (0.05 m/s
+# aided). Its heading differs from the saved one, which a start after a power cut must not use.
 FORGET_SPEED_M_S = 1.0
 
 
 class StateKeeper:
-    """Store of one vehicle's state in `state_file`, else in systemd's state directory, else none.
+    """Store of one vehicle's state: in `state_file`, else in systemd's state directory; none
+    without either.
 
     Files are written and removed in a thread: a tick never waits for a disk. Failures are logged.
     `on_event(code, text)` receives `saved_state_damaged` and `saved_state_refused`.
@@ -55,7 +56,7 @@ class StateKeeper:
         self._save = Every(SAVE_EVERY_S * SECOND_NS)
 
     def load(self) -> SavedState | None:
-        """State of the last run; None without a usable one."""
+        """Load the last run's state; None without a usable one."""
         if self._path is None:
             return None
         utc_ns = self._clock.utc_ns(self._clock.now_ns())
@@ -99,7 +100,7 @@ class StateKeeper:
         if utc_ns is None or not _speed_m_s(solution) <= SAVE_MAX_SPEED_M_S:
             return None
         s = solution
-        if math.isnan(s.rpy_rad[2]):  # without an inertial unit there is none to keep
+        if math.isnan(s.rpy_rad[2]):  # no heading without an IMU
             return None
         try:
             return SavedState(
@@ -110,7 +111,7 @@ class StateKeeper:
                 s.sd_rpy_rad[2],
                 confirmed,
             )
-        except ValidationError as error:  # a heading that no model estimates, a diverged filter
+        except ValidationError as error:  # a model without heading, or a diverged filter
             log.warning("state not saved: %s", error.errors(include_url=False)[0]["msg"])
             return None
 

@@ -1,7 +1,7 @@
-"""Standard error as a log, written by a thread: a full pipe delays no tick.
+"""Log to standard error by a thread, so that a full pipe delays no tick.
 
-A write to a pipe waits for its reader, possibly for ever, one to a file for a slow disk. The queue
-is bounded; lines beyond it are lost and counted.
+A write to a pipe may wait for its reader for ever, a write to a file for a slow disk. The queue is
+bounded: lines beyond its end are lost and counted.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ FAREWELL_S = 1.0
 
 
 class StandardErrorHandler(logging.StreamHandler[TextIO]):
-    """Handler that writes directly until `begin_thread`, so that processes can be forked before it.
-    `lost` counts lines since the last accepted one, which states the number."""
+    """Handler that writes directly until `begin_thread`, so that processes can be forked before
+    that. `lost` counts the lines lost since the last accepted one; the next accepted line states
+    the number."""
 
     def __init__(self) -> None:
         super().__init__(sys.stderr)
@@ -51,7 +52,7 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
         self._news.set()
 
     def flush(self) -> None:
-        """Write waiting lines as far as accepted."""
+        """Write as many waiting lines as the descriptor takes."""
         if self._thread is None:
             super().flush()
 
@@ -65,8 +66,8 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
         super().close()
 
     def _write_waiting(self) -> None:
-        """Write to the descriptor: a blocked write through Python's buffer would hold its lock,
-        which the interpreter takes at exit."""
+        """Write waiting lines to the descriptor itself: a blocked write through Python's buffer
+        would hold the buffer's lock, for which the interpreter waits at exit."""
         descriptor = self.stream.fileno()
         while True:
             self._news.wait()
@@ -76,7 +77,7 @@ class StandardErrorHandler(logging.StreamHandler[TextIO]):
                 try:
                     while data:
                         data = data[os.write(descriptor, data) :]
-                except OSError:  # the disk is full, the pipe closed
+                except OSError:  # the disk is full or the pipe closed
                     self.lost += 1
             if self._ending:
                 return

@@ -1,4 +1,4 @@
-"""Stored short messages: those that wait, and received ones not yet published.
+"""Stored short messages: waiting ones, and received ones that are not yet published.
 
 Instants are stored as ages, since a monotonic clock may restart.
 """
@@ -25,7 +25,7 @@ Natural = Annotated[int, Field(ge=0, le=2**62)]
 
 @dataclass(frozen=True, slots=True)
 class KeptWording:
-    """`EncodedText` with its bytes in hex."""
+    """Stored `EncodedText`, its bytes in hex."""
 
     payload: Hex
     encoding: TextEncoding
@@ -34,7 +34,7 @@ class KeptWording:
 
 @dataclass(frozen=True, slots=True)
 class KeptMessage:
-    """An `Outgoing`. `age_s` since it was queued."""
+    """Stored `Outgoing`; `age_s` is the time since it was queued."""
 
     key: Annotated[str, Field(max_length=64)]
     receiver: Natural
@@ -51,8 +51,8 @@ class KeptMessage:
 class KeptBox:
     """Messages of one terminal.
 
-    `number`: the last given to a text that asks for a receipt; `seen`: received texts that asked
-    for one."""
+    `number`: the last one used for a text that asks for a receipt. `seen`: received texts that
+    asked for a receipt."""
 
     number: Natural
     waiting: tuple[KeptMessage, ...]
@@ -61,8 +61,8 @@ class KeptBox:
 
 @dataclass(frozen=True, slots=True)
 class KeptMessages:
-    """Stored messages by terminal; `untold` are those that no broker has confirmed. `utc_s` is the
-    instant of writing, None if unknown; `taken_up_ns` that of the restore."""
+    """Stored messages by terminal; no broker has confirmed those of `untold`. `utc_s` is the
+    instant of writing, None if unknown; `taken_up_ns` the instant of the restore."""
 
     serial: Natural
     boxes: dict[str, KeptBox]
@@ -104,7 +104,7 @@ def _kept(m: Outgoing, t_ns: int) -> KeptMessage:
 
 
 def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
-    """Restore waits for receipts, each at most as long as a new one."""
+    """Restore a message; one that waits for a receipt waits at most as long as a new one."""
     wordings = tuple(
         EncodedText(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings
     )

@@ -1,4 +1,4 @@
-"""Supervision of parts: a failed part is restarted after a delay, the daemon continues."""
+"""Supervision of tasks: a failed one is restarted after a delay while the daemon continues."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ log = logging.getLogger("fusiond")
 async def supervise(
     name: str, serve: Callable[[], Awaitable[None]], on_fault: Callable[[str], None]
 ) -> None:
-    """Call `serve` again and again until cancelled; `on_fault(text)` receives each end of it."""
+    """Run `serve` until cancelled, and restart it whenever it ends; `on_fault(text)` receives the
+    reason."""
     backoff = Backoff()
     while True:
         try:

@@ -1,11 +1,11 @@
-"""Fixed-rate tick: absolute deadlines on the monotonic clock, no backlog, garbage collected
-between.
+"""Fixed-rate tick: absolute deadlines on the monotonic clock, no backlog; garbage is collected
+between ticks.
 
     deadline_k = t_0 + k * period
 
-A tick that could not start within its own period is skipped and counted as an overrun; the
-following ones keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick is up
-to 1 ms late on an idle machine; it receives its deadline, not the time of waking.
+A tick that cannot start within its own period is skipped and counted as an overrun; later ticks
+keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick starts up to 1 ms
+after its deadline on an idle machine; it receives the deadline, not the time of waking.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _BINS = 6 * _BINS_PER_DECADE + 1
 
 
 class Every:
-    """Due once a period, on the tick's own time."""
+    """Timer that is due once a period, by the ticks' time."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -37,7 +37,7 @@ class Every:
         return t_ns < self._next_ns
 
     def due(self, t_ns: int) -> bool:
-        """True if a period has passed; those missed altogether are not made up for."""
+        """True if a period has passed; missed periods are not made up for."""
         behind_ns = t_ns - self._next_ns
         if behind_ns < 0:
             return False
@@ -86,11 +86,11 @@ class LatencyHistogram:
 
 
 class Scheduler:
-    """Calls `tick(deadline_ns)` at `rate_hz` until cancelled.
+    """Scheduler that calls `tick(deadline_ns)` at `rate_hz` until cancelled.
 
-    `on_time(now_ns)` is called after every tick that started within its own period and ended
-    before the next: the watchdog's food. `now` and `sleep` (seconds) are the clock and may be a
-    test's. An exception of `tick` leaves `run`.
+    It calls `on_time(now_ns)` after every tick that started within its own period and ended before
+    the next; this feeds the watchdog. `now` and `sleep` (seconds) are the clock, which tests
+    replace. An exception of `tick` ends `run`.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Scheduler:
     async def _run(self) -> None:
         deadline = self._now() + self.period_ns
         while True:
-            # Also when late: other tasks must run between two ticks.
+            # Sleep even after a deadline: other tasks must run between two ticks.
             await self._sleep(max(0, deadline - self._now()) / SECOND_NS)
             behind_ns = self._now() - deadline
             if behind_ns < 0:

@@ -1,4 +1,4 @@
-"""A vehicle's topics as an AsyncAPI document: what `fusiond schema` prints."""
+"""AsyncAPI document of a vehicle's topics, printed by `fusiond schema`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interface of an output: it takes the vehicle's messages in the tick and sends them in its
+"""Interface of an output: takes the vehicle's messages in the tick and sends them in its own
 task."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fusiond.outputs.topics import Topic
 
 
 class Output(Protocol):
-    """An output. `health` shows `counters` and `status` under `name`.
+    """Output of a vehicle's messages. `health` shows `counters` and `status` under `name`.
 
     `nav_rate_hz`: rate at which it takes `nav`. `sets_clocks`: True if clients may set clocks by
     its time of day; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
@@ -56,11 +56,12 @@ class Surroundings:
     """The door of all servers."""
 
     def broker(self) -> MqttPublisher:
-        """Broker of an output that publishes through MQTT; the configuration guarantees one."""
+        """Broker for an output that publishes through MQTT; such an output requires one in the
+        configuration."""
         assert self.mqtt is not None
         return self.mqtt
 
     def time(self) -> Clock:
-        """Clock of an output that publishes time."""
+        """Clock for an output that publishes time."""
         assert self.clock is not None
         return self.clock

@@ -17,7 +17,7 @@ PASSWORD_VARIABLE = "FUSIOND_MQTT_PASSWORD"
 
 
 def password(options: Mqtt, environ: Mapping[str, str] = os.environ) -> str | None:
-    """The broker's password: the environment's, else the file's first line, else none.
+    """Broker's password: from the environment, else the first line of the file, else none.
 
     Raises `ConfigError` if the file cannot be read.
     """
@@ -62,7 +62,7 @@ def tls_context(options: Mqtt) -> ssl.SSLContext | None:
             raise _unusable("ca_file", options.ca_file, error) from error
     if options.cert_file is not None:
         try:
-            # The empty password keeps OpenSSL from asking for one on the terminal.
+            # With an empty password OpenSSL does not ask for one on the terminal.
             context.load_cert_chain(options.cert_file, options.key_file, password="")
         except OSError as error:
             raise _unusable("cert_file", options.cert_file, error) from error

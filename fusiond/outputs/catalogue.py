@@ -50,10 +50,10 @@ def make_outputs(
     kept: Mapping[str, Output] = MappingProxyType({}),
 ) -> dict[str, Output]:
     """Make the configured outputs by name, MQTT first. `on_event(source, code, text)` receives
-    their events. Servers share the connections of `guests`. `kept` outputs exist already, among
-    them those that publish through MQTT.
+    their events. All servers share `guests`, the limit on connections. `kept` outputs already run
+    and are not made again.
 
-    Raises `ConfigError` for one that cannot be as it is configured.
+    Raises `ConfigError` for an output that cannot be made as configured.
     """
     made: dict[str, Output] = {}
     mqtt: MqttPublisher | None = None

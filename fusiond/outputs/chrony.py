@@ -1,10 +1,11 @@
-"""Time for chrony: a datagram a second to the socket of its reference clock SOCK.
+"""Time for chrony: one datagram a second to the socket of its reference clock SOCK.
 
     offset = true UTC - CLOCK_REALTIME, at an instant of CLOCK_REALTIME
 
-The report with the least delay of each second counts, since delay is one-sided. Reports are passed
-on unchanged, without the daemon's own estimate of UTC: chrony has a filter, and its effect on the
-clock must show in the next sample. Nothing is sent before UTC is settled.
+Of each second the report with the least delay is sent, since a delay can only be positive. Reports
+are passed on as the receiver gave them, without the daemon's own estimate of UTC: chrony filters
+them itself, and must see its correction of the clock in the next sample. Nothing is sent before UTC
+is settled.
 
 Source: refclock_sock.c of chrony 4.3, struct sock_sample.
 """
@@ -30,9 +31,10 @@ _SECOND_NS = 1_000_000_000
 
 
 class ChronySocket:
-    """Sender of samples to chronyd. Counters: `sent`; `failed`, chronyd is absent or does not read.
+    """Sender of samples to chronyd. Counters: `sent`, and `failed` while chronyd is absent or does
+    not read.
 
-    `on_event` receives `chrony_absent` once an outage.
+    `on_event` receives `chrony_absent` once in each outage.
     """
 
     name = "chrony"
@@ -53,7 +55,7 @@ class ChronySocket:
         """Ignore messages, which carry no time for chrony."""
 
     def _sampled(self, sample: TimeSample) -> None:
-        """Keep the best of a second of UTC; the next one's first sends it off."""
+        """Keep the best sample of a UTC second; the first sample of the next second sends it."""
         best = self._best
         if best is not None and sample.utc_ns // _SECOND_NS != best.utc_ns // _SECOND_NS:
             self._due.put(best)
@@ -82,12 +84,12 @@ class ChronySocket:
 
 
 def _ahead_ns(sample: TimeSample) -> int:
-    """Lead of true UTC over the system clock by a sample; a delayed sample shows less."""
+    """Lead (ns) of true UTC over the system clock by a sample; a delay makes it smaller."""
     return sample.utc_ns - sample.system_ns
 
 
 def packed(sample: TimeSample) -> bytes:
-    """The datagram; 40 bytes where long has 64 bits."""
+    """Encode a sample as a datagram: 40 bytes where `long` has 64 bits."""
     second, rest_ns = divmod(sample.system_ns, _SECOND_NS)
     offset_s = _ahead_ns(sample) / _SECOND_NS
     return _SAMPLE.pack(second, rest_ns // 1000, offset_s, 0, 0, 0, _MAGIC)

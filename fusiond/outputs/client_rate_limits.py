@@ -2,8 +2,8 @@
 
     left(t) = min(burst, left(t0) + rate (t - t0))
 
-A piece of work may overdraw a bucket. The client then waits until the bucket has refilled, or is
-disconnected for a flood. Time is `time.perf_counter_ns`.
+A piece of work may overdraw a bucket. The client then waits until the bucket has refilled; one that
+floods is disconnected. Time is `time.perf_counter_ns`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Rate limit: amount a second, and burst."""
+    """Rate limit: the amount a second, and the burst."""
 
     per_s: float
     burst: float
@@ -32,7 +32,7 @@ MICROSECONDS = Rate(20_000.0, 20_000.0)
 
 
 class Bucket:
-    """Bucket of a rate."""
+    """Token bucket of one rate."""
 
     __slots__ = ("_at_ns", "_left", "_rate")
 
@@ -46,7 +46,7 @@ class Bucket:
         self._left -= amount
 
     def empty(self, now_ns: int) -> bool:
-        """True if more was used than the limit allows."""
+        """True if the client has used more than the limit allows."""
         self._fill(now_ns)
         return self._left < 0.0
 
@@ -67,5 +67,5 @@ class Allowance:
         self.microseconds = Bucket(MICROSECONDS, now_ns)
 
     def must_wait(self, now_ns: int) -> bool:
-        """True if the client must not be read now."""
+        """True if reading from the client must wait."""
         return self.bytes.empty(now_ns) or self.microseconds.empty(now_ns)

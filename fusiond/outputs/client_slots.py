@@ -1,9 +1,9 @@
-"""Places of a server: the client to disconnect when a new one finds all taken.
+"""Choice of the client that a full server disconnects for a new one.
 
-First a client without a request, or one that does not read its answer. Then, if one host has more
-connections than the newcomer's would have, that host's last one: a host may have all places while
-no other host wants one. An IPv6 host is its network of 64 bits, all addresses of which it may have
-(RFC 4291, 2.5.4).
+First a client that is overdue with its request or with reading its reply. Else, if one host has
+more connections than the new client's host would then have, the last of that host: so one host may
+use all places until another host needs one. All addresses of a 64-bit IPv6 network count as one
+host, because one host may have them all (RFC 4291, 2.5.4).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _HOST_BITS = 64
 
 
 class Placed(Protocol):
-    """A connection that has a place."""
+    """Connection that occupies a place."""
 
     host: str
 
@@ -43,8 +43,8 @@ def host_of(address: Any) -> str:
 
 
 def gives_way(taken: Collection[T], host: str, now_ns: int) -> T | None:
-    """Client that gives way to one of `host`, if anybody does; `taken` in the order they came
-    in."""
+    """Client to disconnect for one of `host`; None if there is none. `taken` is in order of
+    connection."""
     for placed in taken:
         if placed.owes(now_ns):
             return placed

@@ -1,16 +1,15 @@
 """Client sockets of all servers, served in turns at little cost to a tick.
 
-All listeners and connections are in one epoll set, of which the event loop sees a single
-descriptor. When it is readable the loop gives a turn: for each server one piece to send and one to
-receive, until none is left or the window's budget is spent; the rest waits for the next window. A
-piece of work is one `accept`, one `recv` with the handling of its data, or one piece sent to a
-client.
+All listeners and connections are in one epoll set, which the event loop sees as one descriptor.
+When it is readable, the loop serves the servers in turns, one piece sent and one received each,
+until nothing is left or the window's budget is spent; the rest waits for the next window. A piece
+of work is one `accept`, one `recv` with the handling of its data, or one piece sent to a client.
 
     spent in any window of 10 ms <= 1 ms + one piece of work
 
-Servers take turns, and so do the clients of each: a served client goes to the end of its server's
-queue (epoll does so with level-triggered descriptors). With n clients at one of m servers each has
-a turn once in m n, and clients of other servers do not wait for them.
+The clients of a server take turns, too: a served client goes to the end of its server's queue
+(epoll does so with level-triggered descriptors). Each of n clients at one of m servers has one turn
+in m n, and clients of other servers do not wait for them.
 
 Source: fair queueing, round robin by flow (Nagle, RFC 970).
 """
@@ -46,17 +45,17 @@ Handler = Callable[[int], None]
 
 
 class Guest(Protocol):
-    """Client connection."""
+    """Connection of a client."""
 
     def look(self, now_ns: int) -> None:
-        """Continue or abort a wait; called four times a second."""
+        """Resume a paused client, or drop one whose time is over; called four times a second."""
 
 
 class Guests:
     """Connections of all servers of a daemon; at most `most` are open.
 
-    It needs a running event loop while a descriptor is watched, and is never called from outside
-    it. `postponed` counts windows with a spent budget.
+    It needs a running event loop while a descriptor is watched, and is only called within that
+    loop. `postponed` counts windows with a spent budget.
     """
 
     def __init__(self) -> None:
@@ -76,15 +75,16 @@ class Guests:
         self._due: asyncio.Handle | None = None
         self._looking: asyncio.TimerHandle | None = None
 
-    # ------------------------------------------------------------------ who is there
+    # ------------------------------------------------------------------ connections
 
     @property
     def full(self) -> bool:
-        """True if one more would take a descriptor of the daemon's own."""
+        """True if another connection would use a descriptor that the daemon needs."""
         return len(self._open) >= self.most
 
     def places(self, wanted: int) -> int:
-        """Share of a server that wants `wanted` places, if there are too few for all."""
+        """Places of a server that wants `wanted`: fewer in proportion if there are not enough for
+        all."""
         return min(wanted, self.most * wanted // max(wanted, self.wanted))
 
     def came(self, guest: Guest) -> None:
@@ -96,7 +96,8 @@ class Guests:
     # ------------------------------------------------------------------ for the queues
 
     def begin(self, queue: ServerQueue, fd: int) -> None:
-        """`queue` watches something from now on; `fd` is readable while that is so."""
+        """Add a queue with descriptors to watch; `fd`, its epoll set, is readable while one is
+        ready."""
         if self._epoll is None:
             self._begin()
         assert self._epoll is not None
@@ -112,7 +113,7 @@ class Guests:
                 self._end()
 
     def due(self) -> None:
-        """Schedule a turn for work that no descriptor signals."""
+        """Schedule a turn for queued work, which no descriptor signals."""
         if self._paused is None and self._due is None:
             self._due = asyncio.get_running_loop().call_soon(self._turn)
 
@@ -154,7 +155,7 @@ class Guests:
             self._pause(now_ns)
 
     def _pause(self, now_ns: int) -> None:
-        """The budget is spent: the door opens again with the next window."""
+        """Stop serving until the next window, after the budget is spent."""
         assert self._loop is not None
         assert self._epoll is not None
         self.postponed += 1
@@ -178,7 +179,7 @@ class Guests:
 
 
 class ServerQueue:
-    """Queue of one server: its descriptors, and pieces of work."""
+    """Descriptors and queued work of one server."""
 
     def __init__(self, guests: Guests) -> None:
         self._guests = guests
@@ -196,7 +197,7 @@ class ServerQueue:
         self._handlers[fd] = handler
 
     def change(self, fd: int, events: int) -> None:
-        """Wait for other events of an `fd` that is watched."""
+        """Change the events of an `fd` that is watched."""
         if self._epoll is not None:
             self._epoll.modify(fd, events)
 
@@ -213,12 +214,12 @@ class ServerQueue:
             self._work.clear()
 
     def do(self, work: Work) -> None:
-        """Call `work` in a turn."""
+        """Queue `work` for a turn."""
         self._work.append(work)
         self._guests.due()
 
     def serve(self) -> bool:
-        """Send one piece and receive one; False if there was neither."""
+        """Send one piece and receive one; False without either."""
         return self._send_one() | self._receive_one()
 
     def _send_one(self) -> bool:
@@ -234,7 +235,7 @@ class ServerQueue:
         if not self._events:
             return False
         fd, events, handler = self._events.popleft()
-        # It may have gone meanwhile, and its number may be another's.
+        # The descriptor may have been closed meanwhile, and its number used again.
         if self._handlers.get(fd) is handler:
             handler(events)
         return True

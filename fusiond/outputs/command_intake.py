@@ -1,14 +1,14 @@
-"""Intake of commands from the broker: rate, permission and replies.
+"""Commands from the broker: rate limit, permission and reply.
 
-The rate is bounded by a token bucket: it holds `BURST` tokens, gains `RATE_HZ` a second, and a
-command takes one. A command without a token is not read; the first of a row is answered, the row
-ends when the bucket is full again. Every command and every reply costs the tick's own loop time, so
-a client that has run wild costs an addition and a comparison each.
+A token bucket limits the rate: it holds `BURST` tokens, gains `RATE_HZ` a second, and a command
+takes one. A command without a token is not parsed. The first such command is answered, the next
+ones are not, until the bucket is full again. Commands run in the event loop of the tick; so an
+excess command costs an addition and a comparison only.
 
-A command is executed once. MQTT's QoS 1 delivers at least once, and bridges or scripts repeat: a
-name and id that were executed are refused. A broker delivers a retained command at each
-subscription, and marks it: the mark is a refusal. A client that is already subscribed receives it
-unmarked: it is executed, and refused from then on.
+A command is executed once, although MQTT's QoS 1 may deliver it twice, and bridges or scripts may
+repeat it: a name and id that were executed are refused. So are retained commands, which a broker
+delivers, marked, at each subscription. It delivers a retained command unmarked to a client that is
+already subscribed; that one is executed, and refused when it comes again.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from fusiond.outputs.commands import (
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.reply import ReplyMessage
 
-# What a person means: a few clicks a second, and a script that sends a screenful at once.
+# Enough for a person who clicks, and for a script that sends a screenful at once.
 RATE_HZ = 5.0
 BURST = 20.0
 REMEMBERED = 1000
-"""Command ids kept: 200 s of them at the greatest rate; 100 kB."""
-# The longest command name is 13 characters; of what is none so much is repeated.
+"""Remembered command ids: those of 200 s at the highest rate; 100 kB."""
+# Characters of an unknown command's name in the reply; the longest known name has 13.
 _NAME_SHOWN = 40
 Answer = ReplyMessage | Coroutine[None, None, ReplyMessage]
 """Reply to a command: immediate, or once its result is on disk."""
@@ -67,7 +67,7 @@ class CommandIntake:
         self._done: OrderedDict[tuple[str, str], None] = OrderedDict()
 
     def answer(self, name: str, payload: bytes, retained: bool) -> Answer | None:
-        """Carry the command out; the reply, None for one of too many that is not answered."""
+        """Execute the command and return the reply; None for an excess command that gets none."""
         now_s = self._now()
         self._tokens = min(BURST, self._tokens + RATE_HZ * (now_s - self._filled_s))
         self._filled_s = now_s
@@ -110,7 +110,7 @@ class CommandIntake:
             sent_id, text = error.id, str(error)
         except CommandRefusedError as error:
             text = str(error)
-        except Exception as error:  # a fault of ours must not cost the connection
+        except Exception as error:  # a bug of ours must not end the connection
             text = f"failed: {error!r}"
             self._on_event("mqtt_command_failed", f"{name}: {error!r}")
         self._counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
@@ -119,7 +119,7 @@ class CommandIntake:
     async def _later(self, name: str, sent_id: str, said: Awaitable[str]) -> ReplyMessage:
         try:
             return self._reply(name, sent_id, True, await said)
-        except Exception as error:  # a fault of ours must not cost the connection
+        except Exception as error:  # a bug of ours must not end the connection
             self._on_event("mqtt_command_failed", f"{name}: {error!r}")
             return self._reply(name, sent_id, False, f"failed: {error!r}")
 

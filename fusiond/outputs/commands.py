@@ -12,7 +12,7 @@ MAX_PAYLOAD_BYTES = 4096
 
 
 class Command(BaseModel):
-    """Base of every command. `id` is the sender's own and comes back in the reply."""
+    """Base of every command. The sender chooses `id`; the reply repeats it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -89,7 +89,7 @@ class Inject(Command):
 
 
 class SetGates(Command):
-    """Gates of a reloaded configuration; internal, not sent over MQTT."""
+    """Gates of a reloaded configuration; internal, not a command of MQTT."""
 
     gates: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]]
     """`gate_probability` by section of `aiding`."""
@@ -117,11 +117,11 @@ disk comes later."""
 
 
 class CommandRefusedError(Exception):
-    """The command is well formed but cannot be carried out; the text goes into the reply."""
+    """Error of a valid command that cannot be executed; its text goes into the reply."""
 
 
 class BadCommandError(ValueError):
-    """The payload is no such command; `id` is the request's if it could be read."""
+    """Error of a payload that is no valid command; `id` is the sender's, if readable."""
 
     def __init__(self, text: str, id: str | None = None) -> None:
         super().__init__(text)
@@ -134,9 +134,9 @@ class _Id(BaseModel):
 
 
 def parse(name: str, payload: bytes) -> Command:
-    """The command `name` of a JSON payload. Raises `BadCommandError` for anything else."""
+    """Parse a JSON payload as the command `name`. Raises `BadCommandError` for anything else."""
     if len(payload) > MAX_PAYLOAD_BYTES:
-        # Of a packet that is far too long the end was never kept (outputs.packet_limit).
+        # The end of an oversized packet is missing (outputs.oversized_packets).
         text = f"{len(payload)} bytes or more, at most {MAX_PAYLOAD_BYTES} are read"
         raise BadCommandError(text)
     try:
@@ -149,7 +149,7 @@ def parse(name: str, payload: bytes) -> Command:
 
 
 def request_id(payload: bytes) -> str | None:
-    """Request's `id`, if readable, from any payload."""
+    """Sender's `id` in any payload, if readable."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         return None
     try:

@@ -21,8 +21,8 @@ TWO_SIDED_95 = 1.959964
 
 
 class Motion(NamedTuple):
-    """Motion over the ground: m/s, degrees from true north (None: too slow for a direction), 95 %
-    errors of both."""
+    """Speed over ground (m/s) and course (degrees from true north; None if too slow for a
+    direction), with their 95 % errors."""
 
     speed_m_s: float
     speed_error_m_s: float
@@ -36,14 +36,14 @@ def usable(nav: NavMessage) -> bool:
 
 
 def known(value: float | None) -> float | None:
-    """Value, or None if unknown: NaN in messages made here, null in those read back."""
+    """Value, or None if unknown: NaN in messages built here, null in messages read back."""
     return value if value is not None and isfinite(value) else None
 
 
 def motion(nav: NavMessage) -> Motion | None:
     """Speed and course over the ground; None without a velocity.
 
-    Slower than its own 95 % error it may as well go the other way: no course.
+    The course is None below the speed's 95 % error: the vehicle may as well move the opposite way.
     """
     figures = [known(x) for x in (nav.v_n_m_s, nav.v_e_m_s, nav.sd_vn_m_s, nav.sd_ve_m_s)]
     if any(x is None for x in figures):
@@ -60,7 +60,7 @@ def motion(nav: NavMessage) -> Motion | None:
 
 
 def horizontal_rms_m(nav: NavMessage) -> float | None:
-    """Root of the sum of both variances: 63 to 68 % of errors are smaller, 95 to 98 % than twice
-    it, by the ellipse's shape."""
+    """Root of the sum of the horizontal variances. By the ellipse's shape 63 to 68 % of errors are
+    smaller than it, and 95 to 98 % smaller than twice it."""
     north, east = known(nav.sd_n_m), known(nav.sd_e_m)
     return None if north is None or east is None else hypot(north, east)

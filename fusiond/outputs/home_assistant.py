@@ -1,8 +1,8 @@
-"""Home Assistant's discovery: one retained message at the broker describes the entities.
+"""Home Assistant's discovery: one retained message describes the entities.
 
-They read the topics `tracker`, `status` and `health`, never `nav`, which would flood Home
-Assistant's recorder. The broker retains the description; it is sent again when Home Assistant
-starts, for brokers that lose it.
+The entities read the topics `tracker`, `status` and `health`, never `nav`, which would flood Home
+Assistant's recorder. The broker retains the description. It is sent again whenever Home Assistant
+starts, for a broker that has lost it.
 
 Source: "MQTT Discovery, device discovery payload" of Home Assistant's documentation, the
 abbreviations of its release 2025.4.
@@ -32,12 +32,12 @@ Component = dict[str, Any]
 
 
 class Description(RootModel[dict[str, Any]]):
-    """The discovery message; Home Assistant refuses one with a key that it does not know."""
+    """Discovery message; Home Assistant refuses it if a key is unknown to it."""
 
 
 class HomeAssistantDiscovery:
-    """Publisher of the entities' description. Counter: `births`, the number of repeated requests
-    for it."""
+    """Publisher of the entities' description. Counter: `births`, starts of Home Assistant, after
+    which it is sent again."""
 
     name = "home_assistant"
     sets_clocks = False
@@ -59,7 +59,7 @@ class HomeAssistantDiscovery:
         return self._mqtt.status
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Ignore messages: the entities read the topics of MQTT."""
+        """Ignore messages: the entities read the MQTT topics."""
 
     async def run(self) -> None:
         await asyncio.get_running_loop().create_future()
@@ -71,7 +71,7 @@ class HomeAssistantDiscovery:
 
 
 def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, Any]:
-    """The entities of a vehicle: position, mode and its reason, accuracy, each device."""
+    """Entities of a vehicle: position, mode and its reason, accuracy, each device."""
     base = base_topic(vehicle)
     release = version("fusiond")
     return {
@@ -85,7 +85,7 @@ def description(node: str, vehicle: str, sources: tuple[str, ...]) -> dict[str, 
 
 
 def _entities(node: str, base: str, sources: tuple[str, ...]) -> list[tuple[str, Component]]:
-    """Keys and entities."""
+    """Entities by key."""
 
     def entity(key: str, platform: str, name: str | None, **more: Any) -> tuple[str, Component]:
         identity = {"p": platform, "uniq_id": f"{node}_{key}", "name": name}
@@ -107,7 +107,7 @@ def _entities(node: str, base: str, sources: tuple[str, ...]) -> list[tuple[str,
             "sensor",
             "Reason",
             stat_t=f"{base}/{STATUS.name}",
-            val_tpl="{{ value_json.why[:255] }}",  # a state's longest text
+            val_tpl="{{ value_json.why[:255] }}",  # longest text of a state
             ent_cat="diagnostic",
         ),
         entity(

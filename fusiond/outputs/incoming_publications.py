@@ -1,12 +1,12 @@
-"""Subscriptions to publications of others, counted before they are parsed.
+"""Flood protection of subscriptions: publications are counted before they are parsed.
 
-A broker forwards publications at any rate on the connection of our own confirmations: behind a
-hundred thousand commands a confirmation is seconds late, and QoS 0 messages are withheld meanwhile,
-since they may be lost unseen. Reading faster does not help, reading more slowly makes it worse. A
-flooded client therefore unsubscribes, drops what was already sent, and subscribes again later.
+A broker forwards others' publications at any rate, on the connection that also carries our
+confirmations. Behind a hundred thousand commands a confirmation comes seconds late, and meanwhile
+QoS 0 messages are withheld, since they might be lost unnoticed. Reading faster does not help,
+reading more slowly makes it worse. So a flooded client unsubscribes, drops what is already on its
+way, and subscribes again later.
 
-Little is in flight at that moment, since the kernel buffers only `HELD_BYTES` for us instead of
-megabytes.
+Little is on its way then, since the kernel buffers only `HELD_BYTES` instead of megabytes.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from drivers.base import Backoff
 from fusiond.outputs.client_rate_limits import Bucket, Rate
 
 MESSAGES = Rate(100.0, 500.0)
-"""Five commands a second are carried out, twenty at once (`command_intake`). A message costs 0.1 ms
-until its row is refused: so many a second are a hundredth of a core."""
+"""Limit of messages. A message costs 0.1 ms until it is refused: 100 a second are a hundredth of a
+core. `command_intake` executes at most five commands a second, twenty at once."""
 BYTES = Rate(65_536.0, 131_072.0)
-"""Sixteen of the longest commands a second, thirty-two at once (`MAX_PAYLOAD_BYTES`)."""
+"""Limit of bytes: 16 of the longest commands a second, 32 at once (`MAX_PAYLOAD_BYTES`)."""
 QUIET_S, LONGEST_QUIET_S = 10.0, 60.0
-"""Pause after a flood, doubled by each further one."""
+"""First pause after a flood, and the longest; each further flood doubles the pause."""
 PEACE_S = 60.0
-"""Time without a flood after which the pause is the first again."""
+"""Time without a flood after which the next pause is the first one again."""
 
 
 class Incoming:
-    """Publications of one connection. `counters["mqtt_flooded"]` counts messages dropped unread."""
+    """Publications that arrive on one connection. `counters["mqtt_flooded"]` counts those dropped
+    unread."""
 
     def __init__(self, client: aiomqtt.Client, counters: Counter[str], quiet: Backoff) -> None:
         self._counters = counters
         self._quiet = quiet
         self._flooded = asyncio.Event()
         self._restart()
-        paho = client._client  # aiomqtt has no place to look at a message before it is queued
+        paho = client._client  # aiomqtt has no hook before it queues a message
         self._on_message: Any = paho.on_message
         paho.on_message = self._count
 
@@ -55,7 +56,7 @@ class Incoming:
             self._on_message(paho, userdata, message)
 
     async def flood(self) -> float:
-        """Wait for a flood; return the pause of the subscriptions, s."""
+        """Wait for a flood; return how long to pause the subscriptions, s."""
         await self._flooded.wait()
         if time.monotonic() - self._since_s > PEACE_S:
             self._quiet.reset()
@@ -72,5 +73,5 @@ class Incoming:
 
 
 def quiet() -> Backoff:
-    """Pauses after floods."""
+    """Backoff of the pauses after floods."""
     return Backoff(first_s=QUIET_S, longest_s=LONGEST_QUIET_S)

@@ -1,7 +1,7 @@
-"""Parser of a client's JSON, with one error for all invalid input.
+"""Parser of clients' JSON with one error for all invalid input.
 
-Besides invalid JSON it refuses excessive nesting, half a surrogate pair (which no text can encode),
-NaN and infinities.
+It also refuses excessive nesting, half a surrogate pair (which no text can encode), NaN and
+infinities.
 
 Source: RFC 8259, sections 8.2 and 9 (a parser may limit the depth).
 """
@@ -17,11 +17,11 @@ DEEPEST = 16
 
 
 class NotUnderstoodError(ValueError):
-    """Error: invalid JSON; the text is a reason in a few ASCII characters."""
+    """Error of invalid JSON; its text is a short reason in ASCII."""
 
 
 def parsed(text: str | bytes) -> Any:
-    """The value of a JSON text. Raises `NotUnderstoodError`."""
+    """Value of a JSON text. Raises `NotUnderstoodError`."""
     try:
         value = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
     except RecursionError:

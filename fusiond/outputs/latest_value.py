@@ -1,4 +1,4 @@
-"""Place for one value: a new value replaces one that was not read."""
+"""Place for one value, in which a new value replaces an unread one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ T = TypeVar("T")
 
 
 class Latest(Generic[T]):
-    """`put` never waits; `next` waits for a new value. `replaced` counts unread values; `last` is
-    the newest, read or not."""
+    """Latest value: `put` never waits, `next` waits for a new one. `replaced` counts values that
+    were replaced unread; `last` is the newest, read or not."""
 
     def __init__(self) -> None:
         self.last: T | None = None

@@ -1,4 +1,4 @@
-"""Listening port of a server, retried while in use, with its state."""
+"""Listening port of a server: retried while in use, with its state."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.base import Backoff, DriverStatus
 
 
 class Listening(Protocol):
-    """Listening server."""
+    """Server that listens."""
 
     @property
     def sockets(self) -> Iterable[socket.socket]: ...
@@ -33,7 +33,7 @@ class Port:
         self.status = DriverStatus()
 
     async def open(self, listen: Callable[[str, int], Awaitable[S]]) -> S:
-        """Server by `listen(host, port)`; waits while it raises `OSError`."""
+        """Open the port by `listen(host, port)`; retry while that raises `OSError`."""
         backoff = Backoff()
         while True:
             try:
@@ -51,10 +51,10 @@ class Port:
             return server
 
     def report(self, code: str, text: str) -> None:
-        """An event `<name>_<code>`."""
+        """Report an event `<name>_<code>`."""
         self._on_event(f"{self._name}_{code}", text)
 
     def serves(self, clients: int) -> None:
-        """Report the number of connected clients."""
+        """Set the state to the number of connected clients."""
         host, port = self.address
         self.status = DriverStatus("running", f"{host}:{port}, {clients} connected")

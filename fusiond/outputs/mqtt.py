@@ -1,9 +1,9 @@
 """MQTT publisher: a supervised connection and bounded queues.
 
 `publish` stores a message and returns: it never waits and never raises. One task sends the latest
-values (QoS 0), another status and events (QoS 1, each confirmed before the next); both belong to
-one connection and end with it. A missing confirmation reveals a frozen broker: a QoS 1 message goes
-out at least every quarter of `keepalive_s`, and must be confirmed within half of it.
+values (QoS 0), another sends status and events (QoS 1, each confirmed before the next); both belong
+to one connection and end with it. To detect a frozen broker, a QoS 1 message is sent at least every
+quarter of `keepalive_s`, and its confirmation must come within half of it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
 _OVERDUE = "timed out"
 """Text of aiomqtt's error for a missing confirmation: the disconnection is our own."""
-# aiomqtt warns of every message that it discards: in a flood of commands a line each.
+# aiomqtt logs a line for every message that it discards: too many in a flood of commands.
 _LOG = logging.getLogger("fusiond.aiomqtt")
 _LOG.setLevel(logging.ERROR)
 
@@ -73,8 +73,9 @@ class MqttPublisher:
         self.nav_rate_hz = options.nav_rate_hz
         self._base = base_topic(vehicle)
         self._online = f"{self._base}/online"
-        # A stable name: when we come back before the broker has noticed the old connection's
-        # end, it closes that one, and its will is out before our new `online`.
+        # The name is the same at each start: if we reconnect before the broker has noticed the end
+        # of the old connection, it closes the old one and publishes its will before our new
+        # `online`.
         self._client_id = options.client_id or f"fusiond-{vehicle}"
         self._password = broker_access.password(options)
         self._tls = broker_access.tls_context(options)
@@ -83,7 +84,7 @@ class MqttPublisher:
         self._heartbeat_s = options.keepalive_s / 4
         self._latest: dict[Topic, BaseModel] = {}
         self._queue: deque[tuple[Topic, BaseModel]] = deque(maxlen=options.queue)
-        # The latest of what is retained and confirmed, and which of it is yet to be sent.
+        # Latest messages of the topics that are retained and confirmed, and those still to be sent.
         self._retained: dict[Topic, BaseModel] = {}
         self._due: dict[Topic, None] = {}
         self._events: deque[EventMessage] = deque(maxlen=MOST_KEPT)
@@ -112,12 +113,12 @@ class MqttPublisher:
     # ------------------------------------------------------------------ for the tick
 
     def listen(self, address: str, listener: Callable[[bytes], None]) -> None:
-        """Subscribe `listener` to publications of others at `address`; before `run`."""
+        """Subscribe `listener` to others' publications at `address`; call before `run`."""
         self._listeners[address] = listener
 
     def publish(self, topic: Topic, message: BaseModel) -> None:
-        """Store a message for sending. With QoS 0 the latest counts; a retained one is confirmed
-        and sent again after each connection; all others are queued."""
+        """Store a message for sending. With QoS 0 only the latest is sent; a retained one is
+        confirmed, and sent again after each connection; all others are queued."""
         if topic.qos == 0:
             self._replace(topic, message)
         elif topic.retained:
@@ -144,7 +145,8 @@ class MqttPublisher:
         self._confirmed_ready.set()
 
     def _keep_event(self, message: EventMessage) -> None:
-        """Retain the last events for later subscribers; the list may grow before it is sent."""
+        """Retain the last events for later subscribers; further events may join before they are
+        sent."""
         self._events.append(message)
         self._retained[EVENTS] = events_message(tuple(self._events))
         self._due[EVENTS] = None
@@ -220,9 +222,9 @@ class MqttPublisher:
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> str:
-        """Send and receive until the connection fails; the reason it did."""
+        """Send and receive until the connection fails; return the reason."""
         self._flowing.set()
-        # Not a TaskGroup: in Python 3.11 it leaves its parent counted as cancelled.
+        # No TaskGroup: that of Python 3.11 leaves its parent marked as cancelled.
         tasks = [
             asyncio.create_task(self._listen(client)),
             asyncio.create_task(self._receive(client)),
@@ -292,7 +294,8 @@ class MqttPublisher:
                     await self._confirm(client, self._online, b"online", retain=True)
 
     async def _send_waiting(self, client: aiomqtt.Client) -> None:
-        """Send due retained messages and every queued one; a failed one stays queued."""
+        """Send the due retained messages and all queued ones; a queued one that fails stays
+        queued."""
         while self._due or self._queue:
             if self._due:
                 topic = next(iter(self._due))
@@ -311,7 +314,7 @@ class MqttPublisher:
     async def _confirm(
         self, client: aiomqtt.Client, address: str, payload: bytes, retain: bool
     ) -> None:
-        """Publish with QoS 1; the QoS 0 flow stops while the confirmation is overdue."""
+        """Publish with QoS 1; QoS 0 messages stop while the confirmation is overdue."""
         loop = asyncio.get_running_loop()
         overdue = loop.call_later(_TIMEOUT_S, self._flowing.clear)
         try:
@@ -323,7 +326,7 @@ class MqttPublisher:
     # ------------------------------------------------------------------ commands
 
     async def _listen(self, client: aiomqtt.Client) -> None:
-        """Keep subscriptions; after a flood pause them for a while."""
+        """Keep the subscriptions; pause them for a while after a flood."""
         addresses = [*self._listeners]
         if self._commands is not None:
             addresses.append(f"{self._base}/cmd/+")
@@ -342,7 +345,7 @@ class MqttPublisher:
             coming.over()
 
     async def _receive(self, client: aiomqtt.Client) -> None:
-        """Answer commands; ends with `MqttError` when the connection does."""
+        """Answer commands; raises `MqttError` when the connection ends."""
         prefix = f"{self._base}/cmd/"
         async for message in client.messages:
             payload = message.payload
@@ -360,7 +363,7 @@ class MqttPublisher:
                     self._reply_later(reply)
 
     def _reply_later(self, reply: Coroutine[None, None, ReplyMessage]) -> None:
-        """The connection may be another by then: the reply waits like any other."""
+        """Queue a reply once its result is known, whichever connection exists then."""
 
         async def wait() -> None:
             self._enqueue(REPLY, await reply)

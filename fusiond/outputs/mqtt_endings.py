@@ -1,5 +1,5 @@
-"""End of a broker's connection where aiomqtt fails: a swallowed cancellation, a frozen broker, an
-abandoned attempt."""
+"""Endings of a broker's connection that aiomqtt does not handle: a swallowed cancellation, a frozen
+broker, an abandoned attempt."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FAREWELL_S = 2.0
 
 
 async def end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
-    """Cancel tasks and wait for them; their errors."""
+    """Cancel tasks, wait for them, and return their errors."""
     for task in tasks:
         task.cancel()
     results = await asyncio.gather(*tasks, return_exceptions=True)
@@ -22,20 +22,20 @@ async def end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
 
 
 def honour_cancellation() -> None:
-    """Raise a cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows when it
-    coincides with the result (python/cpython issue 86296)."""
+    """Raise a swallowed cancellation: `asyncio.wait_for` of Python 3.11, used by aiomqtt, drops one
+    that coincides with the result (python/cpython issue 86296)."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
 
 
 def hang_up(client: aiomqtt.Client) -> None:
-    """Shut the socket without DISCONNECT: the broker then publishes the will.
+    """Shut down the socket without DISCONNECT, so that the broker publishes the will.
 
-    aiomqtt offers only the graceful way, which a frozen broker never confirms; its reader sees
-    the end of file and closes the connection's remains. `_client` is paho's public client.
+    aiomqtt offers only a graceful disconnect, which a frozen broker never confirms. After the
+    shutdown its reader sees the end of file and closes the rest. `_client` is paho's public client.
     """
-    if client._connected.cancelled():  # aiomqtt would ask the attempt how it ended
+    if client._connected.cancelled():  # aiomqtt's callback would read the cancelled attempt
         client._client.on_disconnect = None
     sock = client._client.socket()
     if isinstance(sock, socket.socket):

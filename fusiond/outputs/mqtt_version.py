@@ -1,10 +1,10 @@
-"""Version of MQTT for a broker: 5, or 3.1.1 if it does not support that.
+"""Version of MQTT for a broker: 5, or 3.1.1 for a broker without 5.
 
-A client of version 5 states its largest packet (Maximum Packet Size, MQTT 5, 3.1.2.11.4): the
-broker keeps longer ones. It also learns whether a command was retained (Retain As Published,
-3.8.3.1). A broker of 3.1.1 refuses the version (CONNACK 1; MQTT 3.1.1, 3.1.2-2), disconnects, or is
-silent, since it misreads the properties: a missing reply counts as a refusal. The version of the
-first reply is kept for the process.
+A client of version 5 states its largest packet (Maximum Packet Size, MQTT 5, 3.1.2.11.4), and the
+broker does not send longer ones. It also learns whether a command was retained (Retain As
+Published, 3.8.3.1). A broker of 3.1.1 refuses version 5 (CONNACK 1; MQTT 3.1.1, 3.1.2-2),
+disconnects, or misreads the properties and is silent: so a missing reply counts as a refusal. The
+first version that gets a reply is used as long as the process runs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _UNANSWERED = "Operation timed out"
 
 
 class MqttVersion:
-    """Protocol version of one broker, for a client with packets of at most `most_bytes`."""
+    """Protocol version of one broker, for a client that accepts packets of `most_bytes`."""
 
     def __init__(self, most_bytes: int) -> None:
         self.is_5 = True
@@ -36,7 +36,7 @@ class MqttVersion:
         self._other_tried = False
 
     def client(self, host: str, port: int, *, timeout: float, **options: Any) -> aiomqtt.Client:
-        """Unconnected client of this version; `timeout` (s) is for replies once connected."""
+        """Make an unconnected client of this version; `timeout` (s) limits the wait for replies."""
         if not self.is_5:
             return aiomqtt.Client(host, port, timeout=timeout, **options)
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
@@ -55,7 +55,7 @@ class MqttVersion:
         self._other_tried = False
 
     def failed(self, error: aiomqtt.MqttError) -> bool:
-        """Switch to the other version if this one may be the cause; True to retry at once."""
+        """Switch to the other version if this one may be the cause; True for an immediate retry."""
         code = error.rc if isinstance(error, aiomqtt.MqttCodeError) else None
         refused = getattr(code, "value", code) == _UNSUPPORTED
         if not (refused or str(error) == _UNANSWERED):

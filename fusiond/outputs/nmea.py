@@ -41,8 +41,8 @@ _QUALITY = {Mode.NAVIGATING: "1", Mode.COASTING: "6"}
 
 
 class NmeaServer:
-    """Server of sentences at `host:port`, with the counters of `TcpServer`. A client's bytes are
-    discarded; only its end matters."""
+    """Server of sentences at `host:port`, with the counters of `TcpServer`. Bytes from clients are
+    discarded."""
 
     name = "nmea"
     sets_clocks = True
@@ -76,13 +76,13 @@ class NmeaServer:
 
 
 def sentences(nav: NavMessage, kinds: Sequence[str], geoid_separation_m: float | None) -> bytes:
-    """An epoch: the sentences of `kinds`, in the order in which gpsd understands them.
+    """Sentences of one epoch: those of `kinds`, in an order that gpsd understands.
 
     GST and PASHR are sent only with a solution: they have no field for its absence.
     """
     epoch = _Epoch(nav, geoid_separation_m)
     makers: dict[str, Callable[[], list[str] | None]] = {
-        "PASHR": epoch.pashr,  # last in the epoch it makes gpsd 3.22 print no TPV
+        "PASHR": epoch.pashr,  # as the last of an epoch it keeps gpsd 3.22 from sending TPV
         "RMC": epoch.rmc,
         "GGA": epoch.gga,
         "VTG": epoch.vtg,
@@ -100,7 +100,7 @@ def _sentence(kind: str, fields: list[str]) -> bytes:
 
 
 class _Epoch:
-    """Solution `nav` as NMEA fields; unknown ones are empty."""
+    """Solution `nav` as NMEA fields; unknown fields are empty."""
 
     def __init__(self, nav: NavMessage, geoid_separation_m: float | None) -> None:
         self._nav = nav
@@ -110,7 +110,7 @@ class _Epoch:
         self._mode = _MODE.get(nav.mode, "N")
         self._time = self._date = ""
         if nav.t_ms is not None:
-            # Hundredths, cut off: rounding could say 60.00 s.
+            # Hundredths are cut off: rounding could give 60.00 s.
             at = datetime.fromtimestamp(nav.t_ms // 1000, UTC)
             self._time = f"{at:%H%M%S}.{nav.t_ms % 1000 // 10:02d}"
             self._date = f"{at:%d%m%y}"
@@ -120,7 +120,7 @@ class _Epoch:
         return "" if figure is None else f"{figure * scale:.{decimals}f}"
 
     def _angle(self, value: float | None, decimals: int) -> str:
-        """Format an angle from 0 to 360; rounding must not reach 360."""
+        """Format an angle of 0 to 360 deg, which rounding must not make 360."""
         figure = known(value) if self._usable else None
         return "" if figure is None else f"{round(figure, decimals) % 360.0:.{decimals}f}"
 
@@ -129,7 +129,7 @@ class _Epoch:
         return [*self._coordinate(nav.lat_deg, 2, "NS"), *self._coordinate(nav.lon_deg, 3, "EW")]
 
     def _coordinate(self, value: float | None, digits: int, signs: str) -> list[str]:
-        """Degrees and minutes, to 0.2 mm."""
+        """Format degrees and minutes, to 0.2 mm."""
         figure = known(value) if self._usable else None
         if figure is None:
             return ["", ""]
@@ -179,7 +179,7 @@ class _Epoch:
 
     def pashr(self) -> list[str] | None:
         nav = self._nav
-        # Without a time pynmeagps 1.1 takes it for another PASHR and raises IndexError.
+        # pynmeagps 1.1 takes one without time for another kind of PASHR and raises IndexError.
         if not self._usable or not self._time:
             return None
         tilt = [known(x) for x in (nav.roll_deg, nav.pitch_deg)]

@@ -1,7 +1,7 @@
 """OwnTracks output: the vehicle's location for phones, through the broker of `[mqtt]`.
 
-A location for each `tracker`, with the speed, course and height of the last `nav`. It has a date,
-so none is sent before UTC is settled.
+Each `tracker` makes one location, with speed, course and height of the last `nav`. A location has a
+date, so none is sent before UTC is settled.
 
 Source: OwnTracks booklet, "JSON", _type=location: acc and vac m, alt m, cog deg, vel km/h, tst and
 created_at POSIX seconds.
@@ -28,12 +28,12 @@ _KMH_M_S = 1.0 / 3.6
 
 
 class Location(RootModel[dict[str, str | int | float]]):
-    """`_type` location; unknown values are omitted."""
+    """Message of `_type` location; unknown values are omitted."""
 
 
 class OwnTracksLocations:
-    """Publisher of `owntracks/<user>/<vehicle>`, retained. Counters: `locations`; `undated`, left
-    out because UTC is not settled."""
+    """Publisher of `owntracks/<user>/<vehicle>`, retained. Counters: `locations`, and `undated`,
+    those not sent because UTC is not settled."""
 
     name = "owntracks"
     sets_clocks = True

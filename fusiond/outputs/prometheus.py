@@ -1,10 +1,10 @@
 """Prometheus output: the daemon's state as metrics at `/metrics`.
 
-Answers from the latest messages, with a text made once a second at most, so that scrapes do not
-load the tick. Units are Prometheus's base units: seconds, metres, radians, bytes.
+The reply is made from the latest messages, at most once a second, so that scrapes do not load the
+tick. Units are Prometheus's base units: seconds, metres, radians, bytes.
 
-Source: Prometheus text exposition format 0.0.4; OpenMetrics 1.0 for state sets (a series a state,
-1 for the one that holds).
+Source: Prometheus text exposition format 0.0.4; OpenMetrics 1.0 for state sets (one series for each
+state, 1 for the present state).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Labels = tuple[tuple[str, str], ...]
 
 
 class Family(NamedTuple):
-    """Metric; `samples` are (suffix of the name, labels, value)."""
+    """Metric family; `samples` are (suffix of the name, labels, value)."""
 
     name: str
     kind: Literal["gauge", "counter", "histogram"]
@@ -89,7 +89,7 @@ class PrometheusEndpoint:
         return _Scrape(self, client)
 
     def answer(self, head: bytes) -> bytes:
-        """Reply to a request with this head."""
+        """Reply to a request with the head `head`."""
         method, path, *_ = [*head.split(b"\r\n", 1)[0].split(), b"", b""]
         if method not in (b"GET", b"HEAD"):
             self.counters["malformed"] += 1
@@ -108,7 +108,7 @@ class PrometheusEndpoint:
     # ------------------------------------------------------------------ metrics
 
     def families(self) -> list[Family]:
-        """Metrics of now."""
+        """Present metrics."""
         found: list[Family] = []
         for message in self._latest.values():
             match message:
@@ -134,7 +134,7 @@ class PrometheusEndpoint:
 
 
 class _Scrape:
-    """Connection: one request, one reply, then the end."""
+    """Connection of one request and one reply."""
 
     def __init__(self, endpoint: PrometheusEndpoint, client: Client) -> None:
         self._endpoint, self._client = endpoint, client
@@ -164,7 +164,8 @@ def _labelled(
     labels: tuple[str, ...],
     values: Mapping[Any, float | None],
 ) -> Family:
-    """Family of series by the tuple of their labels' values; unknown values are omitted."""
+    """Make a family of `values`, whose keys are tuples of label values; unknown values are
+    omitted."""
     samples = tuple(
         ("", tuple(zip(labels, key, strict=True)), float(value))
         for key, value in values.items()
@@ -177,7 +178,7 @@ def _states(
     name: str, text: str, labels: tuple[str, ...], held: Iterable[tuple[tuple[str, ...], str]],
     states: Iterable[str],
 ) -> Family:  # fmt: skip
-    """A state set: 1 for the state that holds, 0 for the others."""
+    """Make a state set: 1 for the present state, 0 for all others."""
     known = tuple(states)
     values = {(*key, state): float(state == now) for key, now in held for state in known}
     return _labelled(name, "gauge", text, labels, values)
@@ -307,7 +308,7 @@ def _of_consistency(consistency: ConsistencyMessage) -> Iterator[Family]:
 
 
 def exposition(families: Iterable[Family]) -> str:
-    """The families as text."""
+    """Format the families as text."""
     lines: list[str] = []
     for family in families:
         lines += [f"# HELP {family.name} {family.text}", f"# TYPE {family.name} {family.kind}"]

@@ -1,20 +1,22 @@
 """Reconnection to the broker, and detection of a second client with our name.
 
-A broker ends the older of two connections with one client identifier (MQTT 3.1.1, 3.1.4-2), in that
-version without a reason. Repeated ends moments after connecting reveal a rival that reconnects as
-we do. Each then waits longer; otherwise the two would disconnect each other several times a second.
+A broker ends the older of two connections with one client identifier (MQTT 3.1.1, 3.1.4-2); in
+3.1.1 it gives no reason. Connections that end again and again, moments after they began, reveal a
+rival with our name that reconnects as we do. We then wait longer; otherwise the two would
+disconnect each other several times a second.
 """
 
 from __future__ import annotations
 
 from drivers.base import Backoff
 
-# A rival that reconnects as we do is back within the longest ordinary wait, 5 s; so a connection
-# was taken over if it was ended within twice that.
+# A rival that reconnects as we do returns within the longest ordinary wait, 5 s. So a connection
+# that ends within twice that time was taken over.
 TAKEN_WITHIN_S = 10.0
-# Once may be a broker that restarts, twice its configuration being tried out.
+# One end may be a restart of the broker, two a trial of its configuration.
 TAKEN_COUNT = 3
-# With a rival each waits at most a minute; peace is a connection that outlives two such waits.
+# With a rival each wait is a minute at most; the rival is gone if a connection outlives two such
+# waits.
 LONGEST_CONTESTED_S = 60.0
 PEACE_S = 2.0 * LONGEST_CONTESTED_S
 
@@ -29,7 +31,7 @@ class Reconnecting:
         self._in_a_row = 0
 
     def failed(self) -> None:
-        """No connection came about: the broker is away, or was."""
+        """Note a failed attempt, which is no evidence of a rival: the broker is away."""
         self._in_a_row = 0
 
     def ended(self, lasted_s: float, by_broker: bool) -> bool:
@@ -48,5 +50,5 @@ class Reconnecting:
         return True
 
     def wait_s(self) -> float:
-        """Time before the next attempt, s."""
+        """Wait before the next attempt, s."""
         return (self._contested if self.taken else self._ordinary).next()

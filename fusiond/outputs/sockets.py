@@ -1,4 +1,4 @@
-"""Sockets of a TCP server: listening address, and options of a connection."""
+"""Sockets of a TCP server: listening addresses, and options of a connection."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LINGER_NOT = struct.pack("ii", 1, 0)
 
 
 async def bound(host: str, port: int) -> list[socket.socket]:
-    """Sockets at every address of `host`. Raises `OSError`."""
+    """Make sockets at every address of `host`. Raises `OSError`."""
     loop = asyncio.get_running_loop()
     found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     sockets: list[socket.socket] = []
@@ -31,8 +31,8 @@ async def bound(host: str, port: int) -> list[socket.socket]:
 
 
 def tune(sock: socket.socket, timeout_s: float) -> None:
-    """Detect a dead connection: after 20 s of silence it is probed twice, 5 s apart; unconfirmed
-    data are waited for `timeout_s`."""
+    """Set a connection to end if its peer is dead: two probes, 5 s apart, after 20 s of silence, or
+    `timeout_s` with unacknowledged data."""
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

@@ -1,10 +1,10 @@
-"""TCP server whose clients hold up neither each other nor a tick.
+"""TCP server whose clients delay neither each other nor a tick.
 
 All work for a client is done in turns (`fusiond.outputs.client_sockets`) and charged to its
 allowance: a client that sends too much is read more slowly, one with too many requests is dropped.
-Unread output waits in its connection: 16 KiB in the process and as much again in the kernel. While
-these are full its epochs are skipped; after thirty skipped in a row, or half a minute without
-reading, it is dropped. A connection counts until its descriptor is closed.
+Output that a client has not read waits in its connection: 16 KiB in the process and as much again
+in the kernel. While both are full, epochs are skipped; after thirty in a row, or half a minute
+without reading, the client is dropped. A connection counts until its descriptor is closed.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ class Session(Protocol):
     """State of one client."""
 
     def receive(self, data: bytes) -> None:
-        """Receive bytes, at most a KiB at once."""
+        """Process received bytes, a KiB at most."""
 
     def end(self) -> None:
-        """The connection is no more."""
+        """Release the session after the connection's end."""
 
 
 class Unheard:
-    """Session of a client without requests; input is read only to notice its end."""
+    """Session that ignores input, which is read only to notice the connection's end."""
 
     def receive(self, data: bytes) -> None:
         pass
@@ -74,7 +74,7 @@ class Unheard:
 
 
 class Client:
-    """Client connection; after its close only the descriptor number remains."""
+    """Connection of a client."""
 
     def __init__(self, sock: socket.socket, server: TcpServer, host: str) -> None:
         self.host = host
@@ -96,7 +96,7 @@ class Client:
         self._flushing = self._slowed = self._finishing = self.closed = False
         self.session: Session | None = None
         self.on_room: Callable[[], None] | None = None
-        """Called when all that was sent is out."""
+        """Called when the kernel has taken all data."""
         self._wanted = select.EPOLLIN
         self._queue.watch(self._fd, self._wanted, self._ready)
         self._guests.came(self)
@@ -104,7 +104,7 @@ class Client:
     # ------------------------------------------------------------------ for the server
 
     def send(self, data: bytes) -> None:
-        """Send all of `data` or nothing, without waiting."""
+        """Queue all of `data`, or nothing while too much is waiting; never waits."""
         if self.closed or self._finishing:
             return
         if self._out_bytes > MOST_WAITING_BYTES:
@@ -117,7 +117,7 @@ class Client:
         self._put(data)
 
     def finish(self, data: bytes = b"") -> None:
-        """Send `data`, then close."""
+        """Send `data` and what is waiting, then close."""
         if self.closed or self._finishing:
             return
         self._finishing = True
@@ -127,7 +127,7 @@ class Client:
             self.close()
 
     def charge(self) -> bool:
-        """Count one request; False, and the client is dropped, beyond its limit."""
+        """Count one request. Beyond the limit drop the client and return False."""
         now_ns = time.perf_counter_ns()
         self._allowance.messages.spend(1.0, now_ns)
         if not self._allowance.messages.empty(now_ns):
@@ -143,7 +143,7 @@ class Client:
         """Close at once and discard waiting data; counted as `reason`."""
         if not self.closed:
             self._counters[reason] += 1
-            # Reset: the kernel would keep for a minute what nobody reads.
+            # Close by a reset: otherwise the kernel would store unread data for a minute.
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NOT)
             self.close()
 
@@ -155,13 +155,13 @@ class Client:
         self._guests.left(self)
         self._socket.close()
         self._out.clear()
-        session, self.session, self.on_room = self.session, None, None  # no circle is left
+        session, self.session, self.on_room = self.session, None, None  # breaks reference cycles
         self._server.ended(self)
         if session is not None:
             session.end()
 
     def owes(self, now_ns: int) -> bool:
-        """True if a request, or room for a final reply, is overdue."""
+        """True if the client is overdue with its request, or with reading its last reply."""
         since_ns = self.since_ns if self.request_due else self._moved_ns
         due = self.request_due or self._finishing
         return due and now_ns - since_ns > HASTY_S * _SECOND_NS
@@ -212,7 +212,7 @@ class Client:
             self._wait_for(self._wanted & ~select.EPOLLIN)
 
     def _hung_up(self) -> None:
-        """Handle the client's end of sending; pending replies are still sent."""
+        """Close after the client's end of sending, once pending replies are sent."""
         self._wait_for(self._wanted & ~select.EPOLLIN)
         self.finish()
 
@@ -260,14 +260,14 @@ class Client:
 
 
 class _Listener:
-    """The sockets of a port at the door."""
+    """Listening sockets of a port."""
 
     def __init__(self, sockets: list[socket.socket]) -> None:
         self.sockets = sockets
 
 
 class TcpServer:
-    """Server at `host:port`, or at the socket that the service manager holds as `name`.
+    """Server at `host:port`, or at the socket `name` of the service manager.
 
     `greet(client)` gives the session of a connection. `counters`: `clients` (since the start),
     `clients_refused` (too many at once), `clients_dropped` (did not read), `clients_flooding`
@@ -312,31 +312,32 @@ class TcpServer:
                 client.close()
 
     def send(self, data: Callable[[Client], bytes]) -> None:
-        """Send each client the bytes that `data` returns for it, if any."""
+        """Send each client the bytes that `data(client)` returns, if any."""
         for client in tuple(self.clients):
             payload = data(client)
             if payload:
                 client.send(payload)
 
     def ended(self, client: Client) -> None:
-        """A connection is closed."""
+        """Remove a client whose connection is closed."""
         del self.clients[client]
         self.port.serves(len(self.clients))
 
-    # ------------------------------------------------------------------ who comes
+    # ------------------------------------------------------------------ new connections
 
     async def _listening(self, host: str, port: int) -> _Listener:
         held = activated(self.name)
         sockets = await bound(host, port) if held is None else [held]
         for sock in sockets:
             sock.setblocking(False)
-            # Inherited by each connection: the kernel would keep megabytes for who does not read.
+            # Each connection inherits this limit: otherwise the kernel would store megabytes for a
+            # client that does not read.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_WAITING_BYTES // 2)
             sock.listen(_BACKLOG)
         return _Listener(sockets)
 
     def _watch(self, listening: socket.socket) -> None:
-        if listening.fileno() >= 0:  # else it was closed during a pause
+        if listening.fileno() >= 0:  # unless it was closed during a pause
             self.queue.watch(listening.fileno(), select.EPOLLIN, lambda _: self._accept(listening))
 
     def _accept(self, listening: socket.socket) -> None:
@@ -345,7 +346,7 @@ class TcpServer:
         except OSError as error:
             if error.errno in _SHORT:
                 self._pause(listening, error)
-            return  # else who came has gone again
+            return  # otherwise the client has disconnected already
         host = host_of(address)
         self._make_room(host)
         if len(self.clients) >= self._places or self.guests.full:
@@ -368,7 +369,7 @@ class TcpServer:
         return self.guests.places(self._most)
 
     def _make_room(self, host: str) -> None:
-        """Free a place on a full server for a client from `host`."""
+        """Disconnect a client of a full server, if `host` may have its place."""
         if len(self.clients) < self._places:
             return
         client = gives_way(self.clients, host, time.perf_counter_ns())
@@ -376,7 +377,7 @@ class TcpServer:
             client.drop("malformed" if client.request_due else "clients_gave_way")
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """No descriptor is left: said once a minute at most, and tried again later."""
+        """Pause accepting while no descriptor is left; report it once a minute at most."""
         now_ns = time.perf_counter_ns()
         logged_ns = self._short_logged_ns
         if logged_ns is None or now_ns - logged_ns > SHORT_LOGGED_S * _SECOND_NS:

@@ -1,4 +1,4 @@
-"""MQTT topics of a vehicle with content and delivery."""
+"""MQTT topics of a vehicle: contents and delivery."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fusiond.outputs.messages.tracker import TrackerMessage
 class Topic:
     """Topic below `fusiond/<vehicle>`: contents and delivery.
 
-    `below` is the rest of the address of a topic of which there are several.
+    `below` is the last part of the address of a topic that exists several times.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Topic:
 
     @property
     def path(self) -> str:
-        """Name of the topic with its subtopics."""
+        """Name of the topic with `below`."""
         return f"{self.name}/{self.below}" if self.below else self.name
 
     def address(self, base: str) -> str:
@@ -57,7 +57,7 @@ EVENTS = Topic("events", EventsMessage, 1, True)
 REPLY = Topic("reply", ReplyMessage, 1, False)
 MESSAGE = Topic("message", ShortMessage, 1, False)
 FLEET = Topic("fleet", FleetMessage, 1, True, below="{card}")
-"""Topic of all cards; `fleet(card)` is that of one."""
+"""Pattern of all cards' topics; `fleet(card)` is the topic of one."""
 TOPICS = (
     *(NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER),
     *(EVENT, EVENTS, REPLY, MESSAGE, FLEET),
@@ -65,7 +65,7 @@ TOPICS = (
 
 
 def fleet(card: int) -> Topic:
-    """Topic of another vehicle, by the number of its card."""
+    """Topic of the vehicle with a card's number."""
     return replace(FLEET, below=str(card))
 
 

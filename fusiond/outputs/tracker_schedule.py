@@ -17,14 +17,14 @@ _METRES_A_DEGREE = 111_195.0
 
 
 class Tracking:
-    """Last published position, for a decision on the next. Time is the tick's."""
+    """Decision on the next `tracker`, by the last one published and the tick's time."""
 
     def __init__(self) -> None:
         self._sent: TrackerMessage | None = None
         self._sent_ns = 0
 
     def due(self, t_ns: int, nav: NavMessage) -> TrackerMessage | None:
-        """The message to send at `t_ns`; None if there is none to send."""
+        """Message to send at `t_ns`; None if none is due."""
         since_ns = t_ns - self._sent_ns
         if self._sent is not None and since_ns < SHORTEST_NS:
             return None

@@ -1,1 +1,1 @@
-"""Foxglove's WebSocket protocol: channels, and the server that Foxglove and Lichtblick open."""
+"""Foxglove's WebSocket protocol: channels, and a server for Foxglove and Lichtblick."""

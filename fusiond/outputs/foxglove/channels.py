@@ -1,7 +1,7 @@
-"""Channels of Foxglove: its own schemas for map, attitude and log, and every topic.
+"""Channels for Foxglove: every topic, and Foxglove's own schemas for map, attitude and log.
 
-Position covariance is east-north-up (m^2), of the variances alone. The attitude turns the body,
-with x forward, y left, z up, into east-north-up: by roll, minus pitch and 90 deg minus yaw, 3-2-1.
+Position covariance is east-north-up (m^2), with zeros off the diagonal. The attitude turns the body
+axes (x forward, y left, z up) into east-north-up: roll, minus pitch and 90 deg minus yaw, 3-2-1.
 
 Source: JSON schemas `foxglove.LocationFix`, `foxglove.FrameTransforms`, `foxglove.Log`.
 """
@@ -64,7 +64,8 @@ _LOG = _object(
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Channel: `payload(message)` converts a message of `topic`; None sends nothing.
+    """Channel to viewers: `payload(message)` converts a message of `topic`, or is None to send
+    nothing.
 
     `schema()` is made on demand: those of all topics take 0.05 s.
     """
@@ -104,7 +105,7 @@ def location_fix(message: Message) -> bytes | None:
     covariance[::4] = [0.0 if x is None else x * x for x in sd]
     height = known(message.height_m)
     if height is None:
-        height, covariance[8] = 0.0, NO_HEIGHT_SD_M**2  # the schema wants a number
+        height, covariance[8] = 0.0, NO_HEIGHT_SD_M**2  # the schema requires a number
     return _json(
         {
             "timestamp": _time(message.t_ms),

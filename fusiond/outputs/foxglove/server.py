@@ -1,12 +1,11 @@
 """WebSocket server for Foxglove, Lichtblick and compatible viewers; needs `websockets`.
 
-A message is encoded once for all its viewers. Each viewer has a place for each of its
-subscriptions, in which a newer message replaces an unsent one: a slow viewer delays only itself,
-and holds only the bytes in flight. A viewer that reads nothing for half a minute is disconnected,
-as is one whose connection is dead (`fusiond.outputs.tcp`).
+A message is encoded once for all viewers. For each of its subscriptions a viewer has one place, in
+which a newer message replaces an unsent one: so a slow viewer delays only itself, and only its
+bytes in flight occupy memory. A viewer that reads nothing for half a minute, or whose connection is
+dead, is disconnected (`fusiond.outputs.tcp`).
 
-A browser states the origin of the page (`Origin`): pages of this computer and of `origins` may
-connect.
+A browser sends the page's `Origin`: pages of this computer and of `origins` may connect.
 
 Source: Foxglove WebSocket Protocol v1 (`foxglove.websocket.v1`, and `foxglove.sdk.v1`, which is the
 same for this server): serverInfo, advertise, subscribe, unsubscribe; binary message data is opcode
@@ -97,7 +96,7 @@ class FoxgloveServer:
             group.create_task(self._distribute())
 
     def last(self, channel: Channel) -> Data | None:
-        """The newest message of a channel, encoded; None if there is none to send."""
+        """Newest message of a channel, encoded; None without one to send."""
         if channel.id not in self._encoded:
             message = self._latest.get(channel.topic)
             self._encoded[channel.id] = None if message is None else _data(channel, message)
@@ -105,7 +104,7 @@ class FoxgloveServer:
 
     @cached_property
     def greeting(self) -> bytes:
-        """First messages to a viewer: the server, and the channels; the frames."""
+        """Frames of the first messages to a viewer: server information and channels."""
         hello = {
             "op": "serverInfo",
             "name": f"fusiond {self._vehicle}",
@@ -119,7 +118,7 @@ class FoxgloveServer:
         return text_frame(json.dumps(hello)) + text_frame(json.dumps(advertised))
 
     def refuse_origin(self, origin: str) -> None:
-        """A page of that site wanted to connect."""
+        """Count and report a page of a site that may not connect."""
         self.counters["origins_refused"] += 1
         now_s = time.monotonic()
         if self._origin_logged_s is None or now_s - self._origin_logged_s > ORIGIN_EVENT_S:
@@ -132,7 +131,7 @@ class FoxgloveServer:
         return Viewer(self, client)
 
     async def _distribute(self) -> None:
-        """Distribute messages from the tick's places to the viewers."""
+        """Pass the messages that ticks have left to the viewers."""
         while True:
             await self._queued.wait()
             self._queued.clear()
@@ -143,7 +142,7 @@ class FoxgloveServer:
                     topic = next(iter(self._waiting))
                     message = self._waiting.pop(topic)
                 self._place(topic, message)
-                await asyncio.sleep(0)  # a tick may be due
+                await asyncio.sleep(0)  # let a due tick run
 
     def _place(self, topic: Topic, message: Message) -> None:
         for channel in CHANNELS:

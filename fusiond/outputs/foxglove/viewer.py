@@ -35,7 +35,7 @@ _ON_THEIR_WAY_BYTES = 8192
 _DATA = struct.Struct("<BIQ")
 _OPCODE_DATA = 1
 _BY_ID = {channel.id: channel for channel in CHANNELS}
-# A line for everyone who connects, and a traceback for who speaks something else.
+# It logs a line for each connection, and a traceback for each that is no WebSocket.
 _LOG = logging.getLogger("fusiond.websockets")
 _LOG.setLevel(logging.CRITICAL)
 
@@ -61,7 +61,7 @@ def loopback(origin: str) -> bool:
 
 
 class Viewer:
-    """Viewer; `channels` counts its subscriptions to each channel."""
+    """Connected viewer; `channels` counts its subscriptions to each channel."""
 
     def __init__(self, server: FoxgloveServer, client: Client) -> None:
         self._server, self._client = server, client
@@ -91,7 +91,7 @@ class Viewer:
         self._waiting[number] = data
 
     def _send_waiting(self) -> None:
-        """Send waiting frames while little is in flight; frames are built for this viewer alone."""
+        """Send waiting messages while little is in flight, in frames for this viewer alone."""
         while (
             self._socket.state is OPEN
             and self._waiting
@@ -103,23 +103,23 @@ class Viewer:
             self._pass_on()
 
     def _report(self, text: str) -> None:
-        if self._socket.state is OPEN:  # not after a frame that has ended it, in the same piece
+        if self._socket.state is OPEN:  # an earlier frame of the same piece may have closed it
             self._socket.send_text(text.encode())
 
     def _pass_on(self) -> None:
-        """Frame to send over the WebSocket."""
+        """Send what the WebSocket has encoded; close after its last frame."""
         parts = self._socket.data_to_send()
         data = b"".join(parts)
         if data:
             self._client.send(data)
-        if b"" in parts or self._socket.close_expected():  # its mark of the end
+        if b"" in parts or self._socket.close_expected():  # the mark of the end of data
             self._client.finish()
 
     # ------------------------------------------------------------------ from the viewer
 
     def receive(self, data: bytes) -> None:
         if self._client.request_due:
-            # websockets has bounds for a line and for lines, together a megabyte.
+            # The limits of websockets, on a line and on the number of lines, allow a megabyte.
             self._head_bytes += len(data)
             if self._head_bytes > MOST_REQUEST_BYTES:
                 self._client.drop("malformed")
@@ -138,7 +138,7 @@ class Viewer:
                 return
 
     def end(self) -> None:
-        self._socket.parser.close()  # it holds the protocol, which holds it
+        self._socket.parser.close()  # breaks the cycle of parser and protocol
         self._waiting.clear()
         self.channels.clear()
 

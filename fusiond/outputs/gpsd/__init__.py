@@ -1,1 +1,1 @@
-"""gpsd's JSON protocol: requests, reports, and the server that gpsd's clients talk to."""
+"""gpsd's JSON protocol: requests, reports, and the server for gpsd's clients."""

@@ -1,4 +1,4 @@
-"""Reports of gpsd's protocol, built from the daemon's messages; no I/O.
+"""Reports in gpsd's protocol, built from the daemon's messages; no I/O.
 
 Units m, m/s, degrees; `climb` up, `velD` down; the errors of TPV at 95 %, those of GST one sigma.
 Unknown values are left out, since the protocol has neither null nor NaN. TPV has only fields of
@@ -31,13 +31,13 @@ Report = dict[str, Any]
 
 
 def encoded(report: Report) -> bytes:
-    """The report as a line. Without spaces: cgps reads `"mode": 3` as no fix at all."""
+    """Encode a report as a line without spaces: cgps reads `"mode": 3` as no fix."""
     text = json.dumps(known_only(report), separators=(",", ":"), allow_nan=False)
     return text.encode() + b"\r\n"
 
 
 def known_only(report: Report) -> Report:
-    """A report without the keys that have no value."""
+    """Report without the keys whose value is unknown."""
 
     def stands(value: Any) -> bool:
         return value is not None and not (isinstance(value, float) and not isfinite(value))
@@ -56,7 +56,7 @@ def version(release: str) -> Report:
 
 
 def device(path: str, activated: str | None) -> Report:
-    """Report of the only device; `activated` is its start in UTC."""
+    """Report DEVICE of the only device; `activated` is its start in UTC."""
     report = {"class": "DEVICE", "path": path, "driver": "fusiond", "activated": activated}
     return known_only(report)
 
@@ -66,7 +66,7 @@ def error(text: str) -> Report:
 
 
 def tpv(path: str, nav: NavMessage, geoid_separation_m: float | None) -> Report:
-    """Time, position, velocity."""
+    """Report TPV: time, position, velocity."""
     head = {"class": "TPV", "device": path}
     if not usable(nav):
         return head | {"mode": _NO_FIX, "time": nav.t_utc}
@@ -107,7 +107,7 @@ def tpv(path: str, nav: NavMessage, geoid_separation_m: float | None) -> Report:
 
 
 def att(path: str, nav: NavMessage) -> Report | None:
-    """Report of the attitude; None while unknown."""
+    """Report ATT: attitude; None while unknown."""
     if not usable(nav) or known(nav.yaw_deg) is None:
         return None
     return {
@@ -122,7 +122,7 @@ def att(path: str, nav: NavMessage) -> Report | None:
 
 
 def gst(path: str, nav: NavMessage) -> Report | None:
-    """Report of one sigma of position and velocity; None without a position."""
+    """Report GST: one sigma of position and velocity; None without a position."""
     if not usable(nav):
         return None
     return {
@@ -139,7 +139,7 @@ def gst(path: str, nav: NavMessage) -> Report | None:
 
 
 def sky(path: str, t_utc: str | None, seen: SkyHealth) -> Report:
-    """Report of the satellites of the last raw epoch; refused ones count as unused."""
+    """Report SKY: satellites of the last raw epoch; refused ones are marked unused."""
     satellites = [_satellite(name, seen) for name in (*seen.used, *seen.refused)]
     return {
         "class": "SKY",

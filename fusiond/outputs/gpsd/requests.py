@@ -1,10 +1,10 @@
 """Requests of gpsd's clients: bytes in, requests out; no I/O.
 
-A request is `?NAME;` or `?NAME={...};`. Clients end it with the semicolon, with a line end, with
-both, or, after an object, with neither: an object ends where its brackets close. Each byte is
-examined once, in pieces of any size.
+A request is `?NAME;` or `?NAME={...};`. Clients end it by the semicolon, by a line end or by both;
+an object also ends where its brackets close. The parser examines each byte once, in pieces of any
+size.
 
-Source: gpsd_json(5) of gpsd 3.22, "Core protocol commands"; what its clients really send.
+Source: gpsd_json(5) of gpsd 3.22, "Core protocol commands"; recorded requests of its clients.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Malformed:
-    """Something that is no request."""
+    """Input that is no request."""
 
     text: str
 
@@ -47,7 +47,7 @@ class RequestReader:
         self._quoted = self._escaped = False
 
     def feed(self, data: bytes) -> Iterator[Request | Malformed]:
-        """The requests that are complete now."""
+        """Requests that are complete after `data`."""
         begin = 0
         for index, byte in enumerate(data):
             if not self._ends(byte):

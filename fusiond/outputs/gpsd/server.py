@@ -1,4 +1,4 @@
-"""Server for gpsd's clients in place of gpsd: VERSION on connection, reports to watchers."""
+"""Server for gpsd's clients, in place of gpsd: VERSION on connection, reports to watchers."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Watch:
     pps: bool = False
 
     def ask(self, wanted: dict[str, Any]) -> str | None:
-        """Adopt a client's object; the reason if it is invalid.
+        """Apply a client's object; return the reason if it is invalid.
 
-        Without `enable` it starts watching; without a format it gets no reports, as from gpsd 3.22:
-        clients that then connect again and ask for JSON read the answer first.
+        Without `enable` the client starts watching; without a format it gets no reports. gpsd 3.22
+        does the same: a client can then read the reply before it asks for JSON.
         """
         asked = {k: v for k, v in wanted.items() if k in self.__slots__ and k != "raw"}
         wrong = [key for key, value in asked.items() if not isinstance(value, bool)]
@@ -57,7 +57,7 @@ class Watch:
 
 
 class _Asking:
-    """A client's own state."""
+    """State of one client."""
 
     def __init__(self, server: GpsdServer, client: Client) -> None:
         self.watch = Watch()
@@ -121,11 +121,11 @@ class GpsdServer:
             self.server.send(self._epoch.wanted)
 
     def wanted(self, client: Client) -> Watch:
-        """Set the options of a client's WATCH."""
+        """Options of a client's WATCH."""
         return client.session.watch if isinstance(client.session, _Asking) else Watch()
 
     def reports(self, nav: NavMessage) -> dict[str, Report]:
-        """The reports of an epoch, by class in small letters."""
+        """Reports of an epoch, by class in lower case."""
         made = {
             "tpv": reports.tpv(self.device, nav, self._geoid_m),
             "att": reports.att(self.device, nav),
@@ -144,7 +144,7 @@ class GpsdServer:
         return _Asking(self, client)
 
     def answer(self, watch: Watch, request: Request | Malformed) -> bytes:
-        """Reply to a request; `watch` is the client's new subscription."""
+        """Reply to a request; WATCH changes `watch`, the client's options."""
         if isinstance(request, Request) and request.name == "POLL":
             self.counters["requests"] += 1
             return self._epoch.polled() if self._epoch is not None else encoded(_poll(None, {}))
@@ -192,8 +192,8 @@ def _poll(t_utc: str | None, made: dict[str, Report]) -> Report:
 
 
 class _Epoch:
-    """Reports of one `nav`, with the satellites of that time: made once for all clients, and only
-    if one wants it."""
+    """Reports of one `nav` with the satellites of that time, made once for all clients when the
+    first client needs them."""
 
     def __init__(self, nav: NavMessage, server: GpsdServer) -> None:
         self._nav, self._server = nav, server
@@ -207,7 +207,7 @@ class _Epoch:
         return b"".join(map(self._in, formats))
 
     def polled(self) -> bytes:
-        """The answer to POLL."""
+        """Reply to POLL."""
         return self._in("poll")
 
     def _in(self, form: str) -> bytes:

@@ -1,1 +1,1 @@
-"""The messages of the MQTT topics, a module each: flat JSON, units in the names as in the files."""
+"""Messages of the MQTT topics, one module each: flat JSON with units in the names."""

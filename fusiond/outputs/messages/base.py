@@ -1,7 +1,7 @@
-"""Base of every message: the instant that it speaks of, null while the daemon knows no UTC.
+"""Base of every message: its instant of validity, null while UTC is unknown.
 
-An unknown quantity is `null` (NaN here). Only the published schemas have bounds: the daemon builds
-messages from its own values, and NaN is within no bound.
+An unknown quantity is `null` (NaN here). Bounds are in the published schemas only: the daemon
+builds messages from its own values, and a check would refuse NaN.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Message(BaseModel):
 
 
 def stamp(utc_ns: int | None) -> tuple[str | None, int | None]:
-    """`t_utc` and `t_ms` of a UTC instant in ns; both null if it is not known."""
+    """`t_utc` and `t_ms` of a UTC instant in ns; both null if it is unknown."""
     if utc_ns is None:
         return None, None
     t_ms = utc_ns // 1_000_000

@@ -37,7 +37,7 @@ class ConsistencyMessage(Message):
 def consistency_message(
     utc_ns: int | None, reports: Mapping[str, Consistency]
 ) -> ConsistencyMessage:
-    """`consistency` from the monitors' reports."""
+    """Build `consistency` from the monitors' reports."""
     t_utc, t_ms = stamp(utc_ns)
     return ConsistencyMessage(
         t_utc=t_utc,

@@ -1,4 +1,4 @@
-"""Message `event`: an operator's notice."""
+"""Message `event`: a notice for the operator."""
 
 from __future__ import annotations
 

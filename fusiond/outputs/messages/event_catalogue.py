@@ -22,17 +22,17 @@ class Entry(NamedTuple):
 
 
 def info(meaning: str, advice: str = "") -> Entry:
-    """Entry of a normal event, or one without urgency."""
+    """Entry of a normal event, or of one that needs no action soon."""
     return Entry("info", meaning, advice)
 
 
 def warning(meaning: str, advice: str) -> Entry:
-    """Entry of something that makes the solution worse, or will."""
+    """Entry of an event that makes the solution worse, or soon will."""
     return Entry("warning", meaning, advice)
 
 
 def error(meaning: str, advice: str) -> Entry:
-    """Entry of a failure that needs an operator's action."""
+    """Entry of a failure that the operator must repair."""
     return Entry("error", meaning, advice)
 
 

@@ -45,5 +45,5 @@ def fault_report(finding: Finding, source: str, t_ns: int) -> FaultReport:
 
 
 def _figures(value: float) -> float:
-    """Four figures: more than any sigma bears out."""
+    """Round to four figures, which is finer than any sigma."""
     return float(f"{value:.4g}")

@@ -37,7 +37,7 @@ class FleetMessage(Message):
 def of_report(
     report: PositionReport, card: int, source: str, t_utc_ns: int | None, seen_utc_ns: int | None
 ) -> FleetMessage:
-    """`fleet` of a report that is of `t_utc_ns`; 1e-7 deg is 1 cm."""
+    """Build `fleet` of a vehicle's own report, valid at `t_utc_ns`; 1e-7 deg is 1 cm."""
     t_utc, t_ms = stamped(t_utc_ns)
     north, east, down = (_figure(sd) for sd in report.sd_ned_m)
     height, speed, course = report.height_m, report.speed_m_s, report.course_deg
@@ -61,7 +61,8 @@ def of_report(
 
 
 def of_centre(fix: FleetFix, seen_utc_ns: int | None) -> FleetMessage:
-    """`fleet` of a fix that the centre passed on; its own time of day has no zone and no date."""
+    """Build `fleet` of a fix from the centre, at its arrival: the fix's own time of day lacks zone
+    and date."""
     t_utc, t_ms = stamped(seen_utc_ns)
     return FleetMessage(
         t_utc=t_utc,

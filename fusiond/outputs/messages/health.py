@@ -150,7 +150,7 @@ def health_message(
     cpu_percent: float,
     memory_mb: float | None,
 ) -> HealthMessage:
-    """`health` from the parts' own snapshots."""
+    """Build `health` from snapshots of all parts."""
     t_utc, t_ms = stamp(utc_ns)
     return HealthMessage(
         t_utc=t_utc,

@@ -39,7 +39,7 @@ class NavMessage(Message):
 
 
 def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
-    """Build `nav` of a solution whose instant is `utc_ns`; 1e-9 deg is 0.1 mm."""
+    """Build `nav` of a solution valid at `utc_ns`; 1e-9 deg is 0.1 mm."""
     t_utc, t_ms = stamp(utc_ns)
     s = solution
     return NavMessage(

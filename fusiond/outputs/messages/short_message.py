@@ -66,7 +66,7 @@ def of_stage(stage: MessageStage, serial: int, utc_ns: int | None) -> ShortMessa
 
 
 def of_received(mail: MessageReceived, serial: int, utc_ns: int | None) -> ShortMessage:
-    """`message` of one that came."""
+    """Build `message` of a received short message."""
     t_utc, t_ms = stamp(utc_ns)
     minute = mail.minute_of_day
     return ShortMessage(

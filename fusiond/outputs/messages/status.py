@@ -81,7 +81,7 @@ class DaemonState:
 
 
 def status_message(solution: Solution, utc_ns: int | None, daemon: DaemonState) -> StatusMessage:
-    """`status` at `utc_ns`."""
+    """Build `status` at `utc_ns`."""
     t_utc, t_ms = stamp(utc_ns)
     since_utc, since_ms = stamp(daemon.since_utc_ns)
     recording, mqtt = daemon.recording, daemon.mqtt

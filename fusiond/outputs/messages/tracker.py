@@ -1,4 +1,4 @@
-"""Message `tracker`: the vehicle's position, seldom, in Home Assistant's terms."""
+"""Message `tracker`: the vehicle's position at intervals, in Home Assistant's terms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TrackerMessage(Message):
 
 
 def tracker_message(nav: NavMessage) -> TrackerMessage | None:
-    """`tracker` of a solution; None if it may not be used."""
+    """Build `tracker` of a solution; None if the solution may not be used."""
     accuracy_m = horizontal_rms_m(nav)
     if not usable(nav) or accuracy_m is None or nav.lat_deg is None or nav.lon_deg is None:
         return None
