@@ -155,12 +155,16 @@ class Diagnosis(ServiceTable):
         if bank is not None:
             evidence = bank.is_evidence(measurement, used)
             measured = evidence or not measurement.constraint
+            fails = used and not measured and outcome.name == "gated"
+            if fails:  # before it excludes itself, the bank is asked
+                bank.judge(t_ns)
             found = bank.take(t_ns, measured, used, outcome.name == "fused")
             if found is not None and evidence:
                 if identified(found) and self._can_decide(measurement, found):
                     correction = self._decide(measurement, e, bank, found)
-                explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[measurement.source]
+            if found is not None and (evidence or fails):
+                explained = found.item(EXPLAINS) > DECIDED - APART
         if not used:
             correction = self._looked_at(measurement, one, outcome, estimator)
         elif one.out:  # by that decision
