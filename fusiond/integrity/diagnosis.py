@@ -39,11 +39,12 @@ from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
 from fusiond.integrity.fault_findings import Finding, Lasting
-from fusiond.integrity.position_velocity_agreement import Agreement
+from fusiond.integrity.position_velocity_agreement import LONGEST_NS, Agreement
 from fusiond.integrity.series_states import (
     DISAGREES,
     FORGET_NS,
     MOST_SURE,
+    READMIT_COUNT,
     REPEATS,
     RETURNS,
     STILL,
@@ -103,12 +104,12 @@ class Diagnosis(ServiceTable):
     @property
     def contradicts(self) -> str | None:
         """Device whose positions and velocities agree with each other and contradict the filter;
-        None without one."""
+        None without one. Velocities that agree with the filter's do not: only the place differs."""
         if not self.positions_out:
             return None
         for device, agreement in self._agreement.items():
             own = [s for s in self._series.values() if s.device == device]
-            if not all(s.out for s in own):
+            if not all(s.out for s in own) or _velocities_passed(own, 1):
                 continue
             unexplained = all(s.reason in (DISAGREES, STILL) for s in own)
             if agreement.lasted_ns > (FITS_NS if unexplained else FITS_AGAINST_NS):
@@ -211,12 +212,18 @@ class Diagnosis(ServiceTable):
             bank.begin_lasting(t_ns, kind, finding.since_s, b, sd, odds)
 
     def _can_decide(self, measurement: AidingMeasurement, found: Array) -> bool:
-        """False for a position's fault before the position of that instant has arrived, if it may
-        be the shared error (fusiond.integrity.correlated_fix_jumps)."""
-        kind = self._kinds[int(found.item(BEST)) // RESTARTS]
-        if kind.of != PLACE or measurement.locates:
+        """False before the position of an epoch has arrived, for a fault that it may tell from
+        others: of the device whose velocity came first, and of a place that may be the shared error
+        (fusiond.integrity.correlated_fix_jumps)."""
+        if measurement.locates:
             return True
-        return not any(s.shares and s.device == kind.device for s in self._series.values())
+        kind = self._kinds[int(found.item(BEST)) // RESTARTS]
+        places = [s for s in self._series.values() if s.device == kind.device and s.locates]
+        if measurement.moves and measurement.device == kind.device:
+            since_ns = measurement.t_ns - LONGEST_NS
+            if any(s.received_ns > since_ns for s in places if not s.out):
+                return False
+        return kind.of != PLACE or not any(s.shares for s in places)
 
     def _decide(
         self, measurement: AidingMeasurement, estimator: Estimator, bank: Hypotheses, found: Array
@@ -329,15 +336,20 @@ class Diagnosis(ServiceTable):
     def _goes_its_own_way(self, one: Series) -> bool:
         """True if the position of the filter, not of the device, is wrong.
 
-        The device's positions, whose fault is over, have agreed for a minute with its velocity,
-        which is in service."""
-        if not (one.out and one.locates and one.reason == STILL):
+        The device's positions have agreed for a minute with its velocity, which is that of the
+        filter: it is in service, and the position's fault is over, or it passes while all series
+        are excluded."""
+        if not (one.out and one.locates):
             return False
-        moves = [s for s in self._series.values() if s.device == one.device and s.moves]
         known = self._agreement.get(one.device)
-        return bool(
-            known and known.lasted_ns > FITS_AGAINST_NS and moves and not any(s.out for s in moves)
-        )
+        if known is None or known.lasted_ns <= FITS_AGAINST_NS:
+            return False
+        own = [s for s in self._series.values() if s.device == one.device]
+        if all(s.out for s in own):
+            return _velocities_passed(own, READMIT_COUNT)
+        moves = [s for s in own if s.moves]
+        unexplained = one.reason in (DISAGREES, STILL)
+        return unexplained and bool(moves) and not any(s.out for s in moves)
 
     def _agrees(self, measurement: AidingMeasurement, one: Series) -> None:
         """Update the agreement of a device that is or was excluded. A value that repeats while the
@@ -349,3 +361,9 @@ class Diagnosis(ServiceTable):
             **self._agreement,
             measurement.device: known.with_measurement(measurement),
         }
+
+
+def _velocities_passed(own: Sequence[Series], count: int) -> bool:
+    """True if the last `count` velocities of an excluded device were those of the filter."""
+    moves = [s for s in own if s.moves]
+    return bool(moves) and all(s.passed >= count for s in moves)

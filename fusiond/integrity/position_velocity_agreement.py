@@ -1,9 +1,12 @@
 r"""Agreement of an excluded device's positions with its velocities.
 
-    |p_k - p_(k-1) - (v_k + v_(k-1)) h / 2| <= 4 sqrt(2 s_p^2 + s_v^2 h^2 / 2)        north and east
+    |p_k - p_(k-1) - (v_k + v_(k-1)) h / 2| <= 4 s                                    north and east
+    s^2 = 2 s_p^2 + s_v^2 h^2 / 2 + (v_k - v_(k-1))^2 h^2 / 12
 
-The limit is four sigma for each fix; five fixes in a row within it agree. A turn within the
-interval adds h^2 a_t / 12, centimetres at a fix a second.
+The limit is four sigma for each fix. The last term is for the unknown way from one velocity to the
+other: a change d at an instant u h of the interval makes the displacement v_(k-1) h + d (1 - u) h,
+which is d h (1/2 - u) from the mean velocity's; of a u that is uniform in [0, 1] the variance is
+d^2 h^2 / 12. A turn within the interval adds h^2 a_t / 12, centimetres at a fix a second.
 """
 
 from __future__ import annotations
@@ -73,6 +76,7 @@ def _fits(
         by_speed = 0.5 * h * (v0.v_ned[axis] + v1.v_ned[axis])
         variance = p0.sd[axis] ** 2 + p1.sd[axis] ** 2
         variance += (0.5 * h) ** 2 * (v0.sd[axis] ** 2 + v1.sd[axis] ** 2)
+        variance += (v1.v_ned[axis] - v0.v_ned[axis]) ** 2 * h**2 / 12.0
         if abs(way[axis] - by_speed) > SIGMAS * math.sqrt(variance):
             return False
     return True

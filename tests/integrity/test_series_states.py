@@ -206,3 +206,38 @@ def test_what_repeats_itself_does_not_fit_itself() -> None:
             diagnosis._agrees(velocity(second, 0.0), speed)
         lasted = [known.lasted_ns for known in diagnosis._agreement.values()]
         assert lasted == ([] if repeats else [7 * S])
+
+
+def excluded(reason: str) -> Diagnosis:
+    """A device that has agreed with itself for 61 s, its series excluded."""
+    diagnosis, agreement = Diagnosis(), Agreement()
+    for second in range(62):
+        agreement = agreement.with_measurement(position(second, 0.0))
+        agreement = agreement.with_measurement(velocity(second, 0.0))
+    diagnosis._agreement = {"gnss": agreement}
+    for one in (position(0, 0.0), velocity(0, 0.0)):
+        diagnosis.own(one).exclude(0, reason)
+    return diagnosis
+
+
+@pytest.mark.parametrize("passed", [0, 1, READMIT_COUNT])
+def test_velocities_that_are_the_filters_leave_only_the_place_in_doubt(passed: int) -> None:
+    """One that passes ends the contradiction; five in a row, and the place may be that of the
+    device."""
+    diagnosis = excluded("carried off")
+    assert diagnosis.contradicts == "gnss"
+    diagnosis.series["gnss_velocity"].passed = passed
+    assert (diagnosis.contradicts is None) == (passed > 0)
+    assert diagnosis._goes_its_own_way(diagnosis.series["gnss"]) == (passed == READMIT_COUNT)
+
+
+@pytest.mark.parametrize(
+    ("reason", "own_way"), [(STILL, True), (DISAGREES, True), ("off by 50 m", False)]
+)
+def test_an_offset_that_lasts_agrees_with_itself_and_is_not_believed(
+    reason: str, own_way: bool
+) -> None:
+    """The velocity is in service."""
+    diagnosis = excluded(reason)
+    diagnosis.series["gnss_velocity"].readmit(61 * S)
+    assert diagnosis._goes_its_own_way(diagnosis.series["gnss"]) == own_way
