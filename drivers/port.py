@@ -1,4 +1,13 @@
-"""Ports: interface of a non-blocking open port, and the serial port."""
+"""Ports: interface of a non-blocking open port, the serial port, and the limit on bytes parsed.
+
+The limit is the fastest rate of a real receiver:
+
+    a bucket of BURST bytes, filled at the line's rate; each byte read takes one out of it
+
+Navigation comes first: parsing a byte of the worst stream takes some microseconds (`python -m
+tests.fuzz.hostile`), so a flood over a network could use the whole processor. Bytes beyond the
+limit wait with their sender (TCP, a pty) or are lost in the kernel (UDP).
+"""
 
 from __future__ import annotations
 
@@ -6,6 +15,7 @@ import contextlib
 import errno
 import os
 import termios
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
@@ -15,6 +25,12 @@ import serial
 READ_BYTES = 1024
 """Most bytes handed over at a time: 11 ms of a line at 921600 baud, and less than a millisecond of
 parsing, so that a device that floods leaves every other task its turn."""
+
+LINE_BYTES_S = 92_160.0
+"""Byte rate of 921600 baud, a receiver's highest UART rate, at ten bits a byte; 60 satellites of
+two signals at 10 Hz (RXM-RAWX and RXM-SFRBX) take half of it."""
+BURST = 65_536.0
+"""The largest datagram; seven of the longest epochs (8 kB)."""
 
 OPEN_ERRORS = (OSError, ValueError, OverflowError, termios.error)
 """Exceptions of opening a port or reaching a host.
@@ -120,3 +136,19 @@ class SerialPort:
         with contextlib.suppress(*OPEN_ERRORS):
             self._serial.reset_output_buffer()  # otherwise close waits for a dead line, up to 30 s
         self._serial.close()
+
+
+class ByteBudget:
+    """Token bucket of one line at `baud`; `now_s` is monotonic."""
+
+    def __init__(self, baud: int = 0, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._rate = max(LINE_BYTES_S, baud / 10.0)
+        self._now_s = now_s
+        self._left, self._filled_s = BURST, now_s()
+
+    def spend(self, count: int) -> float:
+        """Spend `count` bytes; return how long to wait before the next read, s."""
+        now_s = self._now_s()
+        self._left = min(BURST, self._left + self._rate * (now_s - self._filled_s)) - count
+        self._filled_s = now_s
+        return max(0.0, -self._left / self._rate)

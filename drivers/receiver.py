@@ -41,6 +41,10 @@ class ReceiverDecoder(Protocol):
     def epoch_open(self) -> bool:
         """True if `silence` would close an epoch."""
 
+    @property
+    def cautions(self) -> dict[str, str]:
+        """Cautions of what arrives, by counter."""
+
     def feed(self, data: bytes, t_seen_ns: int) -> Sequence[Measurement | RawEvent]: ...
 
     def silence(self) -> Sequence[Measurement | RawEvent]: ...
@@ -115,15 +119,10 @@ class ReceiverDriver:
     @property
     def cautions(self) -> dict[str, str]:
         """Cautions by counter: limits on the quality of fixes, and the actions taken."""
-        found, rates = self._decoder_cautions, self._rates
+        found, rates = self._decoder.cautions, self._rates
         if rates.baud != rates.configured and self.status.state == "running":
             return {**found, "baud_followed": self._other_rate()}
         return found
-
-    @property
-    def _decoder_cautions(self) -> dict[str, str]:
-        """Cautions of the decoder, by counter."""
-        return {}
 
     def _other_rate(self) -> str:
         rates = self._rates
@@ -205,7 +204,8 @@ class ReceiverDriver:
         self._hand_over(self._decoder.feed(data, t_seen_ns))
         if self._signs_of_life() > before:
             self._mark_alive()
-            self._rates.understood()
+            if self.status.state != "running":
+                self._rates.understood()
             self._set_state("running", self._running_detail())
 
     def _on_silence(self, _: None, t_ns: int) -> None:

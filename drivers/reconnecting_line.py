@@ -1,8 +1,7 @@
 """Serial line under asyncio that reopens itself when its device disappears and returns.
 
 Every read is bounded and stamped, and an end of the stream is recognised. Each piece is handed over
-in a turn of the loop of its own, and bytes no faster than a real line brings them
-(drivers.byte_budget).
+in a turn of the loop of its own, and bytes no faster than a real line brings them (drivers.port).
 """
 
 from __future__ import annotations
@@ -13,9 +12,16 @@ from collections.abc import Callable
 from functools import partial
 
 from drivers.base import Backoff, Now, monotonic_ns
-from drivers.byte_budget import ByteBudget
 from drivers.detached_call import aside
-from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial, why_not_open
+from drivers.port import (
+    OPEN_ERRORS,
+    READ_BYTES,
+    ByteBudget,
+    OpenPort,
+    Port,
+    open_serial,
+    why_not_open,
+)
 
 __all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
 
@@ -166,8 +172,9 @@ class SerialLine:
             self._end(f"{self.port}: {port.at_end}")
             return
         self.counters["bytes_in"] += len(data)
-        self._backoff.reset()
-        self.detail = ""
+        if self.detail:  # the first of this opening
+            self._backoff.reset()
+            self.detail = ""
         self._unread = data, t_seen_ns  # a datagram must be read as a whole
         self._hand_over(port, gone, on_bytes)
 

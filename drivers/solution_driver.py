@@ -81,12 +81,6 @@ class SolutionDriver(ReceiverDriver):
         found = protocol_sentence(bytes(self._foreign))
         return "" if f'driver = "{self.kind}"' in found else found
 
-    @property
-    def _decoder_cautions(self) -> dict[str, str]:
-        """Cautions, as in `ReceiverDriver`."""
-        found: dict[str, str] = self._solutions.cautions
-        return found
-
     def _useless_detail(self) -> str:
         if self.counters["position_type_unknown"]:
             return "the receiver names a kind of position that is not known here: please report it"

@@ -50,6 +50,7 @@ class CompassDecoder:
 
     gga = b""
     epoch_open = False
+    cautions: ClassVar[dict[str, str]] = {}
 
     def __init__(self, source: str, decoding: CompassDecoding, counters: Counter[str]) -> None:
         self.counters = counters

@@ -37,11 +37,6 @@ class NmeaDriver(ReceiverDriver):
         """Reason for the absence of a fix, as a sentence; "" if unknown."""
         return self._nmea.cause if self.counters["bytes_in"] else ""
 
-    @property
-    def _decoder_cautions(self) -> dict[str, str]:
-        """Cautions, as in `ReceiverDriver`."""
-        return self._nmea.cautions
-
     def _useless_detail(self) -> str:
         return self.cause
 

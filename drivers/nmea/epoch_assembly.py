@@ -43,7 +43,7 @@ from drivers.nmea.fields import (
 from drivers.nmea.mixed_framing import Sentence
 from drivers.nmea.printed_velocity import PrintedSpeed
 from drivers.nmea.time import parse_time_of_day, printed_time
-from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
+from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S
 from drivers.quantization import NEAREST_SD
 
 INTEGRATED = frozenset({"II", "IN"})
@@ -194,7 +194,7 @@ class Epoch:
     def implausible(self) -> str | None:
         """Counter of an implausible value; None without one."""
         height = (self.altitude_m or 0.0) + (self.separation_m or 0.0)
-        if not within(height, HEIGHT_M):
+        if not HEIGHT_M[0] <= height <= HEIGHT_M[1]:
             return "height_implausible"
         if self.speed is not None and self.speed.speed_m_s > SPEED_M_S:
             return "speed_implausible"

@@ -162,8 +162,10 @@ class StreamSplitter(Splitter[Item]):
             at += used
         if at:
             del buffer[:at]
-            for along in (self._whole, self._fletcher, self._crc):
-                along.drop(at)
+            self._whole.drop(at)
+            if self.summed:
+                self._fletcher.drop(at)
+                self._crc.drop(at)
 
     def _keep(self, nothing: bytearray) -> None:
         self._unread += nothing

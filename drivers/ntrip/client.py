@@ -18,12 +18,11 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from drivers.base import Backoff, DriverOptions
-from drivers.byte_budget import ByteBudget
 from drivers.detached_call import aside
 from drivers.network_port import connect
 from drivers.nmea.mixed_framing import Frame, StreamSplitter
 from drivers.ntrip.protocol import CasterRefusedError, CasterReply, mountpoint_request
-from drivers.port import READ_BYTES
+from drivers.port import READ_BYTES, ByteBudget
 
 PASSWORD_VARIABLE = "FUSIOND_NTRIP_PASSWORD"
 DEFAULT_PORT = 2101

@@ -290,11 +290,6 @@ class GnssDriver(ReceiverDriver):
             )
         return ""
 
-    @property
-    def _decoder_cautions(self) -> dict[str, str]:
-        """Cautions, as in `ReceiverDriver`."""
-        return self._gnss.cautions
-
     def _useless_detail(self) -> str:
         counters = self.counters
         if self._options.use_raw:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.byte_budget import BURST, LINE_BYTES_S, ByteBudget
+from drivers.port import BURST, LINE_BYTES_S, ByteBudget
 
 
 def test_a_burst_is_read_at_once_and_the_rest_at_the_lines_rate() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.base import Backoff
-from drivers.byte_budget import BURST, LINE_BYTES_S
+from drivers.port import BURST, LINE_BYTES_S
 from drivers.reconnecting_line import PENDING_WRITE_BYTES, READ_BYTES, SerialLine
 from tests.drivers.at_work import at_work
 from tests.patience import until
