@@ -212,9 +212,9 @@ class GnssDecoder:
             found.append(event)
 
     def _look_for_delays(self, epoch: RawGnssEpoch) -> None:
-        beidou = [s for s in epoch.signals if s.system == "C"]
-        served = any(s.signal[0] not in "15" or s.prn in self._delays for s in beidou)
-        self.undelayed = 0 if served else len({s.prn for s in beidou})
+        beidou = [(prn, signal) for system, prn, signal in epoch.packed.keys if system == "C"]
+        served = any(signal[0] not in "15" or prn in self._delays for prn, signal in beidou)
+        self.undelayed = 0 if served else len({prn for prn, _ in beidou})
 
     def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
         """Report UTC of RXM-RAWX, if the receiver knows the leap seconds and sends no RMC or

@@ -13,7 +13,9 @@ BDT = GPST - 14 s. `Ephemeris` keeps the system's own time, `RawGnssEpoch` is in
 from __future__ import annotations
 
 import math
-from typing import Literal
+from array import array
+from collections.abc import Iterator, Sequence
+from typing import Literal, overload
 
 from drivers.immutable import immutable
 from drivers.measurements import Stamp
@@ -68,11 +70,79 @@ class RawSignal:
         return f"{self.system}{self.prn:02d}"
 
 
+SignalKey = tuple[System, int, str]
+"""System, PRN and RINEX code of a signal."""
+SIGNAL_VALUES = 7
+
+
+class PackedSignals(Sequence[RawSignal]):
+    """Signals of an epoch in one array; a `RawSignal` is made when it is asked for.
+
+    `keys` (n,); `values` (n * 7): pseudorange (m), range rate (m/s), C/N0 (dB-Hz), their sigmas as
+    the receiver states them (m, m/s), carrier (cycles), lock time (s), signal after signal; NaN is
+    what the receiver does not say.
+    """
+
+    __slots__ = ("keys", "values")
+
+    def __init__(self, keys: tuple[SignalKey, ...], values: array[float]) -> None:
+        self.keys = keys
+        self.values = values
+
+    @classmethod
+    def of(cls, signals: Sequence[RawSignal]) -> PackedSignals:
+        """Pack single signals."""
+        if isinstance(signals, PackedSignals):
+            return signals
+        values = array("d")
+        for s in signals:
+            said = (
+                *(s.pseudorange_m, s.range_rate_m_s, s.cno_db_hz, s.sd_pseudorange_m),
+                *(s.sd_range_rate_m_s, s.carrier_cycles, s.lock_s),
+            )
+            values.extend(math.nan if value is None else value for value in said)
+        return cls(tuple((s.system, s.prn, s.signal) for s in signals), values)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __iter__(self) -> Iterator[RawSignal]:
+        return map(self._signal, range(len(self.keys)))
+
+    @overload
+    def __getitem__(self, at: int) -> RawSignal: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> tuple[RawSignal, ...]: ...
+
+    def __getitem__(self, at: int | slice) -> RawSignal | tuple[RawSignal, ...]:
+        found = range(len(self.keys))[at]
+        return self._signal(found) if isinstance(found, int) else tuple(map(self._signal, found))
+
+    def _signal(self, at: int) -> RawSignal:
+        first = SIGNAL_VALUES * at
+        pseudorange, *said, lock_s = self.values[first : first + SIGNAL_VALUES]
+        rate, cno, sd, sd_rate, cycles = (None if math.isnan(v) else v for v in said)
+        return RawSignal(*self.keys[at], pseudorange, rate, cycles, cno, sd, sd_rate, lock_s)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, PackedSignals):
+            return self.keys == other.keys and self.values.tobytes() == other.values.tobytes()
+        return tuple(self) == other
+
+    def __hash__(self) -> int:
+        return hash(self.keys)
+
+    def __repr__(self) -> str:
+        return repr(tuple(self))
+
+
 @immutable()
 class RawGnssEpoch:
     """Signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
 
-    `stamp` is the same instant in UTC, if the receiver knows the leap seconds.
+    `stamp` is the same instant in UTC, if the receiver knows the leap seconds. `signals` become
+    `PackedSignals`.
     """
 
     source: str
@@ -80,8 +150,16 @@ class RawGnssEpoch:
     stamp: Stamp
     week: int
     tow_s: float
-    signals: tuple[RawSignal, ...]
+    signals: Sequence[RawSignal]
     clock_reset: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "signals", PackedSignals.of(self.signals))
+
+    @property
+    def packed(self) -> PackedSignals:
+        """The signals in one array."""
+        return PackedSignals.of(self.signals)
 
 
 @immutable()

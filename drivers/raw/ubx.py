@@ -14,11 +14,19 @@ from __future__ import annotations
 
 import math
 import struct
+from array import array
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 
 from drivers.plausible import LEAP_SECONDS, within
-from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, RawSignal, System
+from drivers.raw.messages import (
+    CARRIER_HZ,
+    SPEED_OF_LIGHT_M_S,
+    PackedSignals,
+    SignalKey,
+    System,
+)
 
 RAWX = b"\x02\x15"
 SFRBX = b"\x02\x13"
@@ -88,7 +96,7 @@ class Rawx:
     week: int
     leap_seconds: int | None
     clock_reset: bool
-    signals: tuple[RawSignal, ...]
+    signals: PackedSignals
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +121,11 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
     tow_s, week, leap, count, status = _HEADER.unpack_from(payload)
     if len(payload) != _HEADER.size + count * _MEASUREMENT.size or not 0.0 <= tow_s < 604_801.0:
         return None
-    signals: dict[tuple[str, int, str], RawSignal] = {}
+    signals: dict[SignalKey, tuple[float, ...]] = {}
     for measurement in _MEASUREMENT.iter_unpack(payload[_HEADER.size :]):
-        signal = _signal(measurement, counters)
-        if signal is None:
-            continue
-        key = (signal.system, signal.prn, signal.signal)
-        if key in signals:
-            counters["signal_repeated"] += 1
-            continue
-        signals[key] = signal
+        refused = _measured(measurement, counters, signals)
+        if refused:
+            counters[refused] += 1
     known = bool(status & _LEAP_KNOWN)
     if known and not within(leap, LEAP_SECONDS):
         counters["leap_seconds_implausible"] += 1
@@ -132,58 +135,54 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
         week,
         leap if known else None,
         bool(status & _CLOCK_RESET),
-        tuple(signals.values()),
+        PackedSignals(tuple(signals), array("d", chain.from_iterable(signals.values()))),
     )
 
 
-def _signal(
+def _measured(
     measurement: tuple[float, float, float, int, int, int, int, int, int, int, int],
     counters: Counter[str],
-) -> RawSignal | None:
+    signals: dict[SignalKey, tuple[float, ...]],
+) -> str:
+    """Add the values of one measurement to those of `signals`; why not, if it is refused."""
     pseudorange, carrier, doppler, gnss, prn, sig, lock_ms, cno, sd_range, sd_doppler, track = (
         measurement
     )
     system = SYSTEM_BY_ID.get(gnss)
     if system is None:
-        counters[f"measured_{OTHER_SYSTEMS.get(gnss, 'unknown_system')}"] += 1
-        return None
+        return f"measured_{OTHER_SYSTEMS.get(gnss, 'unknown_system')}"
     counters[f"measured_{system}"] += 1
     known = _BY_SIGNAL.get((gnss, sig))
     if known is None:
-        counters["signal_unknown"] += 1
-        return None
+        return "signal_unknown"
     if not 1 <= prn <= MAX_PRN[system]:
-        counters["prn_unknown"] += 1
-        return None
+        return "prn_unknown"
     if not track & _RANGE_VALID:
-        counters["pseudorange_invalid"] += 1
-        return None
+        return "pseudorange_invalid"
     if not (math.isfinite(pseudorange) and math.isfinite(doppler) and math.isfinite(carrier)):
-        counters["not_finite"] += 1
-        return None
+        return "not_finite"
     if not PSEUDORANGE_M[0] <= pseudorange <= PSEUDORANGE_M[1]:
-        counters["pseudorange_implausible"] += 1
-        return None
+        return "pseudorange_implausible"
     _, code, wavelength = known
     if abs(doppler * wavelength) > MAX_RATE_M_S:
-        counters["rate_implausible"] += 1
-        return None
+        return "rate_implausible"
     followed = track & _CARRIER_VALID
     if followed and not track & _HALF_KNOWN:
         counters["half_cycle_open"] += 1
         followed = 0
-    return RawSignal(
-        system,
-        prn,
-        code,
+    key = (system, prn, code)
+    if key in signals:
+        return "signal_repeated"
+    signals[key] = (
         pseudorange,
         -doppler * wavelength,
-        carrier if followed else None,
-        float(cno) if cno else None,
+        cno or math.nan,
         0.01 * (1 << (sd_range & 0xF)),
         0.002 * (1 << (sd_doppler & 0xF)) * wavelength,
+        carrier if followed else math.nan,
         lock_ms * 1e-3 if lock_ms < _LOCK_FULL_MS else math.inf,
     )
+    return ""
 
 
 def parse_sfrbx(payload: bytes) -> Sfrbx | None:

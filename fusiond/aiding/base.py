@@ -231,11 +231,11 @@ class AidingMeasurement:
         """Candidates for the start of alignment."""
         return ()
 
-    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
+    def series(self, whitened: Sequence[float], codes: Sequence[int]) -> Mapping[str, Array]:
         """Innovation series of a screened measurement for the verdicts: by name, this epoch's row
         (m,). Other measurements have one series, named after their source.
 
-        `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows were used.
+        `whitened` (m,) the innovation as the filter found it, `codes` (m,) of its rows, 0 if used.
         """
         return {}
 

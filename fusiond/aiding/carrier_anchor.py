@@ -292,12 +292,12 @@ def _learn(values: Array, place: Array, anchor: Array, left: Array) -> None:
 
 
 @compiled(
-    "b1(f8[:, ::1], i8[::1], i8, f8, f8, b1, f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])",
+    "b1(f8[:, ::1], u1[::1], i8, f8, f8, b1, f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])",
     allocates=True,
 )
 def go_on(
     values: Array,
-    codes: NDArray[np.int64],
+    codes: NDArray[np.uint8],
     first: int,
     t_s: float,
     ahead_s: float,

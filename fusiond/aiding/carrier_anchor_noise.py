@@ -33,12 +33,17 @@ from fusiond.aiding.carrier_anchor import (
     _WALKED,
     CARRIER,
     CARRIER_VARIANCE,
+    ON_EARTH_M,
     SLOT,
+    V_NED,
+    antenna,
+    go_on,
     invert,
     phase_scale,
     sight,
 )
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
 
@@ -118,3 +123,47 @@ def walk_noise(values: Array, place: Array, t_s: float, left: Array, noise: Arra
     invert(information, inverted, 1.0)
     _spread(inverted, spread, noise)
     return True
+
+
+NOTHING, ANCHORED, WALKED = 0, 1, 2
+"""Change of the clone after an epoch."""
+
+
+@compiled(
+    "i8(f8[:, ::1], u1[::1], i8, f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1],"
+    "f8[:, ::1])",
+    allocates=True,
+)
+def leave(
+    values: Array,
+    codes: NDArray[np.uint8],
+    first: int,
+    epoch: Array,
+    nav: Array,
+    anchor: Array,
+    before: Array,
+    left: Array,
+    of_navigation: Array,
+    noise: Array,
+) -> int:
+    """Write the output of an epoch, and noise if the clone is renewed or walks; which of them.
+
+    `epoch` (6,): its instant (s), the lead of the receiver's clock (s), 1 if that was set, and the
+    lever arm; `anchor` (3,) the clone (ECEF, m). `of_navigation` (4, 9), zero before, takes the
+    antenna's errors by those of navigation, `noise` (5, 4) the covariance, and the antenna in its
+    last row. Other arguments as of `fusiond.aiding.carrier_anchor.go_on`.
+    """
+    t_s, place = epoch[0], noise[4]
+    square = anchor[0] * anchor[0] + anchor[1] * anchor[1] + anchor[2] * anchor[2]
+    cloned = square > ON_EARTH_M * ON_EARTH_M
+    antenna(nav, epoch[3], epoch[4], epoch[5], place[:3], of_navigation[:3])
+    place[3] = 0.0
+    goes_on = cloned and epoch[2] == 0.0
+    if go_on(values, codes, first, t_s, epoch[1], goes_on, place, anchor, before, left):
+        for i in range(3):
+            left[0, V_NED + i] = nav[VN + i]
+        phase_noise(values, place, left, noise[:4])
+        return ANCHORED
+    if cloned and walk_noise(values, place, t_s, left, noise[:4]):
+        return WALKED
+    return NOTHING

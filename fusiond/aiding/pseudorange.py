@@ -45,6 +45,7 @@ Source: Groves, 2nd ed., eq. 14.114 to 14.128 and 9.165.
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Sequence
 from dataclasses import field, replace
 from typing import ClassVar
@@ -67,7 +68,6 @@ from fusiond.aiding.carrier_anchor import (
     BASIC,
     CARRIER,
     COLUMNS,
-    ON_EARTH_M,
     RANGE,
     RANGE_VARIANCE,
     RATE,
@@ -75,20 +75,16 @@ from fusiond.aiding.carrier_anchor import (
     SHARED,
     SLOTS,
     SPAN,
-    V_NED,
     VALUES,
     VX,
     X,
     anchored,
-    antenna,
-    go_on,
 )
-from fusiond.aiding.carrier_anchor_noise import OF_ANCHOR, phase_noise, walk_noise
+from fusiond.aiding.carrier_anchor_noise import ANCHORED, OF_ANCHOR, WALKED, leave
 from fusiond.aiding.headings_without_imu import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, CLOCK_DRIFT, CLOCK_OFFSET
-from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -271,7 +267,7 @@ class PseudorangeMeasurement(AidingMeasurement):
         lever, nothing = (0.0, 0.0, self.lever[2]), nothing_left()
         return replace(self, values=values, lever=lever, before=nothing, left=nothing)
 
-    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
+    def series(self, whitened: Sequence[float], codes: Sequence[int]) -> dict[str, Array]:
         """Innovations (2,) for each satellite system with a clock, by its letter: the sums of the
         whitened range and rate innovations over the root of their number.
 
@@ -279,8 +275,8 @@ class PseudorangeMeasurement(AidingMeasurement):
         form one series. A system without a range or without a rate in the epoch has none.
         """
         sums, first = np.empty((self._clocks, 2)), np.empty(self._clocks, dtype=np.int64)
-        y = np.fromiter(whitened, float, len(whitened))
-        found = by_clock(self.values, self.clock, kept, y, sums, first)
+        of_rows, y = np.frombuffer(bytearray(codes), np.uint8), np.frombuffer(array("d", whitened))
+        found = by_clock(self.values, self.clock, of_rows, y, sums, first)
         firsts = first[:found].tolist()
         return {self.satellites[at][0]: sums[k] for k, at in enumerate(firsts)}
 
@@ -328,20 +324,15 @@ class PseudorangeMeasurement(AidingMeasurement):
         slots = state.model.slots_of_all(_CLONED)
         if len(slots) != len(_NOTHING_KEPT):
             return None
-        anchor, place = state.xi[slots[:3]], np.empty(4)
-        cloned = bool((anchor**2).sum() > ON_EARTH_M**2)
-        goes_on = cloned and not self.clock_reset
-        of_navigation = np.zeros((4, 9))
-        antenna(state.nav, *self.lever, place[:3], of_navigation[:3])
-        place[3] = 0.0
-        of_rows, t_s = np.array(codes, np.int64), self.t_ns * 1e-9
-        of = self._ranges, t_s, self.ahead_s, goes_on, place, anchor, self.before, self.left
-        noise = np.empty((4, 4))
-        if go_on(self.values, of_rows, *of):
-            self.left[0, V_NED:] = state.nav[VN : VN + 3]
-            phase_noise(self.values, place, self.left, noise)
+        of_rows, anchor = np.frombuffer(bytearray(codes), np.uint8), state.xi[slots[:3]]
+        epoch = np.array((self.t_ns * 1e-9, self.ahead_s, self.clock_reset, *self.lever), float)
+        of_navigation, found = np.zeros((4, 9)), np.empty((5, 4))
+        of = epoch, state.nav, anchor, self.before, self.left
+        result = leave(self.values, of_rows, self._ranges, *of, of_navigation, found)
+        noise, place = found[:4], found[4]
+        if result == ANCHORED:
             return Renewal(_CLONED, _NOTHING_KEPT, noise, of_navigation, place)
-        if cloned and walk_noise(self.values, place, t_s, self.left, noise):
+        if result == WALKED:
             # Antenna of the place: its transpose takes an error in ECEF back to north, east, down.
             of_place, shared = np.zeros((9, 4)), np.zeros((4, 4))
             of_place[6:9, :3] = of_navigation[:3, 6:9].T

@@ -242,20 +242,20 @@ def measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, in
     return finite, row - finite, clocks, wrong
 
 
-@compiled("i8(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1], i8[::1])")
+@compiled("i8(f8[:, ::1], i8[::1], u1[::1], f8[::1], f8[:, ::1], i8[::1])")
 def by_clock(
     values: Array,
     clock: Indices,
-    kept: NDArray[np.bool_],
+    codes: NDArray[np.uint8],
     whitened: Array,
     sums: Array,
     first: Indices,
 ) -> int:
     """Sum the innovations of each receiver clock; the number of clocks.
 
-    `sums` (k, 2) takes, for each clock that has both, the sums of its ranges and of its rates that
-    are `kept` (m,) of `whitened` (m,), each over the root of its number; `first` (k,) the clocks'
-    first satellites, by which they are ordered."""
+    `sums` (k, 2) takes, for each clock that has both, the sums of its ranges and of its rates of
+    `whitened` (m,) whose `codes` (m,) are 0, each over the root of its number; `first` (k,) the
+    clocks' first satellites, by which they are ordered."""
     found = 0
     for i in range(clock.shape[0]):
         new = clock[i] >= 0
@@ -268,7 +268,7 @@ def by_clock(
             total, count = 0.0, 0
             for k in range(clock.shape[0]):
                 if math.isfinite(values[RANGE + kind, k]) or (kind == 1 and values[SPAN, k] > 0.0):
-                    if kept[row] and clock[k] == clock[i]:
+                    if codes[row] == 0 and clock[k] == clock[i]:
                         total += whitened[row]
                         count += 1
                     row += 1

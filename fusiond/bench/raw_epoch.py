@@ -1,10 +1,11 @@
 """Cost of an epoch of raw GNSS data: 40 satellites with two frequencies each.
 
-From the decoded epoch to the filter that has used it: signals chosen, carriers followed from the
-epoch before, which is their anchor, satellites and corrections computed, 80 rows (ranges, carriers)
-linearised, gated one by one, folded in and tested by their residuals, the solution corrected; then
-what `health` and the verdicts keep. The same epoch comes again and again after the same one, so the
-choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
+From the decoded epoch, whose signals the decoder has packed, to the filter that has used it:
+signals chosen, carriers followed from the epoch before, which is their anchor, satellites and
+corrections computed, 80 rows (ranges, carriers) linearised, gated one by one, folded in and tested
+by their residuals, the solution corrected; then what `health` and the verdicts keep. The same epoch
+comes again and again after the same one, so the choice of signals and ephemerides holds, as it does
+for up to 10 s in the daemon.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def raw_epoch(_: int) -> Callable[[], int]:
             assert outcome.name == "fused"
             assert outcome.rows == (KEPT,) * (2 * SATELLITES)
             measurement.judged(outcome.rows, outcome.whitened)
-            measurement.series(outcome.whitened, np.array(outcome.rows) == KEPT)
+            measurement.series(outcome.whitened, outcome.rows)
         return EPOCHS
 
     work()

@@ -54,6 +54,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from drivers.raw.messages import SIGNAL_VALUES
 from fusiond.navigation.compiled import compiled
 
 Array = npt.NDArray[np.float64]
@@ -63,10 +64,8 @@ Array = npt.NDArray[np.float64]
 # and of its first signal.
 PLAN_COLUMNS = 8
 SLOT, LENGTH_A, LENGTH_B, GAMMA, DELAY, DELAY_VARIANCE, PAIR, SIGNAL = range(PLAN_COLUMNS)
-# What the receiver says: of the first signal, of the second.
-FIRST_COLUMNS, SECOND_COLUMNS = 7, 5
-P_A, RATE, CNO, SD_A, SD_RATE, CARRIER_A, LOCK_A = range(FIRST_COLUMNS)
-P_B, CNO_B, SD_B, CARRIER_B, LOCK_B = range(SECOND_COLUMNS)
+# What the receiver says of a signal, the first or the second (drivers.raw.messages.PackedSignals).
+P, RATE, CNO, SD, SD_RATE, CYCLES, LOCK = range(SIGNAL_VALUES)
 # What is kept of a satellite: of its first signal, of its pair; times and numbers of 0: nothing.
 SLOTS, KEPT_COLUMNS = 3 * 64, 12
 (
@@ -80,6 +79,8 @@ OUT_COLUMNS = 6
 SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_COLUMNS)
 # Refusals of a satellite's carrier, or of all of it, by what `follow` writes.
 FOLLOWED, LOCK_LOST, CYCLE_SLIP, MULTIPATH = 0, 1, 2, 3
+ALL_FOLLOWED, JUMPED, SOME_REFUSED = 0, 1, 2
+"""Results of `follow`."""
 
 CODE_M, THERMAL_M, REFERENCE_DB_HZ = 1.2, 0.3, 45.0
 """Constants of `fusiond.gnss.ranges.RangeNoise`. The first is a mean over a uniform sky above 10
@@ -131,34 +132,39 @@ def scale_squared(kept: Array) -> float:
     return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
 
 
+@compiled("f8(f8)", forceinline=True)
+def _weakness(cno: float) -> float:
+    """Thermal variance of a signal by that at `REFERENCE_DB_HZ`; 1 where C/N0 is unknown."""
+    if math.isnan(cno):
+        return 1.0
+    found: float = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
+    return found
+
+
 @compiled("f8(f8, f8)", forceinline=True)
-def _phase_variance(cno: float, length: float) -> float:
+def _phase_variance(weak: float, length: float) -> float:
     """Variance (m^2) of a carrier of a wavelength (m), by the model."""
-    weak = 1.0
-    if not math.isnan(cno):
-        weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
     turn = length / PHASE_LENGTH_M
     return turn * turn * (PHASE_M * PHASE_M + PHASE_THERMAL_M * PHASE_THERMAL_M * weak)
 
 
 @compiled("f8(f8, f8, f8)", forceinline=True)
-def _code_variance(cno: float, stated: float, scale: float) -> float:
+def _code_variance(weak: float, stated: float, scale: float) -> float:
     """Variance (m^2) of a pseudorange at any elevation, with its model `scale` times."""
-    weak = 1.0
-    if not math.isnan(cno):
-        weak = 10.0 ** (0.1 * (REFERENCE_DB_HZ - cno))
     found = scale * (CODE_M * CODE_M + THERMAL_M * THERMAL_M * weak)
     if not math.isnan(stated):
         found += stated * stated
     return found
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8, f8[::1])")
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8, f8, f8, f8[::1])")
 def _delay(
     state: Array,
     plan: Array,
     first: Array,
     second: Array,
+    weak_a: float,
+    weak_b: float,
     span: float,
     change: float,
     scale: float,
@@ -167,9 +173,9 @@ def _delay(
     """Write the slant delay from this epoch's codes and the carriers' `change`; NaN: none. Adds to
     the sums of `seen` codes."""
     more = plan[GAMMA] - 1.0
-    code = (second[P_B] - first[P_A] - plan[DELAY]) / more
-    noise = _code_variance(first[CNO], first[SD_A], scale)
-    noise = (noise + _code_variance(second[CNO_B], second[SD_B], scale)) / (more * more)
+    code = (second[P] - first[P] - plan[DELAY]) / more
+    noise = _code_variance(weak_a, first[SD], scale)
+    noise = (noise + _code_variance(weak_b, second[SD], scale)) / (more * more)
     if state[_PAIR] != plan[PAIR] or span > FORGOTTEN_S:
         state[_DELAY], state[_V] = code, noise
         return
@@ -177,8 +183,8 @@ def _delay(
         state[_V] += (DELAY_RATE_M_S * span) ** 2
     else:
         state[_DELAY] += change / more
-        model = _code_variance(first[CNO], first[SD_A], 1.0)
-        model = (model + _code_variance(second[CNO_B], second[SD_B], 1.0)) / (more * more)
+        model = _code_variance(weak_a, first[SD], 1.0)
+        model = (model + _code_variance(weak_b, second[SD], 1.0)) / (more * more)
         w = min(0.5 * span / MULTIPATH_S, 1.0)
         seen[_SUM] += w * (code - state[_DELAY]) ** 2 / (model + state[_V])
         seen[_COUNT] += w
@@ -188,10 +194,11 @@ def _delay(
     state[_V] *= 1.0 - gain
 
 
-@compiled("b1(f8[::1], f8[::1], f8, f8, f8, f8, f8, f8[::1])")
+@compiled("b1(f8[::1], f8[::1], f8, f8, f8, f8, f8, f8, f8[::1])")
 def _has_multipath(
     state: Array,
     first: Array,
+    weak_a: float,
     length: float,
     now: float,
     span: float,
@@ -201,7 +208,7 @@ def _has_multipath(
 ) -> bool:
     """True if the code has diverged from its carrier of `length` (m), which has `slipped` (m; NaN:
     unknown). Adds to the sums `seen` of code minus carrier."""
-    beside, model = first[P_A] - length, _code_variance(first[CNO], first[SD_A], 1.0)
+    beside, model = first[P] - length, _code_variance(weak_a, first[SD], 1.0)
     state[_BESIDE] -= slipped
     if state[_MANY] == 0.0 or math.isnan(beside) or math.isnan(state[_BESIDE]):
         state[_BESIDE], state[_SINCE] = beside, 0.0
@@ -236,13 +243,15 @@ def _shown(kept: Array, of: int) -> float:
     return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8, f8[::1])")
-def _write_rates(state: Array, plan: Array, first: Array, scale: float, out: Array) -> None:
+@compiled("void(f8[::1], f8[::1], f8[::1], f8, f8, f8[::1])")
+def _write_rates(
+    state: Array, plan: Array, first: Array, weak_a: float, scale: float, out: Array
+) -> None:
     """Write the slant delay, its variance, and twice its covariance with the code."""
     if plan[GAMMA] == 0.0 or state[_PAIR] != plan[PAIR] or state[_T] - state[_T_PAIR] > 0.0:
         return
     more = plan[GAMMA] - 1.0
-    own = _code_variance(first[CNO], first[SD_A], scale)
+    own = _code_variance(weak_a, first[SD], scale)
     out[SLANT] = state[_DELAY]
     out[SLANT_VARIANCE] = state[_V] + plan[DELAY_VARIANCE]
     # As if both codes were of one noise: A = 2 own / more^2.
@@ -262,11 +271,13 @@ def follow(
     out: Array,
     refused: npt.NDArray[np.int64],
 ) -> int:
-    """Process an epoch at `now` (s); True if the clock jumped. `kept` (SLOTS, 12) is changed;
-    `plan` (n, 8), `first` (n, 7), `second` (n, 5); writes `out` (n, 6) and `refused` (n,)."""
+    """Process an epoch at `now` (s); returns `ALL_FOLLOWED` or a sum of others.
+
+    `kept` (SLOTS, 12) is changed; `plan` (n, 8), `first` and `second` (n, 7); writes `out` (n, 6)
+    and `refused` (n,)."""
     n = plan.shape[0]
     scale, phases, codes = _shown(kept, _SUM), _shown(kept, _PHASES), _shown(kept, _CODES)
-    residuals, moved = np.empty(n), np.empty(n)
+    residuals, moved, weak = np.empty(n), np.empty(n), np.empty(n)
     many = 0
     for i in range(n):
         state = kept[int(plan[i, SLOT])]
@@ -275,14 +286,15 @@ def follow(
             out[i, j] = math.nan
         out[i, SPAN] = 0.0
         span = now - state[_T]
-        l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
+        l_a = first[i, CYCLES] * plan[i, LENGTH_A]
         out[i, CARRIER] = l_a
-        out[i, CARRIER_VARIANCE] = phases * _phase_variance(first[i, CNO], plan[i, LENGTH_A])
+        weak[i] = _weakness(first[i, CNO])
+        out[i, CARRIER_VARIANCE] = phases * _phase_variance(weak[i], plan[i, LENGTH_A])
         if not (0.0 < span <= LONGEST_S) or state[_SIGNAL] != plan[i, SIGNAL]:
             continue
         if math.isnan(l_a) or math.isnan(state[_L_A]):
             continue
-        if first[i, LOCK_A] < span:
+        if first[i, LOCK] < span:
             refused[i] = LOCK_LOST
             continue
         moved[i], out[i, SPAN] = (l_a - state[_L_A]) / span, span
@@ -296,24 +308,25 @@ def follow(
         common = ordered[many // 2]
     jumped = abs(common) > JUMP_M_S
     for i in range(n):
-        state = kept[int(plan[i, SLOT])]
+        state, weak_a = kept[int(plan[i, SLOT])], weak[i]
         span = now - state[_T]
         if span <= 0.0:  # seen already
             if state[_SINCE] > 0.0:
                 refused[i] = MULTIPATH
-            _write_rates(state, plan[i], first[i], scale, out[i])
+            _write_rates(state, plan[i], first[i], weak_a, scale, out[i])
             continue
-        l_a = first[i, CARRIER_A] * plan[i, LENGTH_A]
-        pair = plan[i, GAMMA] > 0.0 and not math.isnan(second[i, P_B])
+        l_a = first[i, CYCLES] * plan[i, LENGTH_A]
+        pair = plan[i, GAMMA] > 0.0 and not math.isnan(second[i, P])
         l_ab = math.nan
         if pair:
-            l_ab = l_a - second[i, CARRIER_B] * plan[i, LENGTH_B]
+            l_ab = l_a - second[i, CYCLES] * plan[i, LENGTH_B]
         change = math.nan
-        locked = first[i, LOCK_A] >= span and second[i, LOCK_B] >= span
+        locked = first[i, LOCK] >= span and second[i, LOCK] >= span
         if pair and locked and state[_PAIR] == plan[i, PAIR] and state[_T_PAIR] == state[_T]:
             change = l_ab - state[_L_AB]
-        noise = _phase_variance(first[i, CNO], plan[i, LENGTH_A])
-        noise = 2.0 * (noise + _phase_variance(second[i, CNO_B], plan[i, LENGTH_B]))
+        weak_b = _weakness(second[i, CNO])
+        noise = _phase_variance(weak_a, plan[i, LENGTH_A])
+        noise = 2.0 * (noise + _phase_variance(weak_b, plan[i, LENGTH_B]))
         slipped = abs(change) > SLIP_SIGMAS * math.sqrt(phases * noise) + DELAY_RATE_M_S * span
         if 0.0 < span <= LONGEST_S and not math.isnan(change):
             w = min(span, 1.0)
@@ -329,7 +342,7 @@ def follow(
         elif out[i, SPAN] == 0.0 or refused[i] != FOLLOWED:
             rate = 0.5 * (first[i, RATE] + state[_RATE]) + common
             lost = l_a - state[_L_A] - rate * span
-        if _has_multipath(state, first[i], l_a, now, span, lost, codes, kept[0]):
+        if _has_multipath(state, first[i], weak_a, l_a, now, span, lost, codes, kept[0]):
             refused[i] = MULTIPATH
         if jumped or refused[i] != FOLLOWED:
             out[i, SPAN] = 0.0
@@ -337,9 +350,13 @@ def follow(
             if slipped:
                 change = math.nan
             since = now - state[_T_PAIR]
-            _delay(state, plan[i], first[i], second[i], since, change, scale, kept[0])
+            of = weak_a, weak_b, since, change, scale
+            _delay(state, plan[i], first[i], second[i], *of, kept[0])
             state[_T_PAIR], state[_PAIR], state[_L_AB] = now, plan[i, PAIR], l_ab
         state[_T], state[_SIGNAL], state[_L_A] = now, plan[i, SIGNAL], l_a
         state[_RATE] = first[i, RATE]
-        _write_rates(state, plan[i], first[i], scale, out[i])
-    return int(jumped)
+        _write_rates(state, plan[i], first[i], weak_a, scale, out[i])
+    found = int(jumped) * JUMPED
+    for i in range(n):
+        found |= int(refused[i] != FOLLOWED) * SOME_REFUSED
+    return found

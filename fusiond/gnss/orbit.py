@@ -102,6 +102,10 @@ SMALL_RAD = 1e-3
 """Angle below which `turned` is exact to rounding."""
 
 
+STATE_COLUMNS = 8
+"""Position, velocity, clock offset and drift of a satellite."""
+
+
 @compiled("UniTuple(f8, 2)(f8, f8, f8)", forceinline=True)
 def turned(cosine: float, sine: float, small: float) -> tuple[float, float]:
     """Cosine and sine of an angle increased by `small` (rad), at a tenth of the cost of computing
@@ -283,7 +287,7 @@ class Orbits:
 
     def _states(self, week: int, tow_s: float | Array, by_clock: bool) -> SatelliteStates:
         n = len(self.elements)
-        out = np.empty((n, 8))
+        out = np.empty((n, STATE_COLUMNS))
         tow = np.empty(n)
         tow[:] = tow_s
         satellite_states(self.elements, float(week), tow, by_clock, out)

@@ -42,7 +42,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.messages import SPEED_OF_LIGHT_M_S
+from drivers.raw.messages import SIGNAL_VALUES, SPEED_OF_LIGHT_M_S
 from fusiond.gnss.atmosphere import (
     klobuchar_beidou,
     klobuchar_gps,
@@ -55,22 +55,16 @@ from fusiond.gnss.bdgim import bdgim
 from fusiond.gnss.carrier_phase import CARRIER as LENGTH
 from fusiond.gnss.carrier_phase import CARRIER_VARIANCE as LENGTH_VARIANCE
 from fusiond.gnss.carrier_phase import (
-    CNO as CNO_A,
-)
-from fusiond.gnss.carrier_phase import (
-    P_A,
-    SD_A,
+    CNO,
     SLANT,
     SLANT_VARIANCE,
     SPAN,
     WITH_CODE,
 )
-from fusiond.gnss.carrier_phase import (
-    RATE as DOPPLER,
-)
-from fusiond.gnss.carrier_phase import (
-    SD_RATE as SD_DOPPLER,
-)
+from fusiond.gnss.carrier_phase import RATE as DOPPLER
+from fusiond.gnss.carrier_phase import SD as SD_PSEUDORANGE
+from fusiond.gnss.carrier_phase import SD_RATE as SD_DOPPLER
+from fusiond.gnss.carrier_phase import P as PSEUDORANGE
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
 from fusiond.navigation.compiled import compiled
@@ -94,11 +88,11 @@ _NEPERS = 0.1 * math.log(10.0)
 """A decibel of power as an exponent of e."""
 
 # What the plan says of each row.
-SIGNAL_COLUMNS = 6
-GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(SIGNAL_COLUMNS)
+SIGNAL_COLUMNS = 8
+(
+    GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2, OWN_SLOT, OWN_ISSUE,
+) = range(SIGNAL_COLUMNS)  # fmt: skip
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
-# Columns of `first` as the receiver says them; NaN where it does not.
-PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = P_A, DOPPLER, CNO_A, SD_A, SD_DOPPLER
 # Results; the first nineteen are what a measurement takes (fusiond.aiding.pseudorange).
 ROW_COLUMNS = 30
 RANGE_VALUES = 19
@@ -166,12 +160,46 @@ def _take_off_ionosphere(
 
 
 @compiled(
+    "void(f8[::1], i8[::1], i8[::1], f8[:, ::1], f8, f8, f8[:, ::1], f8[:, ::1], f8[:, ::1])",
+    allocates=True,
+)
+def choose(
+    values: Array,
+    at: npt.NDArray[np.int64],
+    second_at: npt.NDArray[np.int64],
+    elements: Array,
+    week: float,
+    tow: float,
+    measured: Array,
+    second: Array,
+    states: Array,
+) -> None:
+    """Write the values of the chosen signals and the states of their satellites.
+
+    `measured` (n, 7) of the first signals, `second` (n, 7) of the second ones, NaN where absent;
+    `states` (n, 8) as the satellites sent the first.
+    `values` (m * 7) of an epoch's signals at GPS time `week`, `tow`; `at` and `second_at` (n,)
+    signals of the satellites, -1: none; `elements` (n, 47).
+    """
+    n = at.shape[0]
+    sent = np.empty(n)
+    for k in range(n):
+        for j in range(SIGNAL_VALUES):
+            measured[k, j] = values[at[k] * SIGNAL_VALUES + j]
+            second[k, j] = math.nan
+            if second_at[k] >= 0:
+                second[k, j] = values[second_at[k] * SIGNAL_VALUES + j]
+        sent[k] = tow - measured[k, PSEUDORANGE] / SPEED_OF_LIGHT_M_S
+    satellite_states(elements, week, sent, True, states)
+
+
+@compiled(
     "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8,"
-    "f8, f8[:, ::1])",
+    "f8, f8, f8[:, ::1])",
     allocates=True,
 )
 def range_rows(
-    elements: Array,
+    states: Array,
     signals: Array,
     measured: Array,
     carriers: Array,
@@ -180,27 +208,24 @@ def range_rows(
     tow: float,
     receiver: Array,
     noise: Array,
+    code_scale: float,
     least_elevation: float,
     least_cno: float,
     out: Array,
 ) -> int:
     """Write (30, n) values of the satellites in the receiver's order.
 
-    `SLOT` and `ISSUE` are the plan's and stay. `receiver` (3,) ECEF m, at GPS time `week`, `tow` of
+    `receiver` (3,) ECEF m, at GPS time `week`, `tow` of
     its clock; returns the number of satellites below `least_elevation` (rad) or `least_cno` (dB
     Hz).
 
-    `elements` (n, 47), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
+    `states` (n, 8) of `choose`, `signals` (n, 8), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carrier_phase, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
-    terms of BDGIM; `noise` (8,).
+    terms of BDGIM; `noise` (8,), whose codes are `code_scale` times the model's.
     """
-    n = elements.shape[0]
+    n = states.shape[0]
     refused = 0
-    sent = np.empty(n)
-    for k in range(n):
-        sent[k] = tow - measured[k, PSEUDORANGE] / SPEED_OF_LIGHT_M_S
-    states = np.empty((n, 8))
-    satellite_states(elements, week, sent, True, states)
+    code_zenith, code_cno = noise[CODE_ZENITH] * code_scale, noise[CODE_CNO] * code_scale
     rx, ry, rz = receiver[0], receiver[1], receiver[2]
     on_earth = rx * rx + ry * ry + rz * rz > LOWEST_RADIUS_M * LOWEST_RADIUS_M
     lat, lon, height = 0.0, 0.0, 0.0
@@ -256,6 +281,7 @@ def range_rows(
             iono_sigma = noise[IONO_SHARE] * iono
             if model == NO_MODEL:
                 iono_sigma = noise[IONO_UNMODELLED] * slant(up) * signals[k, IONO_SCALE]
+        out[SLOT, k], out[ISSUE, k] = signals[k, OWN_SLOT], signals[k, OWN_ISSUE]
         out[X, k], out[Y, k], out[Z, k] = x, y, z
         out[VX, k], out[VY, k], out[VZ, k] = vx, vy, vz
         out[LX, k], out[LY, k], out[LZ, k] = lx, ly, lz
@@ -269,8 +295,8 @@ def range_rows(
         ) / SPEED_OF_LIGHT_M_S
         drift = SPEED_OF_LIGHT_M_S * states[k, 7]
         thin = slant(up)
-        out[CORRECTED_RATE, k] = measured[k, RATE] * (1.0 + inertial) + drift
-        stated = measured[k, SD_RATE]
+        out[CORRECTED_RATE, k] = measured[k, DOPPLER] * (1.0 + inertial) + drift
+        stated = measured[k, SD_DOPPLER]
         if math.isnan(stated):
             stated = 0.0
         out[RATE_VARIANCE, k] = (
@@ -280,7 +306,7 @@ def range_rows(
         out[CARRIER, k] = carriers[k, LENGTH] + SPEED_OF_LIGHT_M_S * states[k, 6] - tropo + iono
         out[CARRIER_VARIANCE, k] = carriers[k, LENGTH_VARIANCE] * thin * thin
         out[WALK, k] = WALK_M_SQRT_S * thin
-        code = noise[CODE_ZENITH] * thin
+        code = code_zenith * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno
         weak = 0.0 if math.isnan(cno) else math.exp(_NEPERS * (noise[CNO_REFERENCE] - cno))
@@ -288,10 +314,7 @@ def range_rows(
         if math.isnan(stated):
             stated = 0.0
         out[VARIANCE, k] = (
-            code * code
-            + noise[CODE_CNO] * noise[CODE_CNO] * weak
-            + stated * stated
-            + signals[k, FIXED_VARIANCE]
+            code * code + code_cno * code_cno * weak + stated * stated + signals[k, FIXED_VARIANCE]
         )
         out[TROPOSPHERE_SIGMA, k] = noise[TROPO_ZENITH] * thin if on_earth else 0.0
     _take_off_ionosphere(signals, carriers, noise[IONO_LOCAL], on_earth, out)

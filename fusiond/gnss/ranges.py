@@ -29,22 +29,18 @@ code has diverged from its carrier); of carriers, which then wait for a new anch
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import chain, compress
-from operator import attrgetter
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.raw.messages import (
-    RawGnssEpoch,
-)
+from drivers.raw.messages import SIGNAL_VALUES, RawGnssEpoch
 from fusiond.gnss import carrier_phase as ca
 from fusiond.gnss import range_kernel as rk
-from fusiond.gnss.orbit import WEEK_S
+from fusiond.gnss.orbit import STATE_COLUMNS, WEEK_S
 from fusiond.gnss.signal_choice import RangeNoise, RangeOptions, SignalChoice, SignalChooser
 from fusiond.gnss.store import EphemerisStore
 
@@ -62,18 +58,6 @@ __all__ = [
 
 PLAN_HOLDS_S = 10.0
 """Time after which ephemerides are chosen again, and by which one may exceed its validity."""
-
-_FIRST = attrgetter(
-    "pseudorange_m",
-    "range_rate_m_s",
-    "cno_db_hz",
-    "sd_pseudorange_m",
-    "sd_range_rate_m_s",
-    "carrier_cycles",
-    "lock_s",
-)
-_SECOND = attrgetter("pseudorange_m", "cno_db_hz", "sd_pseudorange_m", "carrier_cycles", "lock_s")
-_KEY = attrgetter("system", "prn", "signal")
 
 
 class _Of:
@@ -154,14 +138,17 @@ class Rows:
 
 
 class ChosenSignals(NamedTuple):
-    """Chosen signals of an epoch, (n, 7) as measured, and the second ones (n, 5), NaN where
-    absent."""
+    """Chosen signals of an epoch.
+
+    `measured` (n, 7) as the receiver states them, the `second` ones (n, 7), NaN where absent, and
+    the satellites' `states` (n, 8) as they sent the first."""
 
     plan: SignalChoice
     week: int
     tow_s: float
     measured: Array
     second: Array
+    states: Array
 
 
 class TrackedSignals(NamedTuple):
@@ -208,44 +195,41 @@ class RangeModel:
 
     def pick(self, epoch: RawGnssEpoch) -> ChosenSignals:
         """Choose the signals to use."""
-        keys = list(map(_KEY, epoch.signals))
+        packed = epoch.packed
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan
         if (
             plan is None
             or plan.version != self.store.version
             or abs(now - plan.gps_s) > PLAN_HOLDS_S
-            or plan.keys != keys
+            or plan.keys != packed.keys
         ):
-            self._plan = plan = self._planner.plan(epoch, keys, now)
-        signals = epoch.signals
-        measured = _packed(
-            plan.doubles, map(_FIRST, [signals[k] for k in plan.serving]), ca.FIRST_COLUMNS
-        )
-        second = np.full((len(plan.serving), ca.SECOND_COLUMNS), np.nan)
-        second[plan.second_rows] = _packed(
-            plan.second_doubles, map(_SECOND, [signals[k] for k in plan.seconds]), ca.SECOND_COLUMNS
-        )
-        return ChosenSignals(plan, epoch.week, epoch.tow_s, measured, second)
+            self._plan = plan = self._planner.plan(epoch, now)
+        n = len(plan.satellites)
+        measured, second = np.empty((2, n, SIGNAL_VALUES))
+        states = np.empty((n, STATE_COLUMNS))
+        of = plan.measured_at, plan.second_at, plan.orbits.elements, float(epoch.week), epoch.tow_s
+        rk.choose(np.frombuffer(packed.values), *of, measured, second, states)
+        return ChosenSignals(plan, epoch.week, epoch.tow_s, measured, second, states)
 
     def follow(self, picked: ChosenSignals, kept: Array) -> TrackedSignals:
         """Update the state `kept` of earlier epochs by an epoch, in place."""
         plan = picked.plan
-        carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
-        refused = np.empty(len(plan.serving), np.int64)
+        carriers = np.empty((len(plan.satellites), ca.OUT_COLUMNS))
+        refused = np.empty(len(plan.satellites), np.int64)
         now = picked.week * WEEK_S + picked.tow_s
         args = plan.followed, picked.measured, picked.second, now, carriers, refused
-        jumped = ca.follow(kept, *args)
+        found = ca.follow(kept, *args)
         scale = math.sqrt(ca.scale_squared(kept))
         slips: tuple[tuple[str, str], ...] = ()
         multipath = None
-        if refused.any():
+        if found & ca.SOME_REFUSED:
             slips = tuple(
                 (plan.satellites[k], "lock_lost" if refused[k] == ca.LOCK_LOST else "cycle_slip")
                 for k in np.flatnonzero((refused == ca.LOCK_LOST) | (refused == ca.CYCLE_SLIP))
             )
             multipath = refused == ca.MULTIPATH
-        if jumped:
+        if found & ca.JUMPED:
             slips += (("", "clock_jump"),)
         return TrackedSignals(picked, carriers, scale, slips, multipath)
 
@@ -254,10 +238,8 @@ class RangeModel:
         picked, options = followed.picked, self.options
         plan = picked.plan
         out = np.empty((rk.ROW_COLUMNS, len(plan.satellites)))
-        noise = self._noise.copy()
-        noise[: rk.CODE_CNO + 1] *= followed.code_scale
         lost = rk.range_rows(
-            plan.orbits.elements,
+            picked.states,
             plan.fixed,
             picked.measured,
             followed.carriers,
@@ -265,17 +247,17 @@ class RangeModel:
             float(picked.week),
             picked.tow_s,
             np.ascontiguousarray(receiver, float),
-            noise,
+            self._noise,
+            followed.code_scale,
             options.elevation_mask_rad,
             options.cno_mask_db_hz,
             out,
         )
-        out[rk.SLOT], out[rk.ISSUE] = plan.followed[:, ca.SLOT], plan.issues
         satellites, signals, refused = plan.satellites, plan.signals, plan.refused
         rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
         if not lost and followed.multipath is None:
             return rows
-        weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
+        weak = picked.measured[:, ca.CNO] < options.cno_mask_db_hz
         low = out[rk.ELEVATION] < options.elevation_mask_rad
         drop = weak | low
         if followed.multipath is not None:
@@ -288,16 +270,3 @@ class RangeModel:
             for k in np.flatnonzero(drop)
         )
         return rows.only(~drop)
-
-
-def _packed(
-    doubles: struct.Struct, rows: Iterable[tuple[float | None, ...]], columns: int
-) -> Array:
-    """Values as rows; NaN for None."""
-    values = list(chain.from_iterable(rows))
-    out = np.empty((len(values) // columns, columns))
-    try:
-        doubles.pack_into(out.data, 0, *values)  # half of what numpy takes
-    except struct.error:  # what a receiver does not say is None
-        out[:] = np.array(values, float).reshape(out.shape)
-    return out

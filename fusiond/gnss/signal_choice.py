@@ -15,7 +15,6 @@ fusiond.gnss.corrections).
 
 from __future__ import annotations
 
-import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import field
@@ -32,6 +31,7 @@ from drivers.raw.messages import (
     Ephemeris,
     RawGnssEpoch,
     RawSignal,
+    SignalKey,
     System,
 )
 from fusiond.gnss import carrier_phase as ca
@@ -122,16 +122,13 @@ class RangeOptions:
 class SignalChoice(NamedTuple):
     """Cached choice of an epoch's signals, valid until signals or ephemerides change."""
 
-    keys: list[tuple[System, int, str]]
+    keys: tuple[SignalKey, ...]
     version: int
     gps_s: float
-    serving: list[int]
-    doubles: struct.Struct
-    seconds: list[int]
-    second_doubles: struct.Struct
-    second_rows: npt.NDArray[np.intp]
     followed: Array
-    measured_at: npt.NDArray[np.intp]
+    measured_at: npt.NDArray[np.int64]
+    second_at: npt.NDArray[np.int64]
+    """Second signals (n,) in the epoch, -1 without one."""
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
     system: npt.NDArray[np.intp]
@@ -139,9 +136,6 @@ class SignalChoice(NamedTuple):
     orbits: Orbits
     fixed: Array
     ionosphere: Array
-    issues: Array
-    """Numbers (n,) that change with orbit, clock or ionosphere, and so with a carrier's constant.
-    """
     refused: tuple[tuple[str, str], ...]
 
 
@@ -165,49 +159,42 @@ class SignalChooser:
         self.store = store
         self.options = options
 
-    def plan(
-        self, epoch: RawGnssEpoch, keys: list[tuple[System, int, str]], now: float
-    ) -> SignalChoice:
-        """Plan for an epoch with signals `keys`, at `now` (s of GPS time)."""
+    def plan(self, epoch: RawGnssEpoch, now: float) -> SignalChoice:
+        """Plan for an epoch at `now` (s of GPS time)."""
         by_satellite: dict[tuple[System, int], dict[str, int]] = {}
-        for k, s in enumerate(epoch.signals):
+        all_signals = tuple(epoch.signals)
+        for k, s in enumerate(all_signals):
             if s.system in self.options.systems:
                 by_satellite.setdefault((s.system, s.prn), {})[s.signal] = k
         chosen: list[_Served] = []
         refused: list[tuple[str, str]] = []
         corrected = self._corrected(epoch, by_satellite)
         for found in by_satellite.values():
-            served = self._serve(epoch, found, corrected)
+            served = self._serve(epoch, all_signals, found, corrected)
             if isinstance(served, str):
-                refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
+                refused.append((all_signals[next(iter(found.values()))].satellite, served))
             else:
                 chosen.append(served)
-        groups = _grouped(chosen)
-        serving = [s.at for s in chosen]
-        signals = [epoch.signals[k] for k in serving]
-        paired = [k for k, s in enumerate(chosen) if s.second is not None]
-        seconds = [s.second for s in chosen if s.second is not None]
+        signals = [all_signals[s.at] for s in chosen]
+        seconds = [-1 if s.second is None else s.second for s in chosen]
         orbits = Orbits.of([s.ephemeris for s in chosen], [s.corrected for s in chosen])
         models = zlib.crc32(repr((self.store.ionosphere, self.store.bdgim)).encode())
+        # What changes with orbit, clock or ionosphere, and so with a carrier's constant.
+        issues = [zlib.crc32(row.tobytes(), models) for row in orbits.elements]
         return SignalChoice(
-            keys,
+            epoch.packed.keys,
             self.store.version,
             now,
-            serving,
-            struct.Struct(f"{len(serving) * ca.FIRST_COLUMNS}d"),
-            seconds,
-            struct.Struct(f"{len(seconds) * ca.SECOND_COLUMNS}d"),
-            np.array(paired, np.intp),
             np.array([s.followed for s in chosen], float).reshape(-1, ca.PLAN_COLUMNS),
-            np.array(serving, np.intp),
+            np.array([s.at for s in chosen], np.int64),
+            np.array(seconds, np.int64),
             tuple(s.satellite for s in signals),
             tuple(s.signal for s in signals),
             np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
             np.array([self.options.systems.index(s.system) for s in signals], np.int64),
             orbits,
-            np.array(groups, float).reshape(-1, rk.SIGNAL_COLUMNS),
+            np.array(_fixed(chosen, issues), float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
-            np.array([zlib.crc32(row.tobytes(), models) for row in orbits.elements], float),
             tuple(refused),
         )
 
@@ -232,22 +219,23 @@ class SignalChooser:
     def _serve(
         self,
         epoch: RawGnssEpoch,
+        signals: Sequence[RawSignal],
         found: dict[str, int],
         corrected: dict[System, dict[int, CorrectedEphemeris]],
     ) -> _Served | str:
         """Choose the signals of one satellite."""
-        first = epoch.signals[next(iter(found.values()))]
+        first = signals[next(iter(found.values()))]
         wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
         outcome = "no_group_delay"
         candidates: list[tuple[int, Ephemeris, GroupDelay]] = []
         applied = None
         if first.system in corrected:
             applied = corrected[first.system].get(first.prn)
-            wanted = [k for k in wanted if applied and epoch.signals[k].signal in applied.bias]
+            wanted = [k for k in wanted if applied and signals[k].signal in applied.bias]
             if applied is None or not wanted:
                 return "no_correction"
         for k in wanted or found.values():
-            s = epoch.signals[k]
+            s = signals[k]
             if applied is not None:
                 candidates.append((k, applied.ephemeris, _by_bias(applied, s.signal)))
                 continue
@@ -261,13 +249,13 @@ class SignalChooser:
         best: tuple[float, int, int, Ephemeris, GroupDelay, GroupDelay] | None = None
         for k, e, delay in candidates:
             for j in found.values():
-                name = epoch.signals[j].signal
+                name = signals[j].signal
                 other = self.store.delay(e, name)
                 if applied is not None:
                     other = _by_bias(applied, name) if name in applied.bias else None
                 if other is None:
                     continue
-                gamma = _gamma(epoch.signals[k], epoch.signals[j])
+                gamma = _gamma(signals[k], signals[j])
                 if gamma <= LEAST_GAMMA:
                     continue
                 noise = ca.CODE_M**2
@@ -277,13 +265,13 @@ class SignalChooser:
                     best = variance, k, j, e, delay, other
         if best is None:
             k, e, delay = candidates[0]
-            return self._served(epoch, k, e, delay, None, None, applied)
+            return self._served(signals, k, e, delay, None, None, applied)
         _, k, j, e, delay, other = best
-        return self._served(epoch, k, e, delay, j, other, applied)
+        return self._served(signals, k, e, delay, j, other, applied)
 
     def _served(
         self,
-        epoch: RawGnssEpoch,
+        signals: Sequence[RawSignal],
         index: int,
         ephemeris: Ephemeris,
         delay: GroupDelay,
@@ -291,7 +279,7 @@ class SignalChooser:
         other: GroupDelay | None,
         applied: CorrectedEphemeris | None,
     ) -> _Served:
-        s = epoch.signals[index]
+        s = signals[index]
         model, scale = self._ionosphere_model(s)
         in_space = self.options.signal_in_space_m[s.system]
         beidou_2 = s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN
@@ -306,7 +294,7 @@ class SignalChooser:
         first = float(_number(s.signal, ""))
         followed = (slot, length, 0.0, 0.0, 0.0, 0.0, 0.0, first)
         if second is not None and other is not None:
-            b = epoch.signals[second]
+            b = signals[second]
             gamma = _gamma(s, b)
             followed = (
                 slot,
@@ -352,7 +340,7 @@ def _by_bias(applied: CorrectedEphemeris, signal: str) -> GroupDelay:
     return GroupDelay(-applied.bias[signal] / SPEED_OF_LIGHT_M_S)
 
 
-def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:
+def _fixed(chosen: Sequence[_Served], issues: Sequence[int]) -> list[tuple[float, ...]]:
     """Rows of the plan with the numbers of their groups. The receiver's delay between carriers is
     part of the clock, if satellites with two carriers determine it; a satellite with one other
     carrier does not share it."""
@@ -363,12 +351,13 @@ def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:
         if s.second is not None:
             paired.setdefault(s.group[:2], set()).add(s.group[2])
     rows: list[tuple[float, ...]] = []
-    for s in chosen:
+    for s, issue in zip(chosen, issues, strict=True):
         delay, model, scale, variance = s.fixed
         settled = paired.get(s.group[:2])
         if settled and s.group[2] not in settled:
             variance += BAND_DELAY_M**2
-        rows.append((delay, model, scale, variance, numbers[s.group], s.group[1]))
+        own = numbers[s.group], s.group[1], s.followed[ca.SLOT], issue
+        rows.append((delay, model, scale, variance, *own))
     return rows
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Outcome
-from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.integrity.consistency import (
     FEWEST,
     Consistency,
@@ -70,8 +69,7 @@ class Verdicts:
             whitened = outcome.whitened
             series.waiting.append((len(whitened), self._heard, whitened, outcome.nis))
             return
-        kept = np.array(outcome.rows) == KEPT
-        for name, row in measurement.series(outcome.whitened, kept).items():
+        for name, row in measurement.series(outcome.whitened, outcome.rows).items():
             source = f"{measurement.source}_{name}"
             series = self._series.get(source) or self._begin(source, measurement)
             self._heard += 1

@@ -133,9 +133,9 @@ class RawEpochMeasurement(AidingMeasurement):
         """Position and velocity of the epoch alone; none without a solution."""
         return self.receiver.alone(self)
 
-    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
+    def series(self, whitened: Sequence[float], codes: Sequence[int]) -> Mapping[str, Array]:
         found = self.memory.corrected
-        return {} if found is None else found.measurement.series(whitened, kept)
+        return {} if found is None else found.measurement.series(whitened, codes)
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         if self.memory.corrected is not None:
@@ -263,7 +263,7 @@ class RawGnss:
         if self._guess is not None:
             left_out = self._model.evaluate(self.followed(measurement), self._guess).refused
         self._judged, self._left_out = None, dict(left_out)
-        self._count(measurement, left_out)
+        self._count(measurement, left_out, self.followed(measurement))
         return candidates
 
     def correct(
@@ -343,7 +343,7 @@ class RawGnss:
         """Record a processed epoch; one repeated by a rewind counts once."""
         self._judged = measurement, corrected, codes, whitened
         self._guess = corrected.guess
-        self._count(measurement, corrected.rows.refused)
+        self._count(measurement, corrected.rows.refused, corrected.followed)
         if not codes or measurement.t_ns <= self._counted_ns:
             return
         self._counted_ns = measurement.t_ns
@@ -353,13 +353,18 @@ class RawGnss:
             if code != KEPT:
                 self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
-    def _count(self, measurement: RawEpochMeasurement, refused: Sequence[tuple[str, str]]) -> None:
+    def _count(
+        self,
+        measurement: RawEpochMeasurement,
+        refused: Sequence[tuple[str, str]],
+        followed: TrackedSignals,
+    ) -> None:
         """Count the refused satellites of an epoch."""
         if not measurement.memory.counted:
             measurement.memory.counted = True
             for satellite, reason in refused:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
-            for satellite, reason in self.followed(measurement).slips:
+            for satellite, reason in followed.slips:
                 self.refused[f"{satellite[0]}_{reason}" if satellite else reason] += 1
 
     def sky(self) -> Sky:

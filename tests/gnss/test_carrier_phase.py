@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S
+from drivers.raw.messages import CARRIER_HZ, SIGNAL_VALUES, SPEED_OF_LIGHT_M_S
 from fusiond.gnss import carrier_phase as ca
 
 Array = NDArray[np.float64]
@@ -56,21 +56,22 @@ class Receiver:
         rho = 2.2e7 + self.rates() * (self.t - NOON) + self.clock_m
         noise = self.code_m * self.rng.standard_normal((2, self.n))
         i = self.delays()
-        first = np.full((self.n, ca.FIRST_COLUMNS), np.nan)
-        first[:, ca.P_A] = rho + i + noise[0] + self.longer_m
+        first = np.full((self.n, SIGNAL_VALUES), np.nan)
+        first[:, ca.P] = rho + i + noise[0] + self.longer_m
         first[:, ca.RATE] = self.rates() if doppler else np.nan
         first[:, ca.CNO] = 45.0
-        first[:, ca.CARRIER_A] = (rho - i) / L1 + 3e5 + self.cycles[:, 0]
-        first[:, ca.LOCK_A] = lock_s
-        second = np.full((self.n, ca.SECOND_COLUMNS), np.nan)
-        second[:, ca.P_B] = rho + GAMMA * i + DELAY_M + noise[1] + self.longer_m
-        second[:, ca.CNO_B] = 45.0
-        second[:, ca.CARRIER_B] = (rho - GAMMA * i) / L2 - 2e5 + self.cycles[:, 1]
-        second[:, ca.LOCK_B] = lock_s
+        first[:, ca.CYCLES] = (rho - i) / L1 + 3e5 + self.cycles[:, 0]
+        first[:, ca.LOCK] = lock_s
+        second = np.full((self.n, SIGNAL_VALUES), np.nan)
+        second[:, ca.P] = rho + GAMMA * i + DELAY_M + noise[1] + self.longer_m
+        second[:, ca.CNO] = 45.0
+        second[:, ca.CYCLES] = (rho - GAMMA * i) / L2 - 2e5 + self.cycles[:, 1]
+        second[:, ca.LOCK] = lock_s
         out = np.empty((self.n, ca.OUT_COLUMNS))
         refused = np.empty(self.n, np.int64)
-        jumped = ca.follow(self.kept, self.plan, first, second, self.t, out, refused)
-        return Told(out, refused.tolist(), bool(jumped))
+        found = ca.follow(self.kept, self.plan, first, second, self.t, out, refused)
+        assert bool(found & ca.SOME_REFUSED) == bool(refused.any())
+        return Told(out, refused.tolist(), bool(found & ca.JUMPED))
 
     def after(self, seconds: float, **how: float) -> Told:
         self.t += seconds

@@ -185,7 +185,7 @@ def test_figures_of_a_system_are_standard_normal() -> None:
     for _ in range(4000):
         codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
         whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
-        found = measurement.series(whitened.tolist(), codes == KEPT)
+        found = measurement.series(whitened.tolist(), codes.tolist())
         figures.append([*found["G"], *found["C"]])
     covariance = np.cov(np.array(figures).T)
     assert covariance == pytest.approx(np.eye(4), abs=0.1)
@@ -201,7 +201,7 @@ def test_a_system_without_rates_has_no_figure() -> None:
     )
     silent = replace(measurement, values=values)
     rows = len(silent.labels)
-    found = silent.series((1.0,) * rows, np.ones(rows, dtype=bool))
+    found = silent.series((1.0,) * rows, (0,) * rows)
     assert set(found) == {"C"}
 
 

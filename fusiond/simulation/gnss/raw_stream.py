@@ -18,7 +18,7 @@ A satellite that comes into view later is complete after 30 s at most, or 18 s o
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal
 
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch, RawSignal
@@ -67,7 +67,7 @@ class GnssRawStream:
         """Repeat all broadcast messages in view at once."""
         self._warm = self._is_warm
 
-    def _locks_ms(self, k: int, signals: tuple[RawSignal, ...]) -> list[int]:
+    def _locks_ms(self, k: int, signals: Sequence[RawSignal]) -> list[int]:
         """Tracking time of each signal; it restarts after a loss."""
         now = float(self.receiver.t_s[k])
         names = [(s.satellite, s.signal) for s in signals]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.measurements import UtcStamp
 from drivers.raw.decoder import RawDecoder
-from drivers.raw.messages import RawEvent, RawGnssEpoch, RawSignal
+from drivers.raw.messages import PackedSignals, RawEvent, RawGnssEpoch, RawSignal
 from tests.drivers.raw.frames import d1, inav, lnav, measurement, rawx, sfrbx, ubx
 
 C = 299_792_458.0
@@ -291,3 +291,24 @@ def test_every_measurement_is_accounted_for(measurements: list[tuple[Any, ...]])
     wanted = sum(counters[name] for name in MEASURED[:3])
     assert len(found.signals) == wanted - sum(counters[name] for name in REFUSED)
     assert all(math.isfinite(s.pseudorange_m) for s in found.signals)
+
+
+def test_packed_signals_are_the_single_ones() -> None:
+    """What the receiver does not say stays unsaid; a repeated or refused signal takes no place."""
+    single = (
+        RawSignal("G", 5, "1C", 2.2e7, -3.5, 1.1e8, 44.0, 0.16, 0.02, 3.0),
+        RawSignal("C", 21, "6I", 3.7e7),
+        RawSignal("E", 36, "7Q", 2.5e7, cno_db_hz=31.0),
+    )
+    packed = PackedSignals.of(single)
+    assert packed == single
+    assert (packed[1], packed[-1], packed[:2]) == (single[1], single[2], single[:2])
+    assert PackedSignals.of(packed) is packed
+    assert packed != PackedSignals.of(single[:2])
+    assert PackedSignals.of(()) == ()
+    with pytest.raises(IndexError):
+        packed[3]
+    found, _ = epoch(measurement(prn=6, track=1, cno=0), measurement(prn=7), measurement(prn=6))
+    again = PackedSignals.of(tuple(found.signals))
+    assert again == found.packed
+    assert [key[1] for key in again.keys] == [6, 7]
