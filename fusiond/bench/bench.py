@@ -37,7 +37,9 @@ Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
 (`fusiond.studies.reduced_order.cost`).
 
 Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
-to published sigma, and the modules that they are in (`fusiond.bench.fix_call_trace`).
+to published sigma, and the modules that they are in (`fusiond.bench.fix_call_trace`);
+`wired_fix_functions` and `wired_fix_modules`, those from bytes on a line to the payload of `nav`
+(`fusiond.bench.wire_call_trace`).
 """
 
 from __future__ import annotations
@@ -63,6 +65,7 @@ from fusiond.bench.delayed_raw import delayed_raw
 from fusiond.bench.fix_call_trace import ordinary_fix
 from fusiond.bench.process_startup import start
 from fusiond.bench.raw_epoch import raw_epoch
+from fusiond.bench.wire_call_trace import wired_fix
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator
@@ -149,6 +152,8 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["reduced_order_step_ratio"] = reduced_cost.step_ratio(3 * repetitions)
     way = ordinary_fix()
     figures["fix_functions"], figures["fix_modules"] = way.functions, way.modules
+    way = wired_fix()
+    figures["wired_fix_functions"], figures["wired_fix_modules"] = way.functions, way.modules
     return {
         "numpy_product_us": round(statistics.median(products) * 1e6, 3),
         **{name: round(value, 4) for name, value in figures.items()},

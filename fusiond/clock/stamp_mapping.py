@@ -34,7 +34,6 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from fusiond.clock import plausible_dates
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
     KERNEL_FUTURE_NS,
@@ -47,7 +46,7 @@ from fusiond.clock.host import (
 )
 from fusiond.clock.results import ClockStatus, Instant, TimeSample
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
-from fusiond.clock.utc_from_arrivals import UtcEnvelope, UtcKnown
+from fusiond.clock.utc_from_arrivals import UtcEnvelope, UtcKnown, plausible_date, rolled_over, year
 from fusiond.configuration.schema import ClockOptions
 
 _KERNEL_MAX_AGE_NS = SECOND_NS
@@ -177,7 +176,7 @@ class Clock:
                 t_ns = device.to_monotonic(stamp.ticks_ns, t_seen_ns)
                 return Instant(t_ns, _DEVICE_SD_S, "device")
             case UtcStamp():
-                return self._from_utc(plausible_dates.rolled_over(stamp.utc_ns), source, t_seen_ns)
+                return self._from_utc(rolled_over(stamp.utc_ns), source, t_seen_ns)
             case TimeOfDayStamp():
                 return self._from_time_of_day(stamp, source, t_seen_ns)
             case MonotonicStamp():
@@ -267,18 +266,18 @@ class Clock:
         `utc_source_changed`, `utc_jumped`, and those of `UtcEnvelope`.
         """
         self.look()
-        utc_ns = plausible_dates.rolled_over(report.utc_ns)
+        utc_ns = rolled_over(report.utc_ns)
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
             if report.source in self._utc:
                 self._utc[report.source].untrusted(utc_ns, report.t_seen_ns)
             return
-        plausible = plausible_dates.plausible(utc_ns)
+        plausible = plausible_date(utc_ns)
         self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
         envelope = self._envelope(self._utc, report.source)
         if envelope.plausible and not plausible:
-            refusal = f"{report.source} tells the year {plausible_dates.year(utc_ns)}: not believed"
+            refusal = f"{report.source} tells the year {year(utc_ns)}: not believed"
             self._event("utc_implausible", refusal)
         jumped_ns = -envelope.update(utc_ns, report.t_seen_ns, plausible=plausible)
         if jumped_ns and report.source == self._reference:
@@ -314,7 +313,7 @@ class Clock:
         now_ns = self.now_ns()
         for each in known:
             new = 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS
-            if new and plausible_dates.plausible(each.utc_ns):
+            if new and plausible_date(each.utc_ns):
                 envelope = self._envelope(self._utc, each.source)
                 envelope.resume(each)
                 self.counters["utc_resumed"] += 1
@@ -368,7 +367,7 @@ class Clock:
         plausible (a computer without a battery starts in 1970).
         """
         utc_ns = t_ns - self._mapping(None)[0]
-        return utc_ns if plausible_dates.plausible(utc_ns) else None
+        return utc_ns if plausible_date(utc_ns) else None
 
     @property
     def sets_others(self) -> bool:

@@ -20,6 +20,9 @@ Anything else is a change of the source's UTC, recognised in two ways:
 UTC itself changes only after two minutes (`believed_offset_ns`): a receiver's mistake is no leap
 second.
 
+Dates that cannot be today's are mistakes, or GPS weeks that have rolled over: those from before the
+last rollover of the ten-bit week are moved by 1024 weeks (IS-GPS-200, 20.3.3.3.1.1).
+
 Everything is integer nanoseconds: UTC in ns does not fit a double. A pure function of its inputs.
 """
 
@@ -30,6 +33,7 @@ from datetime import UTC, datetime
 from math import hypot
 from typing import Annotated, NamedTuple
 
+import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -59,6 +63,13 @@ _SCATTER_NS = 500 * MILLISECOND_NS
 _AFTER_LEAP_NS = 5 * SECOND_NS
 _DAY_NS = 86400 * SECOND_NS
 
+WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
+EARLIEST_UTC_NS = 1554595200 * SECOND_NS
+"""2019-04-07, the last rollover of the ten-bit GPS week: earlier dates are mistakes."""
+LATEST_UTC_NS = 1793491200 * SECOND_NS + WEEKS_1024_NS
+"""Latest believable date: 1024 weeks (19.6 years) after this release, 2026-11-01. A later date is a
+rollover corrected once too often, or beyond the service life of this code."""
+
 SD_S = 3e-3
 _UNKNOWN_S = 0.15
 """Sentences come 50 to 200 ms after their epoch."""
@@ -84,6 +95,23 @@ class Stamped(NamedTuple):
 
     t_ns: int
     sd_s: float
+
+
+def plausible_date(utc_ns: int) -> bool:
+    """True if a date can be today's."""
+    return EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS
+
+
+def year(utc_ns: int) -> int:
+    """Gregorian year of any date."""
+    return int(np.datetime64(utc_ns // SECOND_NS, "s").astype("datetime64[Y]").astype(int)) + 1970
+
+
+def rolled_over(utc_ns: int) -> int:
+    """Date moved by 1024 weeks if it lies before the last rollover and the result does not."""
+    if utc_ns < EARLIEST_UTC_NS <= utc_ns + WEEKS_1024_NS:
+        return utc_ns + WEEKS_1024_NS
+    return utc_ns
 
 
 def whole_seconds_ns(excess_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:

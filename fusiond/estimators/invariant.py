@@ -73,7 +73,7 @@ from fusiond.estimators.invariant_error import (
     vehicle_axes,
     write_jacobian,
 )
-from fusiond.estimators.measurement_loop_kernel import KNOWN, LARGE, PLAIN, SETTLES
+from fusiond.estimators.measurement_loop_kernel import KNOWN, LARGE, PLAIN, SETTLES, UNDOUBTED
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.tilt_axes_update import keep_down_rows, keep_downward
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
@@ -104,6 +104,7 @@ PLAIN_SD_RAD = math.radians(2.0)
 # Above this sigma of the heading, as after a unit that has turned in its mount, they do not: a
 # correction of 12 deg in a bend at 20 m/s leaves 0.04 m/s^2 in the bias of an accelerometer.
 LARGE_SD_RAD = 2.0 * PLAIN_SD_RAD
+_OF_STATE = [KNOWN, UNDOUBTED]  # part of `_knows` in a snapshot
 
 
 class Turning(NamedTuple):
@@ -379,11 +380,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self.undoubted, self.heading_known, self._bent
+        return self.turns, self._bent, self._knows[_OF_STATE]
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self.undoubted, self.heading_known, self._bent = extra
+        self.turns, self._bent, self._knows[_OF_STATE] = extra
 
 
 def _way(a: Array, b: Array) -> Array:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 COLLECT_AFTER_IMPORTS, COLLECT_AFTER = 1_000_000, 50_000
 """Objects made since the last collection: imports make half a million, and are looked through once
-they are done; a filter at work makes the other in minutes, `fusiond.live.garbage_collection` in
+they are done; a filter at work makes the other in minutes, `fusiond.live.tick_scheduler` in
 none."""
 
 

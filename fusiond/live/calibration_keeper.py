@@ -50,7 +50,9 @@ class CalibrationKeeper:
         self._digest = mounting_digest(config)
         self._clock = clock
         self._event = on_event
-        self._due = Every(SAVE_EVERY_S * SECOND_NS)
+        self._schedule = Every(SAVE_EVERY_S * SECOND_NS)
+        self.schedule = None if self._path is None else self._schedule
+        """Schedule of `keep`; None if nothing is stored."""
         self._working: asyncio.Task[None] | None = None
 
     def restore_into(self, navigator: Navigator) -> None:
@@ -73,7 +75,7 @@ class CalibrationKeeper:
     def keep(self, t_ns: int, navigator: Navigator) -> None:
         """Write the file when due, if a parameter has been observed."""
         busy = self._working is not None and not self._working.done()
-        if self._path is None or busy or not self._due.due(t_ns):
+        if self._path is None or busy or not self._schedule.due(t_ns):
             return
         saved = self._of(navigator)
         if saved is not None:

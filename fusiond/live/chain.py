@@ -100,6 +100,7 @@ class Chain:
         drivers = {name: source.driver for name, source in self.sources.all.items()}
         self.messaging = Messaging(config, clock, drivers, events.report)
         self.sources.on_mail, self._on_code = self.messaging.receive, self.messaging.note_event
+        self._reports_position = config.position_reports.card is not None
         self.operator = Operator(self.navigator, self.sources, self.injection, self.messaging)
         self.solution: Solution | None = None
         self.changed = False
@@ -131,7 +132,8 @@ class Chain:
             self.solution is not None
             and self.solution.mode is Mode.NAVIGATING
             and t_ns - self._ticked_ns < LONGEST_WAIT_NS
-            and sources.imu.may_wait
+            and len(sources.imu.waiting) > 0
+            and not sources.imu.has_spare
             and not sources.measured
             and not self.injection.faults
             and self._second.waits(t_ns)
@@ -145,7 +147,8 @@ class Chain:
     def tick(self, t_ns: int) -> Solution:
         """Run the filter on all input and read the solution at `t_ns`."""
         self._ticked_ns, self.sources.measured, self.sources.behind = t_ns, False, False
-        self.sources.release(t_ns)
+        if self.injection.faults:
+            self.sources.release(t_ns)
         arrived = self.sources.take_imu(t_ns)
         if arrived is not None:
             self.navigator.add_imu(*arrived)
@@ -158,5 +161,6 @@ class Chain:
         navigating = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if (self._second.due(t_ns) or self.changed) and navigating:
             self.sources.height_hint(solution.height_m, solution.sd_ned_m[2], t_ns)
-        self.messaging.tick(t_ns, solution)
+        if self._reports_position:
+            self.messaging.tick(t_ns, solution)
         return solution

@@ -110,7 +110,7 @@ class Daemon:
             config.scheduler.rate_hz,
             self._tick,
             now=self.clock.now_ns,
-            on_time=self.service.feed_watchdog,
+            on_time=None if self.service.watchdog_s is None else self.service.feed_watchdog,
         )
         self._output_tasks = front.output_tasks
         front.on_command = self._carry_out
@@ -123,6 +123,8 @@ class Daemon:
             lambda: self.recorder.recording,
         )
         self._on_solution = on_solution
+        keepers = self._state, self._warm, self._calibration
+        self._saving = [k.schedule for k in keepers if k.schedule is not None]
         self._second = Every(SECOND_NS)
 
     @property
@@ -224,12 +226,13 @@ class Daemon:
     def _tick(self, t_ns: int) -> None:
         delay_ns = self.clock.now_ns() - t_ns
         self.sources.poll()
-        self.recorder.tick_begins(t_ns)
+        if self.recorder.state != "off":
+            self.recorder.tick_begins(t_ns)
         if self._nobody_reads(t_ns) and self._chain.may_wait(t_ns):
             self._chain.wait()
             return
         solution = self._chain.tick(t_ns)
-        if self.recorder.active:
+        if self._records:
             digest = state_digest(self.navigator, solution)
             self.recorder.tick_ended(t_ns, delay_ns, self.scheduler.overruns, digest)
             self._keep_in_log(t_ns, solution)
@@ -239,15 +242,26 @@ class Daemon:
             self._publishing.tick(t_ns, solution)
         if self._second.due(t_ns) or self._chain.changed:
             self._each_second(solution)
+        changed = self._chain.messaging.revision != self._messages.written
+        if changed or self._state.kept or not all(each.waits(t_ns) for each in self._saving):
+            self._save(t_ns, solution)
+
+    def _save(self, t_ns: int, solution: Solution) -> None:
+        """Store what must outlive the process, each part when it is due."""
         self._state.keep(t_ns, solution, confirmed=not self.navigator.trial.unconfirmed)
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
         self._messages.keep(t_ns, self._chain.messaging)
 
+    @property
+    def _records(self) -> bool:
+        """True if a log wants what happens."""
+        return self.recorder.state != "off" and self.recorder.active
+
     def _nobody_reads(self, t_ns: int) -> bool:
         """True if nobody reads this tick's solution. A log holds every tick, so recording counts as
         a reader."""
-        unread = self._on_solution is None and not self.recorder.active
+        unread = self._on_solution is None and not self._records
         return unread and self._second.waits(t_ns) and self._publishing.waits(t_ns)
 
     def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
@@ -258,7 +272,8 @@ class Daemon:
                 self.recorder.keep_state(t_ns, KEPT_STATE.dump_json(state))
 
     def _on_outcome(self, entry: Entry) -> None:
-        self.recorder.innovation(entry)
+        if self._records:
+            self.recorder.innovation(entry)
 
     def _carry_out(self, command: Command) -> str | Awaitable[str]:
         """Execute an operator's command and return its result. Raises `CommandRefusedError`."""

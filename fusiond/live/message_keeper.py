@@ -50,7 +50,8 @@ class MessageKeeper:
         self._path = None if beside is None else beside.with_suffix(".messages.json")
         self._clock = clock
         self._event = on_event
-        self._written = 0
+        self.written = 0
+        """Revision of the messages that is stored."""
         self._error = ""
         self._working: asyncio.Task[None] | None = None
 
@@ -79,9 +80,9 @@ class MessageKeeper:
         return KEPT_MESSAGES.dump_json(kept).decode()
 
     def keep(self, t_ns: int, messaging: Messaging) -> None:
-        """Write changes, unless a write is pending; called every tick."""
+        """Write changes, unless a write is pending; once the revision is another."""
         busy = self._working is not None and not self._working.done()
-        if self._path is None or busy or messaging.revision == self._written:
+        if self._path is None or busy or messaging.revision == self.written:
             return
         revision, text = messaging.revision, _text(messaging.state(t_ns))
         self._working = asyncio.create_task(self._write(self._path, revision, text))
@@ -90,7 +91,7 @@ class MessageKeeper:
         """Wait until this revision is on disk. Returns "", or why it could not be written."""
         if self._path is None:
             return "not kept over a restart: no state_file"
-        while self._written < revision and not self._error:
+        while self.written < revision and not self._error:
             self.keep(self._clock.now_ns(), messaging)
             if self._working is not None:
                 await asyncio.wait([self._working])
@@ -100,7 +101,7 @@ class MessageKeeper:
         """Write the last state, after a pending write has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])
-        if self._path is not None and messaging.revision != self._written:
+        if self._path is not None and messaging.revision != self.written:
             await self._write(self._path, messaging.revision, _text(messaging.state(t_ns)))
 
     async def _write(self, path: Path, revision: int, text: bytes) -> None:
@@ -112,7 +113,7 @@ class MessageKeeper:
             self._error = error.strerror or str(error)
         else:
             self._error = ""
-        self._written = revision
+        self.written = revision
 
 
 def _aged(box: KeptBox, passed_s: float) -> KeptBox:

@@ -61,7 +61,8 @@ class Messaging:
         }
         if self._terminals:  # takes 10 ms: too long for the tick that handles the first message
             import fusiond.live.stored_messages  # noqa: F401, PLC0415
-        self._waiting: deque[tuple[Topic, Message]] = deque()
+        self.waiting: deque[tuple[Topic, Message]] = deque()
+        """Messages to publish."""
         self._unconfirmed: OrderedDict[int, ShortMessage] = OrderedDict()
         self._serial = 0
         self._reports = 0
@@ -71,11 +72,6 @@ class Messaging:
         self._report_due = ""
         self._refused: set[str] = set()
         self.revision = 0
-
-    @property
-    def has_waiting(self) -> bool:
-        """True if there is a message to publish."""
-        return bool(self._waiting)
 
     # ------------------------------------------------------------------ out
 
@@ -178,7 +174,7 @@ class Messaging:
         if len(self._unconfirmed) > MOST_UNCONFIRMED:
             self._unconfirmed.popitem(last=False)
             self._count(message.source, "message_untold")
-        self._waiting.append((MESSAGE, message))
+        self.waiting.append((MESSAGE, message))
 
     def _place(self, message: FleetMessage) -> None:
         """Publish a card's place unless a later one is known: reports may overtake each other."""
@@ -189,7 +185,7 @@ class Messaging:
             self._count(message.source, "fleet_overtaken")
         else:
             self._places[card] = t_ms or 0
-            self._waiting.append((fleet(card), message))
+            self.waiting.append((fleet(card), message))
 
     def _count(self, source: str, counter: str) -> None:
         self._terminals[source].counters[counter] += 1
@@ -198,8 +194,8 @@ class Messaging:
 
     def take_waiting(self) -> Iterator[tuple[Topic, Message]]:
         """Take the messages to publish that came since the last call."""
-        while self._waiting:
-            yield self._waiting.popleft()
+        while self.waiting:
+            yield self.waiting.popleft()
 
     def confirm(self, message: object) -> None:
         """Note that a broker has confirmed a message, or that there is no broker to confirm it."""
@@ -227,7 +223,7 @@ class Messaging:
         self._serial = max(self._serial, kept.serial)
         for message in kept.untold:
             self._unconfirmed[message.serial] = message
-            self._waiting.append((MESSAGE, message))
+            self.waiting.append((MESSAGE, message))
         for name, box in kept.boxes.items():
             driver = self._terminals.get(name)
             if driver is not None:

@@ -22,6 +22,7 @@ from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, healt
 from fusiond.outputs.messages.innovations import innovations_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.status import DaemonState, RecordingStatus, status_message
+from fusiond.outputs.messages.tracker import Tracking
 from fusiond.outputs.topics import (
     CALIBRATION,
     CONSISTENCY,
@@ -32,7 +33,6 @@ from fusiond.outputs.topics import (
     TRACKER,
     Topic,
 )
-from fusiond.outputs.tracker_schedule import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration changes over minutes. A change of a parameter's state is published at once.
@@ -93,7 +93,8 @@ class Publishing:
             self._mode, self._since_ns = solution.mode, t_ns
         utc_ns = self._clock.utc_ns(t_ns)
         self._publish_nav(t_ns, utc_ns, solution)
-        self._publish_messages()
+        if self._messaging.waiting:
+            self._publish_messages()
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
         due = self._health.due(t_ns)
@@ -109,7 +110,7 @@ class Publishing:
 
     def waits(self, t_ns: int) -> bool:
         """True if nothing is due at `t_ns`."""
-        if self._waiting or self._messaging.has_waiting:
+        if self._waiting or self._messaging.waiting:
             return False
         if not self._calibration.waits(t_ns) and self._navigator.calibrating.parameters:
             return False
@@ -125,9 +126,10 @@ class Publishing:
         if not due:
             return
         message = settled = nav_message(solution, utc_ns)
-        tracker = self._tracking.due(t_ns, message)
-        if tracker is not None:
-            self._publish(TRACKER, tracker)
+        if t_ns >= self._tracking.earliest_ns:
+            tracker = self._tracking.due(t_ns, message)
+            if tracker is not None:
+                self._publish(TRACKER, tracker)
         if utc_ns is not None and not self._clock.sets_others:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:

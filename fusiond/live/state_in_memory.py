@@ -79,7 +79,9 @@ class WarmKeeper:
         self._clock = clock
         self._config = config_digest(config)
         self._event = on_event
-        self._due = Every(SNAPSHOT_NS)
+        self._schedule = Every(SNAPSHOT_NS)
+        self.schedule = None if self._path is None else self._schedule
+        """Schedule of `keep`; None if nothing is stored."""
         self._working: asyncio.Task[None] | None = None
         self._failing = False
         self.restored: KeptState | None = None
@@ -105,7 +107,7 @@ class WarmKeeper:
     def keep(self, t_ns: int, solution: Solution, navigator: Navigator) -> None:
         """Write the file when due, if the solution is good enough."""
         busy = self._working is not None and not self._working.done()
-        if self._path is None or busy or not self._due.due(t_ns):
+        if self._path is None or busy or not self._schedule.due(t_ns):
             return
         state = self.state(solution, navigator)
         if state is not None:

@@ -51,9 +51,12 @@ class StateKeeper:
         self._max_age_s = config.alignment.saved_max_age_s
         self._clock = clock
         self._event = on_event
-        self._kept = False
+        self.kept = False
+        """True if there is a file, which the vehicle's departure removes."""
         self._working: asyncio.Task[None] | None = None
-        self._save = Every(SAVE_EVERY_S * SECOND_NS)
+        self._schedule = Every(SAVE_EVERY_S * SECOND_NS)
+        self.schedule = None if self._path is None else self._schedule
+        """Schedule of `keep`; None if nothing is stored."""
 
     def load(self) -> SavedState | None:
         """Load the last run's state; None without a usable one."""
@@ -70,7 +73,7 @@ class StateKeeper:
             self._event("saved_state_refused", f"{self._path}: {error}")
             return None
         log.info("%s: %s", self._path, "no saved state" if state is None else "saved state")
-        self._kept = state is not None
+        self.kept = state is not None
         return state
 
     def keep(self, t_ns: int, solution: Solution, *, confirmed: bool) -> None:
@@ -78,13 +81,13 @@ class StateKeeper:
         true if the heading has been confirmed."""
         if self._path is None or (self._working is not None and not self._working.done()):
             return
-        if self._save.due(t_ns):
+        if self._schedule.due(t_ns):
             state = self._state(solution, confirmed)
             if state is not None:
-                self._kept = True
+                self.kept = True
                 self._working = asyncio.create_task(asyncio.to_thread(_write, self._path, state))
-        elif self._kept and _speed_m_s(solution) > FORGET_SPEED_M_S:
-            self._kept = False
+        elif self.kept and _speed_m_s(solution) > FORGET_SPEED_M_S:
+            self.kept = False
             self._working = asyncio.create_task(asyncio.to_thread(_remove, self._path))
 
     async def close(self, solution: Solution | None, *, confirmed: bool) -> None:

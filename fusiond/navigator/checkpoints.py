@@ -57,9 +57,10 @@ class Spacing:
         """Drop those that lie closer than their age asks, but the first and the last."""
         if not self._lie_close(latest_ns):
             return
-        found = checkpoints[:1]
+        found, longest_ns = checkpoints[:1], self._longest_ns
         for one, later in pairwise(checkpoints[1:]):
             before_ns = found[-1].snapshot.t_ns
-            if later.snapshot.t_ns - before_ns > self.after(before_ns, latest_ns):
+            asked_ns = min(longest_ns, max(CLOSEST_NS, (latest_ns - before_ns) // SHARE_OF_AGE))
+            if later.snapshot.t_ns - before_ns > asked_ns:
                 found.append(one)
         checkpoints[:] = [*found, *checkpoints[1:][-1:]]

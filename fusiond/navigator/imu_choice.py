@@ -39,7 +39,9 @@ class ImuChoice:
         self.used: str | None = None
         """Source whose samples are used; None before the first."""
         self.counters: Counter[str] = Counter()
-        self._waiting: deque[Row] = deque(maxlen=IMU_QUEUE)
+        self.has_spare = imu.spare is not None
+        self.waiting: deque[Row] = deque(maxlen=IMU_QUEUE)
+        """Samples until the next tick that takes them."""
         self._standby: deque[Row] = deque(maxlen=IMU_QUEUE)
         self._standby_since_ns: int | None = None
         self._taken_ns = self._offered_ns = 0
@@ -63,14 +65,9 @@ class ImuChoice:
         if item.source != self.used:
             self.counters["second_imu"] += 1
             return
-        if len(self._waiting) == IMU_QUEUE:
+        if len(self.waiting) == IMU_QUEUE:
             self.counters["imu_queue_overflow"] += 1
-        self._waiting.append(row)
-
-    @property
-    def may_wait(self) -> bool:
-        """True if samples are waiting and may wait longer: there is no spare unit."""
-        return self._spare is None and bool(self._waiting)
+        self.waiting.append(row)
 
     def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:
         """Rotate a sample from the spare's axes to those of the first unit."""
@@ -90,14 +87,14 @@ class ImuChoice:
             return False
         since_ns = max(self._taken_ns, self._standby_since_ns or 0)
         refused = self._offered_ns - since_ns > self._gap_ns
-        silent = not self._waiting and t_ns - since_ns > self._gap_ns
+        silent = not self.waiting and t_ns - since_ns > self._gap_ns
         failed = (refused or silent) and t_ns - self._standby[-1][0] <= self._gap_ns
         if not (failed and self._failed_before):
             self._failed_before = failed
             return False
         silent_ns = t_ns - since_ns
         before, self.used = self.used or "the first IMU", self._spare.source
-        self._waiting = deque((r for r in self._standby if r[0] > self._taken_ns), IMU_QUEUE)
+        self.waiting = deque((r for r in self._standby if r[0] > self._taken_ns), IMU_QUEUE)
         self._standby.clear()
         self.counters["took_over"] += 1
         self._event(
@@ -110,9 +107,9 @@ class ImuChoice:
 
     def samples(self) -> tuple[NDArray[np.int64], Array] | None:
         """Samples since the last call, (m,) ns and (m, 6); None without any."""
-        if not self._waiting:
+        if not self.waiting:
             return None
-        times, samples = zip(*self._waiting, strict=True)
-        self._waiting.clear()
+        times, samples = zip(*self.waiting, strict=True)
+        self.waiting.clear()
         self._offered_ns = max(self._offered_ns, times[-1])
         return np.array(times, dtype=np.int64), np.array(samples, dtype=np.float64)

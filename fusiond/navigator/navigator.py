@@ -59,7 +59,7 @@ from fusiond.navigator.saved_noise import SavedNoise
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.source_status import SourceService
 from fusiond.navigator.timeline import Entry, Timeline
-from fusiond.navigator.without_imu import WithoutImu, counted_together
+from fusiond.navigator.without_imu import MOST_REMEMBERED, SENDS_NS, WithoutImu, counted_together
 
 if TYPE_CHECKING:
     from fusiond.navigator.saved_calibration import SavedCalibration
@@ -279,7 +279,10 @@ class Navigator:
     def tick(self, t_ns: int) -> None:
         """Advance to `t_ns`, without an inertial unit if none delivers samples."""
         self.advance()
-        self.without_imu.tick(t_ns, self.imu, self.started is not None)
+        without, imu = self.without_imu, self.imu
+        sends = imu.end and t_ns - imu.latest_ns < SENDS_NS
+        if not sends or without.estimator is not None or len(without.arrived) > MOST_REMEMBERED:
+            without.tick(t_ns, imu, self.started is not None)
 
     def advance(self, record: bool = False) -> None:
         """Run up to the last IMU sample. `record` stores the solution at each sample in `imu`."""

@@ -334,8 +334,12 @@ class Timeline:
         checkpoint = self._checkpoints[-1]
         self._space()
         self.estimator.restore(checkpoint.snapshot)
-        self.diagnosis.restore(checkpoint.memory)
-        self._next, self.decided = self._following(checkpoint), True
+        diagnosis = self.diagnosis
+        findings, excluded = diagnosis.findings, diagnosis.excluded
+        diagnosis.restore(checkpoint.memory)
+        same = diagnosis.findings is findings and diagnosis.excluded == excluded
+        self.decided |= self._isolates or not same
+        self._next = self._following(checkpoint)
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])
 

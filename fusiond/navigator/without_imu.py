@@ -61,6 +61,8 @@ GAP_S = 1.0
 START_SD_M = 1000.0
 # Measurements that are remembered for a start: a minute of two receivers once a second.
 MOST_REMEMBERED = 128
+# Age (ns) of the newest sample below which the inertial unit surely sends.
+SENDS_NS = int(BEARABLE_GAP_S * 1e9)
 
 
 class _Received:
@@ -110,7 +112,7 @@ class WithoutImu:
         """Estimator of the published solution while active."""
         self._ended: dict[str, Counter[str]] = {}
         self.arrived: deque[tuple[Sequence[AidingMeasurement], int]] = deque(maxlen=MOST_WAITING)
-        """Measurements with the instant (ns) at which they came, until the next tick."""
+        """Measurements with the instant (ns) at which they came, until a `tick` needs them."""
         self._recent: deque[_Received] = deque(maxlen=MOST_REMEMBERED)
         self._way = HeadingHistory(_slips_m_s(config.constraints.non_holonomic))
         self._first_ns: int | None = None

@@ -35,9 +35,9 @@ from drivers.raw.messages import (
     SignalDelays,
 )
 from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
-from fusiond.clock import plausible_dates
 from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock, Slew
 from fusiond.clock.stamp_mapping import Clock
+from fusiond.clock.utc_from_arrivals import plausible_date
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, rejections_from_counts
@@ -247,7 +247,7 @@ class _Replay:
         time zone."""
         status = self._clock.status()
         off_s = (status.system_error_s or 0.0) + self._recorder.slewed_ns * 1e-9
-        if abs(off_s) >= OFF_S and plausible_dates.plausible(self._host.stamp_ns):
+        if abs(off_s) >= OFF_S and plausible_date(self._host.stamp_ns):
             how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
             self._on_refusal("recorder_clock_off", f"the recorder's clock is off {how}")
 

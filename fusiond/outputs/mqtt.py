@@ -72,6 +72,7 @@ class MqttPublisher:
         self._options = options
         self.nav_rate_hz = options.nav_rate_hz
         self._base = base_topic(vehicle)
+        self._addresses: dict[Topic, str] = {}
         self._online = f"{self._base}/online"
         # The name is the same at each start: if we reconnect before the broker has noticed the end
         # of the old connection, it closes the old one and publishes its will before our new
@@ -254,6 +255,13 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ sending
 
+    def _address(self, topic: Topic) -> str:
+        """Address at the broker."""
+        found = self._addresses.get(topic)
+        if found is None:
+            found = self._addresses[topic] = topic.address(self._base)
+        return found
+
     async def _publish(
         self, client: aiomqtt.Client, address: str, payload: bytes, qos: int, retain: bool
     ) -> None:
@@ -270,7 +278,7 @@ class MqttPublisher:
                 topic = next(iter(self._latest))
                 payload = _encoded(self._latest.pop(topic))
                 try:
-                    address = topic.address(self._base)
+                    address = self._address(topic)
                     await self._publish(client, address, payload, topic.qos, topic.retained)
                 except aiomqtt.MqttError:
                     self.counters["mqtt_dropped"] += 1
@@ -301,11 +309,11 @@ class MqttPublisher:
                 topic = next(iter(self._due))
                 del self._due[topic]
                 payload = _encoded(self._retained[topic])
-                await self._confirm(client, topic.address(self._base), payload, topic.retained)
+                await self._confirm(client, self._address(topic), payload, topic.retained)
             if self._queue:
                 first = self._queue[0]
                 topic, queued = first
-                address = topic.address(self._base)
+                address = self._address(topic)
                 await self._confirm(client, address, _encoded(queued), topic.retained)
                 if self._queue and self._queue[0] is first:
                     self._queue.popleft()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 from pydantic import BaseModel
@@ -21,9 +22,9 @@ from fusiond.outputs.messages.status import StatusMessage
 from fusiond.outputs.messages.tracker import TrackerMessage
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Topic:
-    """Topic below `fusiond/<vehicle>`: contents and delivery.
+    """Topic below `fusiond/<vehicle>`: contents and delivery. There is one object of each.
 
     `below` is the last part of the address of a topic that exists several times.
     """
@@ -64,6 +65,7 @@ TOPICS = (
 )
 
 
+@cache
 def fleet(card: int) -> Topic:
     """Topic of the vehicle with a card's number."""
     return replace(FLEET, below=str(card))

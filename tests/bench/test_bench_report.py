@@ -29,6 +29,8 @@ FIGURES = (
     "reduced_order_step_ratio",
     "fix_functions",
     "fix_modules",
+    "wired_fix_functions",
+    "wired_fix_modules",
 )
 
 

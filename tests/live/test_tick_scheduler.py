@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusiond.live.garbage_collection import Collector
-from fusiond.live.tick_scheduler import LatencyHistogram, Scheduler
+from fusiond.live.tick_scheduler import Collector, LatencyHistogram, Scheduler
 
 MS = 1_000_000
 S = 1_000_000_000

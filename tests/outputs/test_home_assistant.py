@@ -14,9 +14,9 @@ from fusiond.configuration.outputs import HomeAssistant
 from fusiond.configuration.schema import Mqtt
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery, description
+from fusiond.outputs.messages.tracker import LONGEST_NS, MOVED_M, SECOND_NS, Tracking
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import STATUS, TOPICS
-from fusiond.outputs.tracker_schedule import LONGEST_NS, MOVED_M, SECOND_NS, Tracking
 from tests.broker import Broker, listening
 from tests.outputs.messages_examples import EXAMPLES
 from tests.outputs.serving import Around, at_work, nav

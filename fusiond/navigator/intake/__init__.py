@@ -53,7 +53,7 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
-from drivers.plausible import SIGMA_M, within
+from drivers.plausible import SIGMA_M
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.configuration.aiding import AnyAiding
@@ -283,16 +283,21 @@ def _place(
 ) -> str | None:
     # What devices send that have no position: nobody is there to the last digit.
     nowhere = lat_rad == 0.0 == lon_rad
-    if nowhere or not (within(lat_rad, LATITUDE_RAD) and within(lon_rad, LONGITUDE_RAD)):
+    on_earth = (
+        LATITUDE_RAD[0] <= lat_rad <= LATITUDE_RAD[1]
+        and LONGITUDE_RAD[0] <= lon_rad <= LONGITUDE_RAD[1]
+    )
+    if nowhere or not on_earth:
         return _finite((lat_rad, lon_rad)) or "position_implausible"
     # Within limits is nothing that is not finite.
-    if height_m is None or (limits is not None and within(height_m, limits.height_m)):
+    if height_m is None:
         return None
     return _finite((height_m,)) if limits is None else _height(height_m, limits)
 
 
 def _height(height_m: float, limits: Plausibility) -> str | None:
-    if within(height_m, limits.height_m):
+    least_m, most_m = limits.height_m
+    if least_m <= height_m <= most_m:
         return None
     return _finite((height_m,)) or "height_implausible"
 
