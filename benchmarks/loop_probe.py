@@ -189,7 +189,7 @@ def _name_of(handle: asyncio.Handle) -> str:
 def _kernels_linked() -> int:
     """How many kernels wait no longer for their first call."""
     compiled = sys.modules.get("fusiond.navigation.compiled")
-    return 0 if compiled is None else -len(vars(compiled)["_waiting"])
+    return 0 if compiled is None else -len(vars(compiled)["waiting"])
 
 
 def main() -> None:

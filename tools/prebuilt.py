@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 
 import fusiond
-from fusiond.navigation.kernel_cache import LEVELS
+from fusiond.navigation.shipped_kernels import LEVELS
 
 # What `run`, `process`, `simulate` and the filters import, `studies` left to whoever runs them.
 MODULES = (

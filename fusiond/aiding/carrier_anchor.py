@@ -324,7 +324,8 @@ def go_on(
         if math.isfinite(values[RATE, k]) or values[SPAN, k] > 0.0:
             row += 1
         if known and fits and anchored(values, k, before):
-            left[slot] = before[slot]
+            for i in range(left.shape[1]):
+                left[slot, i] = before[slot, i]
             alive += 1
         elif math.isfinite(values[CARRIER, k]):
             waiting += 1

@@ -95,7 +95,10 @@ def write_jacobian(error: Array, velocity: Array, place: Array, speeds: bool, j:
     if speeds:
         turning -= error[DV : DV + 3]
     for first in (PHI, DV, DR):
-        j[first : first + 3, first : first + 3] = whole if speeds and first == DV else level
+        block = whole if speeds and first == DV else level
+        for i in range(3):
+            for k in range(3):
+                j[first + i, first + k] = block[i, k]
     for first in (DV, DR):
         part = turning if first == DV else place
         x = whole[0, 0] * part[0] + whole[0, 1] * part[1] + whole[0, 2] * part[2]

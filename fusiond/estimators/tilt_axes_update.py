@@ -159,12 +159,17 @@ def _turned_slots(forces: Indices, gyros: Indices, lever: Indices, late: Indices
     slots = np.empty(behind + (3 + lever.size + late.size if lever.size else 0), dtype=np.int64)
     for j in range(3):
         slots[j] = PHI + j
-    slots[3 : 3 + forces.size], slots[3 + forces.size : behind] = forces, gyros
+    for j in range(forces.size):
+        slots[3 + j] = forces[j]
+    for j in range(gyros.size):
+        slots[3 + forces.size + j] = gyros[j]
     if lever.size:
         for j in range(3):
             slots[behind + j] = DR + j
-        slots[behind + 3 : behind + 3 + lever.size] = lever
-        slots[behind + 3 + lever.size :] = late
+        for j in range(lever.size):
+            slots[behind + 3 + j] = lever[j]
+        for j in range(late.size):
+            slots[behind + 3 + lever.size + j] = late[j]
     return slots
 
 

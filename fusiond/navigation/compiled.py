@@ -18,8 +18,8 @@ What is in the cache was compiled by several processes and is linked in one, by 
 a symbol of module, qualified name, argument types and a number that counts the functions compiled
 in the process: two closures of one name, compiled in two processes, may get the same symbol, and
 one of them then runs in place of the other. So every kernel has a name of its own (a variant of a
-closure says which), and the count starts somewhere else in each process, forked ones too, for
-numba's own closures.
+closure says which) and the number 0 in every process: its code calls other kernels by symbol. For
+numba's own closures the count starts somewhere else in each process, forked ones too.
 """
 
 from __future__ import annotations
@@ -43,7 +43,14 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.types import Array
 from numba.np.numpy_support import FROM_DTYPE, map_layout
 
-from fusiond.navigation.kernel_cache import KernelCache, can_keep, kept_in, shipped_in
+from fusiond.navigation.kernel_cache import (
+    KernelCache,
+    can_keep,
+    kept_in,
+    kernel_name,
+    waiting,
+)
+from fusiond.navigation.shipped_kernels import shipped_in
 
 # numba's functions have no types.
 _array: Any = Array
@@ -92,7 +99,6 @@ _names: set[str] = set()
 _variants: dict[str, int] = {}
 _in_cache = kept_in(FOLDER)
 _shipped = shipped_in(Path(__file__).with_name("prebuilt") / FOLDER.name)
-_waiting: dict[str, Callable[[], None]] = {}
 _gathered: list[Missing] | None = None
 
 
@@ -101,6 +107,20 @@ def _count_from_anywhere() -> None:
     setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
 
 
+def _number_kernels() -> None:
+    """Give each kernel the number 0: its symbol is the same in every process."""
+    identify: Any = FunctionIdentity.from_function
+
+    def from_function(_: object, function: Any) -> Any:
+        identity = identify(function)
+        if getattr(function, "is_kernel", False):
+            identity.unique_id, identity.unique_name = 0, f"{identity.func_qualname}$0"
+        return identity
+
+    setattr(FunctionIdentity, "from_function", classmethod(from_function))  # noqa: B010
+
+
+_number_kernels()
 _count_from_anywhere()
 os.register_at_fork(after_in_child=_count_from_anywhere)
 
@@ -120,13 +140,14 @@ def compiled(
         if variant is not None:
             function.__name__ += f"_{variant}"
             function.__qualname__ += f"_{variant}"
-        name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
+        name = kernel_name(function.__module__, function.__qualname__)
         if name in _names:
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         _names.add(name)
         if variant is not None:
             _variants[name] = variant
-        options.update(error_model="numpy", _nrt=allocates)
+        options.update(error_model="numpy", _nrt=allocates, no_cfunc_wrapper=True)
+        setattr(function, "is_kernel", True)  # noqa: B010
         setattr(function, "__signature__", inspect.signature(function))  # noqa: B010 - asked twice
         kernel = numba.njit(**options)(function)
         kernel.typeof_pyval = partial(_type_of, kernel)
@@ -184,7 +205,7 @@ def load_kernels(variants: Collection[int]) -> None:
     """Link every imported kernel not called yet, before a loop that keeps time; of those with one
     source only these `variants`. Any other is linked at its call."""
     with global_compiler_lock:
-        for name, load in [*_waiting.items()]:
+        for name, load in [*waiting.items()]:
             if name not in _variants or _variants[name] in variants:
                 load()
 
@@ -197,7 +218,7 @@ def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], No
 
     def load() -> None:
         with global_compiler_lock:
-            if _waiting.pop(name, None) is not None:
+            if waiting.pop(name, None) is not None:
                 del kernel._compile_for_args, kernel.get_call_template
                 found = kernel._cache.load_overload(signature, kernel.targetctx)
                 if found is None:
@@ -218,7 +239,7 @@ def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], No
         return kernel.get_call_template(*types)
 
     kernel._compile_for_args, kernel.get_call_template = first_call, called_by_another
-    _waiting[name] = load
+    waiting[name] = load
     return load
 
 

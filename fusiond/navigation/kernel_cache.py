@@ -19,6 +19,11 @@ which others inline (another seventh). Both come when a kernel is missing. A cac
 at its first call, 0.3 ms each: of 170 imported ones a drive on files calls 36
 (fusiond.navigation.compiled). The linker receives the native code directly; numba's own way through
 an LLVM module takes three times as long.
+
+A large kernel is called by others, by its symbol; numba would copy it into each of them, and
+optimise it again there: the largest held 600 kB of others' code, and half of the compiler's time
+went into copies. Such a symbol is the same in every process (fusiond.navigation.compiled). A file
+names the kernels that its code calls, which are linked before it.
 """
 
 from __future__ import annotations
@@ -27,7 +32,6 @@ import contextlib
 import hashlib
 import os
 import pickle
-import platform
 import secrets
 import shutil
 import sys
@@ -36,16 +40,23 @@ import zlib
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakSet
 
-from llvmlite.binding import ObjectFileRef, add_symbol, get_host_cpu_features, parse_bitcode
+from llvmlite.binding import (
+    ObjectFileRef,
+    add_symbol,
+    parse_assembly,
+    parse_bitcode,
+)
 from numba.core.caching import NullCache
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime._nrt_python import c_helpers
 from numba.core.serialize import dumps
+
+from fusiond.navigation.shipped_kernels import Shipped
 
 # numba's functions have no types.
 _dumps: Any = dumps
@@ -54,52 +65,24 @@ _Library: Any = JITCodeLibrary
 _initialise_library: Any = CodeLibrary.__init__
 _object_file: Any = ObjectFileRef.from_data
 _parse_bitcode: Any = parse_bitcode
+_parse_assembly: Any = parse_assembly
 _add_symbol: Any = add_symbol
 _Environment: Any = Environment
 _known_environment: Any = lookup_environment
-_host_features: Any = get_host_cpu_features
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
 _BITCODE = 3
 """Place of the bitcode in a file's contents (`_kept`)."""
+_FORMAT = 2
+"""Of a file's contents."""
+CALLED_FROM = 16_384
+"""Native code (bytes) from which a kernel is called by others. LLVM inlines functions of some 50
+instructions, a tenth of it: nothing that it would inline."""
 _libraries: WeakSet[_Linked] = WeakSet()
-
-
-# What an x86-64 processor of a level has (x86-64 psABI, 3.1.1), by LLVM's names; that of aarch64's
-# base, Armv8.0-A, every one has. The first that is shipped and fits is taken.
-LEVELS: dict[str, dict[str, tuple[str, ...]]] = {
-    "x86_64": {
-        "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
-        "x86-64-v2": ("cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"),
-    },
-    "aarch64": {"generic": ()},
-}
-
-
-class Shipped(NamedTuple):
-    """Kernels that came with the package, for processors of one level."""
-
-    folder: Path
-    level: str
-    names: frozenset[str]
-
-
-def shipped_in(folder: Path) -> Shipped | None:
-    """Shipped kernels in a subfolder of `folder` for this processor; None without any.
-
-    The folders are named after LLVM's names of processors; a kernel in them was compiled for that
-    one with no feature besides (`tools.prebuilt`).
-    """
-    try:
-        levels = set(os.listdir(folder))
-    except OSError:
-        return None
-    has = {name for name, there in _host_features().items() if there}
-    for level, needs in LEVELS.get(platform.machine(), {}).items():
-        # Level 3 has what level 2 has.
-        if level in levels and has.issuperset(needs):
-            return Shipped(folder / level, level, frozenset(os.listdir(folder / level)))
-    return None
+_called: dict[str, str] = {}
+"""Names of the kernels that others call, by symbol."""
+waiting: dict[str, Callable[[], None]] = {}
+"""Functions that link the imported kernels not linked yet, by name of the kernel."""
 
 
 class KernelCache(NullCache):
@@ -141,6 +124,8 @@ class KernelCache(NullCache):
         if data.library.has_dynamic_globals:
             return  # it holds addresses of this process
         payload: bytes = _dumps(_kept(data))
+        if _is_called(data.fndesc, data.library._get_compiled_object()):
+            _call(data.fndesc, data.library)
         path = self._folder / self.file_name
         written = path.with_suffix(f".{os.getpid()}-{secrets.token_hex(8)}.writing")
         try:
@@ -156,7 +141,7 @@ class KernelCache(NullCache):
 
 def _file_name(name: str, signature: str, *processor: str) -> str:
     """File name of native code: by signature, system, processor and its features."""
-    made_for = repr((signature, processor)).encode()
+    made_for = repr((_FORMAT, signature, processor)).encode()
     return f"{name}-{hashlib.sha256(made_for).hexdigest()[:16]}.kernel"
 
 
@@ -200,8 +185,8 @@ def _kept(made: Any) -> tuple[Any, ...]:
     """Contents of a file, the arguments of `_linked`: of what numba keeps that which a kernel
     needs.
 
-    The bitcode, most of it, is read when another kernel is compiled. Environments are what
-    `_environment` takes, the kernel's own first: numba would import a dozen modules of its
+    The bitcode, most of it, is read when another kernel is compiled that gets a copy. Environments
+    are what `_environment` takes, the kernel's own first: numba would import a dozen modules of its
     implementations with them. Of those of inlined functions few hold a constant.
     """
     library, function, environment, signature, *_, initialisers, referenced = made._reduce()
@@ -210,7 +195,31 @@ def _kept(made: Any) -> tuple[Any, ...]:
         (one.globals["__name__"], one.consts, one.env_name)
         for one in (environment, *(inlined for inlined in referenced if inlined.consts))
     ]
-    return name, function, native, zlib.compress(bitcode), signature, initialisers, environments
+    copied = b"" if _is_called(function, native) else zlib.compress(bitcode)
+    declared = (one.name for one in made.library._final_module.functions if one.is_declaration)
+    calls = [(_called[symbol], symbol) for symbol in declared if symbol in _called]
+    return name, function, native, copied, signature, initialisers, environments, calls
+
+
+def kernel_name(module: str, qualified_name: str) -> str:
+    """Name of a kernel in the cache."""
+    return f"{module}.{qualified_name}".replace("<locals>.", "")
+
+
+def _is_called(function: Any, native: bytes) -> bool:
+    """True if other kernels call this one, False if they get a copy of it."""
+    return len(native) >= CALLED_FROM and not function.inline
+
+
+def _call(function: Any, library: Any) -> None:
+    """Give those that link this kernel's library nothing of it but its symbol."""
+    _called[function.llvm_func_name] = kernel_name(function.modname, function.qualname)
+    library._shared_module = _nothing()
+
+
+@cache
+def _nothing() -> Any:
+    return _parse_assembly("")
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Any:
@@ -275,12 +284,21 @@ def _linked(
     signature: Any,
     initialisers: Any,
     environments: list[tuple[str, list[Any], str]],
+    calls: list[tuple[str, str]],
 ) -> Any:
-    """Inverse of `CompileResult._rebuild`."""
+    """Inverse of `CompileResult._rebuild`; None if a kernel that this one calls is missing."""
+    codegen = target.codegen()
+    for called, symbol in calls:
+        if called in waiting:
+            waiting[called]()
+        if not codegen._engine.is_symbol_defined(symbol):  # the linker would end the process
+            _report(f"{path} calls {called}, which is another now")
+            return None
     for initialise in initialisers:
         initialise()
-    codegen = target.codegen()
     library = _Linked(codegen, name, path, native, bitcode)
+    if _is_called(function, native):
+        _call(function, library)
     codegen._engine._defined_symbols |= {
         function.llvm_func_name,
         function.llvm_cpython_wrapper_name,

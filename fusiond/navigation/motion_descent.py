@@ -221,7 +221,8 @@ def descend(
     left, by_steps, step = z.copy(), rows.copy(), np.empty(SOUGHT)
     seconds = t_s[t_s.shape[0] - 1]
     if _bent(guess[BIASES:DELAY], made, seconds):
-        made[:] = guess[BIASES:DELAY]
+        for j in range(made.shape[0]):
+            made[j] = guess[BIASES + j]
         integrate_sensed(times, samples, made, counts, gained, turned, slopes)
     judge_guess(
         t_s, means, gained, turned, slopes, made, velocity, sd, levers, asked, guess, z, rows
@@ -243,7 +244,8 @@ def descend(
             rebuilt = _bent(there[BIASES:DELAY], made, seconds)
             if rebuilt:
                 a, b, c, taken_off = gained_there, turned_there, slopes_there, made_there
-                taken_off[:] = there[BIASES:DELAY]
+                for j in range(made.shape[0]):
+                    taken_off[j] = there[BIASES + j]
                 integrate_sensed(times, samples, taken_off, counts, a, b, c)
             else:
                 a, b, c, taken_off = gained, turned, slopes, made

@@ -174,6 +174,8 @@ def integrate_sensed(
                     s[i, j] += dcm[i, n] * s_l[3 * n + j]
                     d[i, j] += dcm[i, n] * d_l[3 * n + j]
                     turn[i, j] += dcm[i, n] * own[n, j]
-        dcm[:] = turn
-        gained[k], turned[k] = v, dcm
-        slopes[k, :, :3], slopes[k, :, 3:] = d, s
+        for i in range(3):
+            gained[k, i] = v[i]
+            for j in range(3):
+                dcm[i, j] = turned[k, i, j] = turn[i, j]
+                slopes[k, i, j], slopes[k, i, 3 + j] = d[i, j], s[i, j]

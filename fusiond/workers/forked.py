@@ -32,11 +32,11 @@ Job = Callable[[], object]
 # Children side by side, where there are as many processors.
 MOST_CHILDREN = 2
 # What a child may hold of its own after a job, in bytes. The first job copies 20 MB of what is
-# shared, the largest kernels take 120 to 160 MB: two such children, the first one and the caller
-# have been seen to take 494 MB (sum of PSS), with one child 338 MB.
+# shared, the largest kernels take 100 MB: two such children, the first one and the caller have been
+# seen to take 297 MB (sum of PSS).
 SHARE = 45_000_000
 # Available memory (bytes) below which one works alone: what two take, and as much for others.
-FOR_TWO = 800_000_000
+FOR_TWO = 600_000_000
 MEMORY = Path("/proc/meminfo")
 _PR_SET_PDEATHSIG = 1
 _DONE, _LAST = b".", b"!"

@@ -7,6 +7,7 @@ kernels are a module made for the test, since the filters' take a minute to comp
 from __future__ import annotations
 
 import ast
+import hashlib
 import os
 import pickle
 import re
@@ -15,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -123,6 +125,62 @@ def test_what_compiling_needs_is_loaded_when_a_kernel_is_missing(run: Run) -> No
     assert run(code.format((4,))).stdout.split()[-1] == "False"
     # One of two is new: it calls, and inlines, one that was only linked.
     assert run(code.format((4, 6))).stdout == "[2.0, 3.0]\nTrue\n"
+
+
+CALLED = "from fusiond.navigation import kernel_cache; kernel_cache.CALLED_FROM = 1; "
+
+
+def _contents(folder: Path, name: str) -> Any:
+    (file,) = folder.rglob(f"{name}-*.kernel")
+    return pickle.loads(file.read_bytes()[32:])
+
+
+def test_large_kernels_are_called_across_processes(run: Run, tmp_path: Path) -> None:
+    """Compiled in three processes, linked in a fourth; none holds a copy of what it calls."""
+    for factor in (4, 6, 8):
+        assert run(CALLED + f"import kernels; kernels.scaled_for({factor})(1.0)").returncode == 0
+    used = run(CALLED + IN_ORDER.format((8, 4, 6)))
+    assert (used.stdout, used.stderr) == ("[4.0, 2.0, 3.0]\n", "")
+    sys.path.insert(0, str(tmp_path))
+    try:
+        halved = _contents(tmp_path / "cache", "kernels.halved")
+        for factor in (4, 6, 8):
+            scaled = _contents(tmp_path / "cache", f"kernels.scaled_for.scaled_{factor}")
+            assert scaled[-1] == [("kernels.halved", halved[1].llvm_func_name)]
+            assert halved[2].count(b"halved") > scaled[2].count(b"halved") > 0
+            assert scaled[3] == halved[3] == b""  # bitcode
+    finally:
+        sys.path.remove(str(tmp_path))
+
+
+def test_a_called_kernel_compiled_anew_serves_its_callers(run: Run, tmp_path: Path) -> None:
+    code = CALLED + IN_ORDER.format((4, 6))
+    run(code)
+    (halved,) = (tmp_path / "cache").rglob("kernels.halved-*.kernel")
+    kept = {file: file.stat().st_mtime_ns for file in _kept(tmp_path / "cache") if file != halved}
+    halved.unlink()
+    again = run(code)
+    assert (again.stdout, again.stderr) == ("[2.0, 3.0]\n", "")
+    assert halved.exists()
+    assert kept == {file: file.stat().st_mtime_ns for file in kept}
+
+
+def test_a_call_of_a_symbol_that_is_not_there_compiles_the_caller(run: Run, tmp_path: Path) -> None:
+    """Otherwise the linker ends the process."""
+    code = CALLED + IN_ORDER.format((4,))
+    run(code)
+    (file,) = (tmp_path / "cache").rglob("kernels.scaled_for.scaled_4-*.kernel")
+    sys.path.insert(0, str(tmp_path))
+    try:
+        *contents, calls = pickle.loads(file.read_bytes()[32:])
+    finally:
+        sys.path.remove(str(tmp_path))
+    payload = pickle.dumps((*contents, [(name, symbol + "x") for name, symbol in calls]))
+    file.write_bytes(hashlib.sha256(payload).digest() + payload)
+    again = run(code)
+    assert (again.returncode, again.stdout) == (0, "[2.0]\n"), again.stderr
+    assert "calls kernels.halved, which is another now" in again.stderr
+    assert run(code).stderr == ""
 
 
 def test_a_second_kernel_of_the_same_name_is_refused() -> None:

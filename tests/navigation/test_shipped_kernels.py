@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import fusiond
-from fusiond.navigation.kernel_cache import LEVELS, shipped_in
+from fusiond.navigation.shipped_kernels import LEVELS, shipped_in
 from tests.navigation.test_compiled import KERNELS
 
 USE = "import kernels; print(kernels.scaled_for(4)(1.0), kernels.halved(3.0))"
@@ -115,7 +115,7 @@ def test_a_processor_takes_the_best_level_that_it_has(
 ) -> None:
     def features(*names: str) -> None:
         there = dict.fromkeys(names, True) | {"avx512f": False}
-        monkeypatch.setattr("fusiond.navigation.kernel_cache._host_features", lambda: there)
+        monkeypatch.setattr("fusiond.navigation.shipped_kernels._host_features", lambda: there)
 
     levels = LEVELS["x86_64"]
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
