@@ -141,8 +141,8 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
         return found
     if counters["address_bad"] >= MANY:
         return (
-            "sentences arrive whose names are none of NMEA (small letters?), and are not read: "
-            "take them as the receiver sends them, or set it to GGA and RMC"
+            "sentences arrive whose names are not NMEA's (small letters?) and are not read: use "
+            "the receiver's unchanged output, or switch on GGA and RMC"
         )
     if counters["ubx_frames"]:
         return UBX
@@ -182,7 +182,10 @@ def no_fix(counters: Counter[str], received: Received, refusal: str) -> str:
     if counters["untimed_epoch"] and POSITIONS & set(received.used):
         return "positions arrive without a time of day, and are not used: give the antenna more sky"
     if counters["bad_field"] and not POSITIONS & set(received.used):
-        return "the positions that arrive have fields that cannot be true (bad_field)"
+        return (
+            "the positions that arrive have fields that cannot be true (bad_field): check the "
+            "line, or reset the receiver"
+        )
     heading = _heading(received)
     if heading and not POSITIONS & set(received.used):
         return (
@@ -228,7 +231,7 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
     if counters["height_above_sea"] > counters["fixes"] // 2:
         found["height_above_sea"] = (
             "the receiver does not say how high the geoid is: its altitude above the sea is used, "
-            "with one sigma of 62 m (GGA's separation is empty, 0, or none)"
+            "with one sigma of 62 m; switch on the geoid separation in GGA"
         )
     if counters["height_not_measured"] > max(counters["fixes"] // 2, FIRST_FIXES):
         found["height_not_measured"] = (
@@ -237,7 +240,8 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
         )
     if counters["height_missing"] > counters["fixes"] // 2:
         found["height_missing"] = (
-            "the altitude in GGA is empty or not in metres: fixes are used without a height"
+            "the altitude in GGA is empty or not in metres: fixes are used without a height; "
+            "switch it on, in metres"
         )
     if counters["rmc_alone"]:
         refused = " (other sentences have fields that cannot be true)" * (
@@ -269,12 +273,13 @@ def cautions(counters: Counter[str], received: Received, earliest: date) -> dict
     if counters["unknown_status"]:
         status = received.statuses.most_common(1)[0][0]
         found["unknown_status"] = (
-            f"RMC has the status {status!r}, which NMEA does not know: its velocity is not used"
+            f"RMC has the status {status!r}, which NMEA does not define: its velocity is not used; "
+            "update the firmware"
         )
     if counters["two_receivers"] > max(counters["fixes"] // 2, MANY):
         found["two_receivers"] = (
-            "positions of two talkers take turns and differ: two receivers are on this line, and "
-            "their fixes are taken for one's; give each a port of its own"
+            "positions of two talkers alternate and differ: two receivers are on this line, and "
+            "their fixes are mixed; give each a port of its own"
         )
     if counters["course_missing"] > max(counters["fixes"] // 2, MANY):
         found["course_missing"] = (

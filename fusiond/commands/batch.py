@@ -78,16 +78,16 @@ def batch(
     config: ConfigPath,
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG...", help="A drive each: recording, CAN log or folder."),
+        typer.Argument(metavar="LOG...", help="Drives: recordings, CAN logs or folders."),
     ],
-    out: Annotated[Path, typer.Option(metavar="F.parquet", help="Where the rows are kept.")],
+    out: Annotated[Path, typer.Option(metavar="F.parquet", help="File of the rows.")],
     workers: Workers = None,
     cluster: ClusterAddress = None,
     timeout: Timeout = None,
 ) -> None:
     """Navigate through many drives, a row of figures each.
 
-    A batch that was stopped goes on where it was."""
+    A stopped batch continues where it stopped."""
     with compiling():
         from fusiond.batch.batch import run_batch  # noqa: PLC0415
 

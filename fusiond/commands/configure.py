@@ -41,7 +41,7 @@ AskTerminal = Annotated[
     bool | None,
     typer.Option(
         "--ask-terminal/--listen-only",
-        help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
+        help="Query silent ports, to find an RDSS terminal; it transmits nothing.",
     ),
 ]
 Drive = Annotated[

@@ -22,7 +22,7 @@ from fusiond.commands.shared import (
 
 RecordPath = Annotated[
     Path | None,
-    typer.Option("--record", metavar="DIR", help="Record all of it into files of this folder."),
+    typer.Option("--record", metavar="DIR", help="Record everything into files of this folder."),
 ]
 
 

@@ -27,16 +27,16 @@ def dashboard(
         typer.Option(metavar="C.toml", help="Broker, user and certificates of its [mqtt]."),
     ] = None,
     host: Annotated[str, typer.Option(help="Address to serve at.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8770,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve at; 0: any.")] = 8770,
     speed: Annotated[
-        float, typer.Option(min=0.01, max=1000.0, help="Of a recording, times real time.")
+        float, typer.Option(min=0.01, max=1000.0, help="Speed of a recording; 1: real time.")
     ] = 1.0,
     base_map: Annotated[
         Path | None,
         typer.Option("--map", metavar="F.pmtiles", help="Draw this map below the track."),
     ] = None,
     commands: Annotated[
-        bool, typer.Option("--commands", help="Whoever has the token may send commands.")
+        bool, typer.Option("--commands", help="Let holders of the token send commands.")
     ] = False,
 ) -> None:
     """Show a vehicle in the browser, live or from a recording."""

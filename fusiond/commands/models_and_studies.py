@@ -43,7 +43,7 @@ runs."""
 
 
 def schema(
-    vehicle: Annotated[str, typer.Option(help="The name in the topics.")] = "vehicle",
+    vehicle: Annotated[str, typer.Option(help="The vehicle's name in the topics.")] = "vehicle",
 ) -> None:
     """Print the MQTT topics and messages as an AsyncAPI document."""
     from fusiond.outputs.asyncapi import asyncapi  # noqa: PLC0415
@@ -59,15 +59,15 @@ def study(
     workers: Workers = None,
     cluster: ClusterAddress = None,
     timeout: Timeout = None,
-    seed: Annotated[int, typer.Option(min=0, help="What the runs are drawn from.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random runs.")] = 0,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="F.parquet", help="A row a run; those that are there are not made."),
+        typer.Option(metavar="F.parquet", help="File with a row for each run; existing ones stay."),
     ] = None,
     json_path: JsonPath = None,
     plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the result.")] = None,
 ) -> None:
-    """Repeat a paper's experiment, or one that a default stands on."""
+    """Repeat a paper's experiment, or one behind a default value."""
     if name not in STUDIES:
         raise typer.BadParameter(f"{name!r}: there are {', '.join(STUDIES)}")
     if out is not None and not ABOUT[name].rows:
@@ -148,7 +148,7 @@ def model(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Such as ins21.")],
     config: Annotated[
         Path | None,
-        typer.Option(metavar="CONFIG", help="Whose IMU and measurements; the defaults if none."),
+        typer.Option(metavar="CONFIG", help="For IMU and measurements; else the defaults."),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -52,7 +52,7 @@ CanLog = Annotated[
 MeasurementFiles = Annotated[
     list[str] | None,
     typer.Option(
-        "--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(MEASUREMENT_KINDS)}."
+        "--aid", metavar="KIND=F", help=f"Measurements, repeatable: {', '.join(MEASUREMENT_KINDS)}."
     ),
 ]
 
@@ -74,7 +74,7 @@ def process(
     ] = None,
     smooth: Annotated[
         bool,
-        typer.Option("--smooth", help="Write what all measurements say, later ones too."),
+        typer.Option("--smooth", help="Write the solution by all measurements, also later."),
     ] = False,
     systems: Annotated[
         str | None,

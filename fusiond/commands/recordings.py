@@ -30,7 +30,7 @@ LogPaths = Annotated[
     list[Path], typer.Argument(metavar="LOG...", help="A recording: all its files, .mcap.")
 ]
 
-log = typer.Typer(help="Recordings: look into, cut, join, mend, hand on.", no_args_is_help=True)
+log = typer.Typer(help="Recordings: inspect, cut, join, repair, export.", no_args_is_help=True)
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def replay(
     ] = None,
     speed: Annotated[
         float | None,
-        typer.Option(min=0.01, help="Publish over MQTT, this many times as fast as it was."),
+        typer.Option(min=0.01, help="Publish over MQTT at this multiple of real time."),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -103,7 +103,7 @@ def _print_replay(summary: dict[str, Any], err: bool) -> None:
 
 # --------------------------------------------------------------------------- log
 
-OutPath = Annotated[Path, typer.Option("--out", metavar="OUT", help="What to write.")]
+OutPath = Annotated[Path, typer.Option("--out", metavar="OUT", help="File or folder to write.")]
 Kind = Literal["csv", "gpx", "kml", "geojson", "rosbag2"]
 
 
@@ -141,7 +141,7 @@ def trim(
 ) -> None:
     """Cut a part out of a log, to be replayed by itself.
 
-    The part begins at the last state that the log holds before it."""
+    It begins at the last state in the log before --from."""
     from fusiond.recording.edit import trim as cut  # noqa: PLC0415
 
     if end <= begin:

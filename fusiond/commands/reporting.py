@@ -23,7 +23,7 @@ def report(
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(metavar="T.csv", help="Truth, in the solution's time; of a log in UTC."),
+        typer.Option(metavar="T.csv", help="Truth in the solution's time; for a log in UTC."),
     ] = None,
     beside: Annotated[
         list[Path] | None,
@@ -31,7 +31,7 @@ def report(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="F.html", help="The page; here, by the first file's name, if none."),
+        typer.Option(metavar="F.html", help="The page; by default named after the first file."),
     ] = None,
 ) -> None:
     """Write a report of one drive, or of many, as one HTML file.

@@ -66,12 +66,12 @@ class UnansweredError(Exception):
 def status(
     config: Annotated[
         Path | None,
-        typer.Argument(metavar="CONFIG", help="Whose broker and vehicle; localhost if none."),
+        typer.Argument(metavar="CONFIG", help="For broker and vehicle; else localhost."),
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option("--mqtt", metavar="HOST[:PORT]", help="The broker to ask.")
     ] = None,
-    vehicle: Annotated[str | None, typer.Option(help="Which, where the broker has more.")] = None,
+    vehicle: Annotated[str | None, typer.Option(help="Name, if the broker has several.")] = None,
     wait: Annotated[
         float, typer.Option(min=0.5, help="Seconds to wait for a daemon's answer.")
     ] = 3.0,

@@ -72,9 +72,11 @@ class Federated(Section):
         if self.fusion == "uncorrelated":
             return self
         if self.mode != "no_reset":
-            raise ValueError("fusion 'correlated' needs mode 'no_reset': a reset leaves nothing")
+            raise ValueError(
+                "fusion 'correlated' needs mode 'no_reset': a reset ends the correlation"
+            )
         if self.sharing != "fixed" or self.shares:
-            raise ValueError("fusion 'correlated' has no sharing factors")
+            raise ValueError("fusion 'correlated' has no sharing factors: leave shares out")
         return self
 
 

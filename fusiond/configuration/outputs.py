@@ -13,7 +13,7 @@ from fusiond.configuration.aiding import Section
 def _host(text: str) -> str:
     """IPv6 addresses have colons, of which the last is no port's."""
     if not text or "/" in text or text.count(":") == 1 or any(c.isspace() for c in text):
-        raise ValueError("a name or an address alone: no scheme, port or path")
+        raise ValueError("give a name or an address only, without scheme, port or path")
     return text
 
 

@@ -44,7 +44,7 @@ from fusiond.configuration.vehicle_class import PLAUSIBILITY, Plausibility, Vehi
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
     letters = [a[-1] for a in axes]
     if sorted(letters) != ["x", "y", "z"]:
-        raise ValueError("each of x, y and z once, such as ['-x', '+y', '-z']")
+        raise ValueError("name each of x, y and z once, such as ['-x', '+y', '-z']")
     even = letters in (["x", "y", "z"], ["y", "z", "x"], ["z", "x", "y"])
     negative = sum(a.startswith("-") for a in axes)
     if (negative % 2 == 0) != even:
@@ -267,7 +267,7 @@ class Config(Section):
     def _one_raw_receiver(self) -> Config:
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:
-            raise ValueError(f"{' and '.join(raw)}: one receiver's raw data at most, one clock")
+            raise ValueError(f"{' and '.join(raw)}: keep one source of raw data, with one clock")
         return self
 
     @model_validator(mode="after")
@@ -279,9 +279,12 @@ class Config(Section):
         if not terminals:
             raise ValueError("position_reports.card needs a source with driver 'rdss'")
         if o.source is None and len(terminals) > 1:
-            raise ValueError(f"position_reports.source: one of {', '.join(terminals)}")
+            raise ValueError(f"position_reports.source: name one of {', '.join(terminals)}")
         if o.source is not None and o.source not in terminals:
-            raise ValueError(f"position_reports.source: no terminal {o.source!r}")
+            raise ValueError(
+                f"position_reports.source: no terminal {o.source!r}; name one of "
+                f"{', '.join(terminals)}"
+            )
         return self
 
     @property
@@ -313,10 +316,12 @@ class Config(Section):
         federated = self.estimator.federated
         names = federated.sources or tuple(self.aiding)
         if not names:
-            raise ValueError("estimator.filter 'federated' needs a section [aiding.NAME] a source")
+            raise ValueError("estimator.filter 'federated' needs [aiding.NAME] for each source")
         unknown = [name for name in names if name not in self.aiding]
         if unknown:
             raise ValueError(f"estimator.federated.sources: no [aiding.{unknown[0]}]")
         if federated.shares and set(federated.shares) != set(names):
-            raise ValueError("estimator.federated.shares must name every local filter, no other")
+            raise ValueError(
+                "estimator.federated.shares must name every local filter and nothing else"
+            )
         return self

@@ -26,7 +26,9 @@ FINDINGS: Mapping[str, str] = {
         "fuser -v {port} names it)"
     ),
     "port_unusable": "{port} cannot be opened ({detail}): check the device",
-    "port_silent": "No bytes in {seconds:g} s: check power, and that its TX goes to our RX",
+    "port_silent": (
+        "No bytes in {seconds:g} s: check power, and that its TX goes to this computer's RX"
+    ),
     "port_baud": (
         "Bytes arrive, none intelligible: {baud} baud is probably not the device's rate, correct "
         "baud in [sources.{name}]"
@@ -41,8 +43,8 @@ FINDINGS: Mapping[str, str] = {
         "{channel} does not exist: load its driver or correct [sources.{name}]; {others}"
     ),
     "bus_down": (
-        "{channel} is down: ip link set {channel} up (with `type can bitrate 250000`, or what the "
-        "unit has, where it is not set yet)"
+        "{channel} is down: ip link set {channel} up (add `type can bitrate 250000`, with the "
+        "unit's rate, if none is set)"
     ),
     "bus_unusable": "{channel} cannot be used ({detail}): check the interface",
     "bus_silent": (
@@ -51,7 +53,7 @@ FINDINGS: Mapping[str, str] = {
     ),
     "bus_silent_elsewhere": (
         "{detail}: check that the unit sends, and that interface and channel in [sources.{name}] "
-        "are its"
+        "are right"
     ),
     "bus_errors": (
         "{count} CAN error frames: check bit rate, wiring and the two 120 ohm terminators"
@@ -68,7 +70,7 @@ FINDINGS: Mapping[str, str] = {
     # RDSS terminal
     "terminal_silent": (
         "Bytes arrive, but no terminal has answered yet{detail}: listen longer (--seconds 60: "
-        "every baud rate is tried), and check our TX to its RX"
+        "every baud rate is tried), and check this computer's TX to the terminal's RX"
     ),
     "no_card": "{detail}: insert the user card, or have it activated",
     "no_beam": "{detail}: give the antenna a free sky to the south (geostationary satellites)",

@@ -18,12 +18,12 @@ Ionosphere, one layer, in m at the frequency f that the coefficients hold for, t
     BeiDou:  M at geographic latitude |phi_M| / pi, layer at 375 km over 6378 km,
              F = 1 / cos z', the cosine itself within a quarter of P, 72000 s <= P <= 172800 s
 
-h height above the ellipsoid, clamped to 0 .. 10 km (below 0 the formula goes on, the air does not
-matter; higher the wet part is gone); phi latitude, E elevation, angles rad. What these models
-leave, one sigma in m:
+h height above the ellipsoid, clamped to 0 .. 10 km (above, the wet part has vanished; below 0 the
+difference is negligible); phi latitude, E elevation, angles rad. Errors of these models, one sigma
+in m:
 
-    troposphere 0.12 m(E), m = 1.001 / sqrt(0.002001 + sin^2 E)
-    ionosphere  half the delay: a broadcast Klobuchar model takes out at least 50 % RMS
+    troposphere 0.12 m(E), m = 1.001 / sqrt(0.002001 + sin^2 E) ionosphere  half the delay: a
+    broadcast Klobuchar model removes at least 50 % RMS
 
 Source: Saastamoinen, Bulletin Geodesique 107 (1973), 13-34, with U.S. Standard Atmosphere 1976;
 Niell, J. Geophys. Res. 101 B2 (1996), 3227-3246, tables 3 and 4; IS-GPS-200N 20.3.3.5.2.5 and
@@ -91,7 +91,7 @@ def zenith_delays(lat_rad: float, height_m: float) -> tuple[float, float]:
 
 @compiled("f8(f8, f8, f8, f8)")
 def _fraction(sine: float, a: float, b: float, c: float) -> float:
-    """Continued fraction in sin E, 1 at the zenith."""
+    """Continued fraction of m(E) in sin E, 1 at the zenith."""
     top = 1.0 + a / (1.0 + b / (1.0 + c))
     return top / (sine + a / (sine + b / (sine + c)))
 
@@ -100,7 +100,7 @@ def _fraction(sine: float, a: float, b: float, c: float) -> float:
 def mapping_coefficients(lat_rad: float, height_m: float, gps_days: float, out: Array) -> None:
     """Write (7,): hydrostatic a, b, c, wet a, b, c, and height in km for Niell's functions.
 
-    `gps_days` since 1980-01-06, which was day 6 of a year.
+    `gps_days` are days since 1980-01-06, day 6 of its year.
     """
     at = (math.degrees(abs(lat_rad)) - 15.0) / 15.0
     k = int(min(max(at, 0.0), 3.0))
@@ -118,7 +118,7 @@ def mapping_coefficients(lat_rad: float, height_m: float, gps_days: float, out: 
 
 @compiled("UniTuple(f8, 2)(f8, f8[::1])")
 def mapping(sine: float, q: Array) -> tuple[float, float]:
-    """Hydrostatic and wet mapping function by the sine of an elevation, from
+    """Hydrostatic and wet mapping function for the sine of an elevation, from
     `mapping_coefficients`."""
     sine = max(sine, MIN_SINE)
     height_term = 1.0 / sine - _fraction(sine, _HEIGHT[0], _HEIGHT[1], _HEIGHT[2])
@@ -137,7 +137,7 @@ def klobuchar_gps(
     sin_azimuth: float,
 ) -> float:
     """Delay in m at GPS L1; `q` (8,) alpha, beta; GPS second of week; receiver's position."""
-    e = max(elevation_rad, 0.0) / math.pi  # semicircles, as all angles of this model
+    e = max(elevation_rad, 0.0) / math.pi  # semicircles, like all angles of this model
     arc = 0.0137 / (e + 0.11) - 0.022
     lat = lat_rad / math.pi + arc * cos_azimuth
     lat = min(max(lat, -0.416), 0.416)
@@ -158,12 +158,12 @@ def klobuchar_gps(
 def pierced(
     ratio: float, lat_rad: float, sin_elevation: float, cos_azimuth: float
 ) -> tuple[float, float, float, float]:
-    """Pierce point of a ray in a layer: sine and cosine of the arc to there, sine of its
-    latitude, and the cosine of the ray's angle from the vertical. `ratio`: earth's radius over
-    the layer's."""
+    """Pierce point of a ray in a layer: sine and cosine of the arc from the receiver, sine of its
+    latitude, cosine of the ray's angle from the vertical. `ratio`: earth's radius over the
+    layer's."""
     se = max(sin_elevation, 0.0)
     ce = math.sqrt(1.0 - se * se)
-    # The angle at the layer; the arc to its point is pi/2 less this and the elevation.
+    # The arc to the pierce point is pi/2 less the angle at the layer and the elevation.
     sine = ratio * ce
     cosine = math.sqrt(1.0 - sine * sine)
     sin_arc, cos_arc = ce * cosine - se * sine, se * cosine + ce * sine
@@ -198,6 +198,6 @@ def klobuchar_beidou(
 
 @compiled("f8(f8)")
 def slant(sine: float) -> float:
-    """Mapping 1.001 / sqrt(0.002001 + sin^2 E) of the troposphere's sigma."""
+    """Mapping of the troposphere's sigma: 1.001 / sqrt(0.002001 + sin^2 E)."""
     s = max(sine, 0.0)
     return 1.001 / math.sqrt(0.002001 + s * s)

@@ -8,8 +8,8 @@ r"""Ionospheric delay by BDGIM, with BeiDou-3's nine coefficients from B-CNAV.
 
 E elevation; H = 400 km, Re = 6378 km; phi', lambda' of the point where the ray crosses the layer,
 geomagnetic, longitude from the sun's meridian; n, m are 0 to 2 for alpha, 3 to 5 for beta. t is the
-middle of the current two hours (MJD of BDT). VTEC is at least a part of alpha_1, as in the program
-of the model's authors: harmonics of degree 5 go below zero at night.
+middle of the current two hours (MJD of BDT). VTEC has a floor, a share of alpha_1, as in the
+program of the model's authors, because harmonics of degree 5 become negative at night.
 
 Source: BDS-SIS-ICD-B1C-1.0 section 7.8, tables 7-10 to 7-12; floor of VTEC: Z. Li, N. Wang, program
 to the model, 2021; accuracy: Yuan, Wang, Li, Huo, Navigation 66 (2019), 55-69: three quarters of
@@ -90,7 +90,7 @@ _PLACES = np.array([_place(n, m) for n, m in (*_BROADCAST, *_REST)])
 
 
 def bdgim_terms(model: Bdgim, week: int, tow_s: float) -> Array:
-    """Coefficients of `bdgim`, (49,), for a GPS time; it holds for the two hours of BDT."""
+    """Coefficients (49,) of `bdgim`, valid for the two hours of BDT that contain a GPS time."""
     mjd = GPS_EPOCH_MJD + 7 * week + (tow_s - BDT_BEHIND_GPS_S) / 86_400.0
     middle = (math.floor(mjd / SLOT_D) + 0.5) * SLOT_D
     angles = 2.0 * math.pi / _PERIODS_D * middle
@@ -113,7 +113,7 @@ def bdgim(
     cos_azimuth: float,
     sin_azimuth: float,
 ) -> float:
-    """Delay in m at B1C; `q` of `bdgim_terms`; BeiDou second of week; receiver's position."""
+    """Delay in m at B1C; `q` by `bdgim_terms`; BeiDou second of week; receiver's position."""
     sin_arc, cos_arc, z, cosine = pierced(
         RADIUS_M / (RADIUS_M + LAYER_M), lat_rad, sin_elevation, cos_azimuth
     )

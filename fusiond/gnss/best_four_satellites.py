@@ -2,17 +2,17 @@ r"""The four satellites with the best geometry.
 
     G = [-l_1 1; -l_2 1; -l_3 1; -l_4 1],   GDOP^2 = tr (G^T G)^-1 = |G^-1|_F^2
 
-l unit vectors from the receiver to the satellites. One receiver clock: the satellites are of one
-system, or the offsets between systems are known. GDOP does not depend on the axes.
+l are unit vectors from the receiver to the satellites, in any axes. There is one receiver clock:
+the satellites are of one system, or the offsets between systems are known.
 
-Up to `EXHAUSTIVE_UP_TO` satellites every four is looked at: C(14, 4) = 1001. Beyond, an exchange:
-from several starting sets, the one swap of a member for another satellite that lowers GDOP most is
-made until none does: 4 (n - 4) candidates a round, and a few rounds. Starting sets have one
-satellite from the middle of the sky to its edge, and three more chosen one by one for the largest
-determinant of G G^T. No single exchange betters the result; over 195 random skies of 15 to 40
-satellites it was the best of all in 97 %, and its GDOP at most 6 % larger in the rest (1 to 2 ms).
+Up to `EXHAUSTIVE_UP_TO` satellites every set of four is evaluated: C(14, 4) = 1001. With more, an
+exchange starts from several sets and repeats the swap of a member for another satellite that lowers
+GDOP most, until no swap lowers it: 4 (n - 4) candidates a round, and a few rounds. A starting set
+has one satellite, from the middle of the sky to its edge, and three more chosen one by one for the
+largest determinant of G G^T. Over 195 random skies of 15 to 40 satellites the result was the best
+set in 97 %, and its GDOP at most 6 % larger in the others (1 to 2 ms).
 
-Source: paper 002, simulation (of those in view the four of smallest GDOP); Groves, 2nd
+Source: paper 002, simulation (the four satellites in view with the smallest GDOP); Groves, 2nd
 edition, 9.4.3.
 """
 
@@ -34,7 +34,7 @@ SINGULAR = 1e-8
 
 
 def gdop_squared(line_of_sight: Array, sets: Indices) -> Array:
-    """GDOP^2 (k,) of sets (k, 4) of rows of lines of sight (n, 3); infinite where singular."""
+    """GDOP^2 (k,) of sets (k, 4) of rows of lines of sight (n, 3); infinite if singular."""
     g = np.ones((len(sets), 4, 4))
     g[:, :, :3] = -line_of_sight[sets]
     bad = np.abs(np.linalg.det(g)) < SINGULAR
@@ -45,7 +45,7 @@ def gdop_squared(line_of_sight: Array, sets: Indices) -> Array:
 
 
 def best_four(line_of_sight: Array) -> tuple[Indices, float] | None:
-    """Rows (4,), sorted, of lines of sight (n, 3) with the smallest GDOP, and that GDOP.
+    """Sorted rows (4,) of lines of sight (n, 3) with the smallest GDOP, and that GDOP.
 
     None with fewer than four satellites or if every four is singular.
     """
@@ -68,7 +68,7 @@ def _all_fours(n: int) -> Indices:
 
 
 def _starts(line_of_sight: Array) -> list[Indices]:
-    """Sets grown from different first satellites."""
+    """Starting sets, grown from different first satellites."""
     n = len(line_of_sight)
     middle = line_of_sight.mean(axis=0)
     order = np.argsort(line_of_sight @ middle)[::-1]  # from the middle of the sky outwards

@@ -1,35 +1,36 @@
 r"""Carrier phase changes between epochs: slant delay and displacement of a satellite.
 
-Two signals a and b of one satellite, P in m with their group delays d taken off, carriers L in m,
-gamma = (f_a / f_b)^2; I the ionosphere's delay at f_a:
+Of two signals a and b of one satellite, with codes P in m without their group delays d, carriers L
+in m, gamma = (f_a / f_b)^2, and I the ionosphere's delay at f_a:
 
     P_b - P_a = (gamma - 1) I + code noise            L_a - L_b = (gamma - 1) I + constant
     I_code    = (P_b - P_a) / (gamma - 1),            A = (s_a^2 + s_b^2) / (gamma - 1)^2
 
-so the carriers give the change of I to millimetres, the codes its value: a filter of one state,
+So the carriers give the change of I to millimetres, the codes its value. A filter of one state
+combines them,
 
     I <- I + d(L_a - L_b) / (gamma - 1),     K = V / (V + R),  R = A max(1, 2 tau / dt)
     I <- I + K (I_code - I),   V <- (1 - K) V
 
 with tau the correlation time of multipath, within which codes are not independent. The first epoch
-has V = A: the ionosphere-free pair. The error of I is correlated with the epoch's code, from which
-it is subtracted: V / A of its information comes from this epoch, so twice (V / A) s_a^2 / (gamma -
-1) is added (exact for the pair: s_a^2 + 2 s_a^2 / (gamma - 1) + A = (gamma^2 s_a^2 + s_b^2) /
-(gamma - 1)^2). The codes also show the receiver's noise by their difference from the carriers'
-delay: with nu = I_code - I, each counting w = min(dt / 2 tau, 1) of an independent one,
+has V = A: the ionosphere-free pair. I is subtracted from the epoch's code, with whose error its own
+is correlated: V / A of its information is from this epoch, so twice (V / A) s_a^2 / (gamma - 1) is
+added (exact for the pair: s_a^2 + 2 s_a^2 / (gamma - 1) + A = (gamma^2 s_a^2 + s_b^2) / (gamma -
+1)^2). The difference of the codes' delay from the carriers' shows the receiver's noise: with nu =
+I_code - I, each with the weight w = min(dt / 2 tau, 1) of an independent one,
 
     scale^2 = (20 + sum w nu^2 / (A + V)) / (20 + sum w)
 
 multiplies the model's variances of multipath and thermal noise, here and in the ranges.
 
-Neither depends on the receiver's position; its delay between bands remains in I.
+Both are independent of the receiver's position. The receiver's delay between bands remains in I.
 
-Of a tracked carrier an epoch has L_a, its variance s_L^2, and the tracking time since the
-satellite's epoch before; paths from an anchor epoch are made of these
-(fusiond.aiding.carrier_anchor). s_L is by a model of C/N0 and a scale, learned in the same way from
-d(L_a - L_b) of variance 2 (s_La^2 + s_Lb^2).
+For a tracked carrier an epoch has L_a, its variance s_L^2, and the tracking time since the
+satellite's previous epoch; fusiond.aiding.carrier_anchor makes paths from an anchor epoch of them.
+s_L comes from a model of C/N0 and a scale, learned in the same way from d(L_a - L_b) of variance 2
+(s_La^2 + s_Lb^2).
 
-The carrier shows reflections, too: code minus carrier, d = P_a - L_a, changes only by 2 dI,
+The carrier also shows reflections: code minus carrier, d = P_a - L_a, changes only by 2 dI,
 millimetres a second. With D its mean over the last `MEANS_S` of tracking, m seconds long at first,
 and s^2 (1 + 1 / m) the variance of d - D, s^2 that of a code by the model and a scale learned from
 d (over a slip, which changes D, too, by the Dopplers),
@@ -37,11 +38,11 @@ d (over a slip, which changes D, too, by the Dopplers),
     d - D > 4 s    `multipath`, until d - D < 2 s, two minutes at most
     d - D < -4 s   D was too long
 
-A reflected code is longer, never shorter: a fall shows that it was reflected before.
+A reflection only makes a code longer: a fall shows that the code was reflected before.
 
-Rejections. Of a satellite: `multipath`; of its carrier alone: `lock_lost` (reported by the
-receiver), `cycle_slip` (the carriers diverge by more than the ionosphere can, or the rate differs
-from the Dopplers); of all carriers at once: `clock_jump`.
+Rejections: of a satellite, `multipath`; of its carrier alone, `lock_lost` (reported by the
+receiver) and `cycle_slip` (the carriers diverge by more than the ionosphere explains, or the rate
+differs from the Dopplers); of all carriers at once, `clock_jump`.
 
 Source: Hatch, Proc. 3rd Int. Geodetic Symposium on Satellite Doppler Positioning (1982); Groves,
 2nd edition, 9.2.7 and 9.3.3; van Graas and Soloviev, Navigation 51 (2004), 277-292.
@@ -59,25 +60,26 @@ from fusiond.navigation.compiled import compiled
 
 Array = npt.NDArray[np.float64]
 
-# What the plan says of each row: slot of the satellite; wavelengths (m); gamma, 0 without a second
-# signal; d_b - d_a (m); variance (m^2) of what stays unknown of it, as a delay; numbers of the pair
-# and of its first signal.
+# Columns of the plan: slot of the satellite; wavelengths (m); gamma, 0 without a second signal; d_b
+# - d_a (m); variance (m^2) of its error, as a delay; numbers of the pair and of its first signal.
 PLAN_COLUMNS = 8
 SLOT, LENGTH_A, LENGTH_B, GAMMA, DELAY, DELAY_VARIANCE, PAIR, SIGNAL = range(PLAN_COLUMNS)
-# What the receiver says of a signal, the first or the second (drivers.raw.messages.PackedSignals).
+# Columns of the receiver's data of a signal, the first or the second
+# (drivers.raw.messages.PackedSignals).
 P, RATE, CNO, SD, SD_RATE, CYCLES, LOCK = range(SIGNAL_VALUES)
-# What is kept of a satellite: of its first signal, of its pair; times and numbers of 0: nothing.
+# Columns kept for a satellite, of its first signal and of its pair; a time or number of 0: nothing
+# kept.
 SLOTS, KEPT_COLUMNS = 3 * 64, 12
 (
     _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V, _BESIDE, _MANY, _SINCE,
 ) = range(KEPT_COLUMNS)  # fmt: skip
-# Slot 0 is no satellite's: sum of w nu^2 / (A + V) and of w; the same of changes of two carriers,
-# and of codes beside their carriers.
+# Slot 0, which no satellite has, holds sums: of w nu^2 / (A + V) and of w; the same for changes of
+# two carriers, and for codes minus carriers.
 _SUM, _COUNT, _PHASES, _PHASE_COUNT, _CODES, _CODE_COUNT = range(6)
-# What comes out; NaN: nothing known.
+# Columns of the results; NaN: unknown.
 OUT_COLUMNS = 6
 SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_COLUMNS)
-# Refusals of a satellite's carrier, or of all of it, by what `follow` writes.
+# Refusals of a satellite, or of its carrier, by the number that `follow` writes.
 FOLLOWED, LOCK_LOST, CYCLE_SLIP, MULTIPATH = 0, 1, 2, 3
 ALL_FOLLOWED, JUMPED, SOME_REFUSED = 0, 1, 2
 """Results of `follow`."""
@@ -127,7 +129,7 @@ root of a second makes 0.45 m/s over 50 ms, one set by a millisecond within 2 s 
 
 @compiled("f8(f8[:, ::1])")
 def scale_squared(kept: Array) -> float:
-    """Factor on the model's variances of codes."""
+    """Factor on the model's variances of codes, learned from the receiver."""
     found: float = (PRIOR_COUNT + kept[0, _SUM]) / (PRIOR_COUNT + kept[0, _COUNT])
     return min(max(found, SCALE_SQUARED[0]), SCALE_SQUARED[1])
 
@@ -143,14 +145,14 @@ def _weakness(cno: float) -> float:
 
 @compiled("f8(f8, f8)", forceinline=True)
 def _phase_variance(weak: float, length: float) -> float:
-    """Variance (m^2) of a carrier of a wavelength (m), by the model."""
+    """Model variance (m^2) of a carrier of a wavelength (m)."""
     turn = length / PHASE_LENGTH_M
     return turn * turn * (PHASE_M * PHASE_M + PHASE_THERMAL_M * PHASE_THERMAL_M * weak)
 
 
 @compiled("f8(f8, f8, f8)", forceinline=True)
 def _code_variance(weak: float, stated: float, scale: float) -> float:
-    """Variance (m^2) of a pseudorange at any elevation, with its model `scale` times."""
+    """Variance (m^2) of a pseudorange at any elevation: `scale` times the model's."""
     found = scale * (CODE_M * CODE_M + THERMAL_M * THERMAL_M * weak)
     if not math.isnan(stated):
         found += stated * stated
@@ -170,8 +172,8 @@ def _delay(
     scale: float,
     seen: Array,
 ) -> None:
-    """Write the slant delay from this epoch's codes and the carriers' `change`; NaN: none. Adds to
-    the sums of `seen` codes."""
+    """Write the slant delay by this epoch's codes and the carriers' `change` (NaN: none), and add
+    to the sums of `seen` codes."""
     more = plan[GAMMA] - 1.0
     code = (second[P] - first[P] - plan[DELAY]) / more
     noise = _code_variance(weak_a, first[SD], scale)
@@ -207,7 +209,7 @@ def _has_multipath(
     seen: Array,
 ) -> bool:
     """True if the code has diverged from its carrier of `length` (m), which has `slipped` (m; NaN:
-    unknown). Adds to the sums `seen` of code minus carrier."""
+    unknown). Adds to the sums of `seen` codes minus carriers."""
     beside, model = first[P] - length, _code_variance(weak_a, first[SD], 1.0)
     state[_BESIDE] -= slipped
     if state[_MANY] == 0.0 or math.isnan(beside) or math.isnan(state[_BESIDE]):
@@ -235,7 +237,7 @@ def _has_multipath(
 
 @compiled("f8(f8[:, ::1], i8)", forceinline=True)
 def _shown(kept: Array, of: int) -> float:
-    """Factor that sums in slot 0 show, whose first is `of`; they are halved when they grow old."""
+    """Factor by the sums in slot 0 from index `of` on; old sums are halved."""
     if kept[0, of + 1] > MOST_COUNT:
         kept[0, of] *= 0.5
         kept[0, of + 1] *= 0.5
@@ -254,7 +256,7 @@ def _write_rates(
     own = _code_variance(weak_a, first[SD], scale)
     out[SLANT] = state[_DELAY]
     out[SLANT_VARIANCE] = state[_V] + plan[DELAY_VARIANCE]
-    # As if both codes were of one noise: A = 2 own / more^2.
+    # Assumes equal noise of both codes: A = 2 own / more^2.
     part = min(0.5 * state[_V] * more * more / own, 1.0)
     out[WITH_CODE] = 2.0 * part * own / more
 
@@ -310,7 +312,7 @@ def follow(
     for i in range(n):
         state, weak_a = kept[int(plan[i, SLOT])], weak[i]
         span = now - state[_T]
-        if span <= 0.0:  # seen already
+        if span <= 0.0:  # the epoch was processed before
             if state[_SINCE] > 0.0:
                 refused[i] = MULTIPATH
             _write_rates(state, plan[i], first[i], weak_a, scale, out[i])

@@ -1,17 +1,17 @@
-r"""Corrections of a service to broadcast orbits and clocks: their validity and their sigma.
+r"""Corrections of a service to broadcast orbits and clocks: validity and sigma.
 
-A satellite is corrected if one solution has, none of them too old,
+A satellite is corrected if one solution has these parts, none of them too old:
 
     its orbit, for a stored and healthy ephemeris;  its clock;  a bias of the signal
 
-as a clock is only valid with its own biases: P + bias replaces the broadcast group delay. A
-correction is valid for three of its intervals, 30 s at least and 180 s at most, so one or two may
-be lost. (Biases, which change in days: an hour.)
+All are needed because a clock is only valid with its own biases: P + bias replaces the broadcast
+group delay. A correction is valid for three of its intervals, 30 s at least and 180 s at most, so
+that one or two may be lost; biases, which change in days, are valid for an hour.
 
     sigma^2 = max(0.15 m, what the service states)^2 + (1 mm/s age)^2
 
-Clocks of a service have their own zero, often metres from the broadcast one. So a system uses
-corrections as a whole or not at all: if half of its satellites have them, the others are
+A service's clocks have their own zero, often metres from the broadcast one. So corrections are used
+for a whole system or not at all: if half of its satellites have them, the others are
 `no_correction`.
 
 Source: RTCM 10403.3, 3.5.12; quality of real-time orbits (5 cm) and clocks (0.3 ns): IGS Real-Time
@@ -46,14 +46,13 @@ class CorrectedEphemeris(NamedTuple):
 
 
 class Corrections:
-    """The last part of each kind by satellite."""
+    """Latest part of each kind by satellite."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[System, int], dict[CorrectionPart, Correction]] = {}
 
     def add(self, correction: Correction) -> None:
-        """Take a part in; one that holds for an earlier instant than the one that is there is
-        none."""
+        """Store a part, unless the stored one is valid for a later instant."""
         parts = self._parts.setdefault((correction.system, correction.prn), {})
         old = parts.get(correction.part)
         if old is None or _age_s(old, correction.week, correction.tow_s) >= 0.0:
@@ -64,8 +63,8 @@ class Corrections:
         return bool(self._parts)
 
     def issue(self, system: System, prn: int, week: int, tow_s: float) -> int | None:
-        """Issue of the ephemeris that the satellite's correction refers to at a GPS time; None
-        without a valid one."""
+        """Issue of the ephemeris to which the satellite's valid correction refers at a GPS time;
+        None without one."""
         parts = self._parts.get((system, prn), {})
         orbit, clock, bias = (parts.get(p) for p in ("orbit", "clock", "bias"))
         if orbit is None or clock is None or bias is None or orbit.solution != clock.solution:
@@ -76,7 +75,7 @@ class Corrections:
         return orbit.issue if all(holds) else None
 
     def applied(self, ephemeris: Ephemeris, week: int, tow_s: float) -> CorrectedEphemeris:
-        """Correction for the ephemeris of an `issue`."""
+        """Correction for the ephemeris with an `issue`."""
         parts = self._parts[ephemeris.system, ephemeris.prn]
         orbit, clock, bias = parts["orbit"], parts["clock"], parts["bias"]
         c0, c1, c2 = clock.values

@@ -4,8 +4,8 @@ r"""Earth-centred coordinates: geodetic position, ECEF, north-east-down.
     z = (R_N (1 - e^2) + h) sin phi
     C_en = Rz(-lambda) Ry(phi + pi/2): columns are north, east and down in ECEF
 
-phi geodetic latitude, lambda longitude (rad), h ellipsoidal height (m), R_N transverse radius.
-Back by Bowring's formula, twice: 1e-11 rad from the sea floor to satellite heights.
+phi geodetic latitude, lambda longitude (rad), h ellipsoidal height (m), R_N transverse radius. The
+inverse applies Bowring's formula twice: 1e-11 rad from the sea floor to satellite heights.
 
 Source: Groves, Principles of GNSS, Inertial and Multisensor Integrated Navigation Systems, 2nd
 edition, 2.4.3 (2.112, C.18) and 2.5.3 (2.150); Bowring, Survey Review 23 (1976), 323-327.
@@ -33,7 +33,7 @@ def to_geodetic(x: float, y: float, z: float) -> tuple[float, float, float]:
     On the axis the longitude is 0; within 1 km of the earth's centre the result means nothing.
     """
     p = math.hypot(x, y)
-    # reduced latitude of the point below, from that of the point itself
+    # reduced latitude of the point below, by that of the point itself
     beta = math.atan2(SEMI_MAJOR_M * z, SEMI_MINOR_M * p)
     lat = 0.0
     for _ in range(2):

@@ -77,9 +77,9 @@ _ECCENTRICITY = {"geo": 3e-4, "igso": 2e-3, "meo": 8e-4, "gps": 8e-3}
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A place in a constellation: node and argument of latitude at `EPOCH_S`, rad.
+    """Orbital slot: node and argument of latitude at `EPOCH_S`, rad.
 
-    A GEO has its longitude as `latitude_argument` and no node.
+    For a GEO `latitude_argument` is the longitude, and there is no node.
     """
 
     system: System
@@ -148,8 +148,8 @@ def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
 
 
 def ephemeris(slot: Slot, week: int, tow_s: float, epoch_s: float = EPOCH_S) -> Ephemeris:
-    """Ephemeris that the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest
-    one.
+    """Ephemeris broadcast by the satellite at GPS time `week`, `tow_s`: the one with the nearest
+    toe.
 
     At `epoch_s` (GPS time, s; default `EPOCH_S`) the satellites have their nominal positions.
     Unquantised: `fusiond.simulation.gnss.nav_fields.quantised` rounds to what a message can carry.
@@ -168,7 +168,7 @@ def ephemeris(slot: Slot, week: int, tow_s: float, epoch_s: float = EPOCH_S) -> 
     n = math.sqrt(mu / slot.semi_major_m**3)
     spread = 2.0 * math.pi * (0.618034 * slot.prn % 1.0)  # golden section: all phases differ
     if slot.kind == "geo":
-        # The perigee stands among the stars, so it goes backwards in the Earth's axes.
+        # The perigee is fixed among the stars, so it turns backwards in the Earth's axes.
         node = math.pi + rate * toe
         u = slot.latitude_argument + math.pi
         perigee = spread - rate * tau
@@ -225,7 +225,7 @@ def constellation(
 
 
 def system_time(system: System, week: int, tow_s: float) -> tuple[int, float]:
-    """GPS time as week and second of week of the system's own time."""
+    """Convert GPS time to week and second of week of the system's own time."""
     if system != "C":
         return week, tow_s
     tow_s -= BDT_BEHIND_GPS_S
@@ -241,8 +241,8 @@ def _wrap(angle: float) -> float:
 
 
 class Sky(NamedTuple):
-    """Satellites (n,) as seen from a place: angles in rad, unit vectors (n, 3) to the satellites,
-    NED, ranges (n,) in m, ECEF positions (n, 3) in m and velocities in m/s, all at one instant."""
+    """Satellites seen from a place at one instant: angles (n,) rad, unit vectors (n, 3) to the
+    satellites, NED, ranges (n,) m, ECEF positions (n, 3) m and velocities m/s."""
 
     satellites: tuple[str, ...]
     azimuth: Array
@@ -263,7 +263,7 @@ class Sky(NamedTuple):
 
 
 class Constellation:
-    """Satellites on the orbits of their ephemerides, all at once."""
+    """Satellites on the orbits of their ephemerides, as arrays."""
 
     def __init__(self, ephemerides: Sequence[Ephemeris]) -> None:
         self.ephemerides = tuple(ephemerides)
@@ -281,10 +281,10 @@ class Constellation:
         return states.position, states.velocity
 
     def line_of_sight(self, lat: float, lon: float, height_m: float, t_s: float) -> Sky:
-        """The sky over a geodetic place (rad, m) at GPS time `t_s`; satellites below ground too.
+        """Sky over a geodetic place (rad, m) at GPS time `t_s`, with satellites below the horizon.
 
-        Geometry of one instant: without the 70 to 130 ms of flight, in which a satellite moves up
-        to 400 m, 1e-5 rad as seen from here.
+        The geometry of one instant neglects the 70 to 130 ms of flight, in which a satellite moves
+        up to 400 m: 1e-5 rad seen from the place.
         """
         p, v = self.positions(t_s)
         delta = p - np.array(to_ecef(lat, lon, height_m))

@@ -12,10 +12,10 @@ r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
     dt = a0 + a1 (t - toc) + a2 (t - toc)^2 + F e sqrtA sin E,   F = -2 sqrt(GM) / c^2
 
 tk = t - toe, t the system time of transmission; R(x) are rotations of the axes. Velocity and clock
-drift are the derivatives of these lines by t; Edot = (n + n' tk) / (1 - e cos E) carries all.
-Angles rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS
-agree to centimetres). A transmission at t_sv by the satellite's clock was at t = t_sv - dt(t_sv);
-the relativistic term is neglected in this one step: 50 ns move a satellite 0.2 mm.
+drift are the derivatives of these equations by t, with Edot = (n + n' tk) / (1 - e cos E). Angles
+rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS agree to
+centimetres). A transmission at t_sv by the satellite's clock was at t = t_sv - dt(t_sv); the
+relativistic term is neglected in this one step: 50 ns move a satellite 0.2 mm.
 
 A service's corrections (fusiond.gnss.corrections), dO of the orbit and dC of the clock, at the age
 a = t - t0 of each:
@@ -75,12 +75,12 @@ CONSTANTS: dict[System, Constants] = {
 
 
 def is_beidou_geo(system: System, prn: int) -> bool:
-    """True if the orbit is given in the tilted frame: C01 to C05 and C59 to C63."""
+    """True if the orbit is in the tilted frame: C01 to C05 and C59 to C63."""
     return system == "C" and (prn <= 5 or 59 <= prn <= 63)
 
 
 def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
-    """GPS week and second of week of a system's own week and second; seconds may exceed the
+    """Convert a system's own week and second to GPS week and second; seconds may exceed the
     week."""
     if system == "C":
         return week + BDT_WEEK_0_IN_GPS_WEEKS, seconds + BDT_BEHIND_GPS_S
@@ -108,7 +108,7 @@ STATE_COLUMNS = 8
 
 @compiled("UniTuple(f8, 2)(f8, f8, f8)", forceinline=True)
 def turned(cosine: float, sine: float, small: float) -> tuple[float, float]:
-    """Cosine and sine of an angle increased by `small` (rad), at a tenth of the cost of computing
+    """Cosine and sine of an angle after a `small` turn (rad), at a tenth of the cost of computing
     them."""
     square = small * small
     c = 1.0 - square * (0.5 - square / 24.0)
@@ -140,8 +140,8 @@ def satellite_states(
 ) -> None:
     """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
 
-    `elements` (n, 47) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
-    satellite's own clock has it if `by_satellite_clock`.
+    `elements` (n, 47) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, or the
+    satellite clock's if `by_satellite_clock`.
     """
     for k in range(elements.shape[0]):
         q = elements[k]
@@ -160,7 +160,7 @@ def satellite_states(
         mean = q[_M0] + (q[_MOTION] + 0.5 * q[_MOTION_RATE] * tk) * tk
         anomaly = mean + ecc * math.sin(mean)
         cos_e, sin_e = math.cos(anomaly), math.sin(anomaly)
-        for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
+        for _ in range(12):  # Newton: two steps suffice at e = 0.02
             change = (anomaly - ecc * sin_e - mean) / (1.0 - ecc * cos_e)
             anomaly -= change
             if abs(change) < SMALL_RAD:
@@ -231,7 +231,7 @@ def elements_row(ephemeris: Ephemeris, corrected: Sequence[float] = NOT_CORRECTE
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
     _, toc = gps_time(e.system, e.week, e.toc_s)
-    # toc lies in the week nearest to toe: the two differ by hours, unless the week turned between
+    # toc is in the week nearest to toe, from which it differs by hours
     toc_week = week + round((toe - toc) / WEEK_S)
     axis = e.sqrt_a * e.sqrt_a
     motion = math.sqrt(constants.gm / axis) / axis + e.mean_motion_correction
@@ -280,8 +280,8 @@ class Orbits:
     def sent(self, week: int, tow_s: float, pseudorange_m: Array) -> SatelliteStates:
         """States at the transmission of signals received at `tow_s` of the receiver's clock.
 
-        Receiver time minus pseudorange / c is the satellite's own time of transmission, whatever
-        the receiver's clock error is: no iteration over the flight time.
+        Receiver time minus pseudorange / c is the satellite clock's time of transmission, whatever
+        the receiver's clock error, so no iteration over the flight time is needed.
         """
         return self._states(week, tow_s - pseudorange_m / SPEED_OF_LIGHT_M_S, True)
 

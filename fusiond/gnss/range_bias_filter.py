@@ -39,15 +39,15 @@ EVERY_S = 0.9
 FORGOTTEN_S = 300.0
 """Time after which a satellite is treated as new; street corners hide it for less."""
 SIGMAS = 3.0
-# Of a satellite, by its slot: r (m), V and L (m^2), when it was last seen (GPS time, s; 0: never).
-# Slot 0 is no satellite's: when levels were last learned.
+# Columns of a satellite's slot: r (m), V and L (m^2), and when it was last seen (GPS time, s; 0:
+# never). Slot 0, which no satellite has: when levels were last learned.
 COLUMNS = 4
 _OFFSET, _VARIANCE, _PRIOR, _T = range(COLUMNS)
 
 
 @compiled("void(f8[:, ::1], f8[:, ::1], f8, f8[::1], f8[::1])")
 def _expect(levels: Array, values: Array, t_s: float, offset: Array, variance: Array) -> None:
-    """Write r (n,) and V (n,) of rows' `values` at `t_s`, and subtract them."""
+    """Write r (n,) and V (n,) for the rows in `values` at `t_s`, and subtract them."""
     for k in range(offset.shape[0]):
         known = levels[int(values[rk.SLOT, k])]
         prior = values[rk.LASTING, k]
@@ -74,8 +74,8 @@ def _learn(
     z: Array,
     place: Array,
 ) -> None:
-    """Store r and V of rows, updated by innovations z (n,) if any, whose position has the variances
-    `place` (n,)."""
+    """Store r and V of rows, after an update by innovations z (n,), if any, with the position's
+    variances `place` (n,)."""
     n = clock.shape[0]
     for k in range(n):
         known = levels[int(values[rk.SLOT, k])]
@@ -89,7 +89,7 @@ def _learn(
     fits = np.ones(n, np.bool_)
     for system in range(3):
         total, mean, many, worst = 0.0, 0.0, 0, 0
-        while worst >= 0:  # the farthest one goes first: it draws the mean
+        while worst >= 0:  # exclude the farthest one first, because it shifts the mean
             total, mean, many, worst = 0.0, 0.0, 0, -1
             for k in range(n):
                 if clock[k] == system and fits[k]:

@@ -11,11 +11,11 @@ S^T, and its solution has the lasting error
 H = [-u 1_system], u unit vectors to the satellites north, east, down, R the variance of a range
 including lasting errors, L the prior information on position (30 m), on common errors (their unit
 variance), and none on the clock. Its offset is solved from the same ranges, so that a delay of the
-whole sky enters clock and height together. With a clock known to 1 m half of it would cancel: the
-longer ranges of low satellites raise the position, a later clock lowers it (10 satellites with 1 m
-of unknown ionosphere at the zenith: 0.9 m downwards instead of 2.3). So u . K t is the part of the
-errors that acts as a displacement: all of it with four satellites, whose geometry amplifies it, and
-little with thirty.
+whole sky enters clock and height together. A clock known to 1 m would wrongly cancel half of it:
+the longer ranges of low satellites raise the position, a later clock lowers it (10 satellites with
+1 m of unknown ionosphere at the zenith: 0.9 m downwards instead of 2.3). So u . K t is the part of
+the errors that acts as a displacement: all of them with four satellites, whose geometry amplifies
+it, and few with thirty.
 
 If the sky changes, a before and b after, the displacement stays and grows by the unknown part V_k
 of the satellites' levels (fusiond.gnss.range_bias_filter),
@@ -29,10 +29,10 @@ errors, and its sky has another displacement: with C = cov(b_b, b_a) of the gain
 
     C = G_b E G_a^T + (G_b S_b) (G_a S_a)^T,  E the lesser v_k of both,  b_b = C B_a^-1 b_a + w
 
-weighted by the larger of the fresh satellites' share and the mean V / v. With b_b = b_a alone, a
-position started by four satellites kept their sigma for half an hour under any later sky. A filter
-that lets K grow without added noise estimates t from the changes of ranges when satellites
-disappear, and is too sure of its position.
+weighted by the larger of the fresh satellites' share and the mean V / v. With b_b = b_a alone a
+position started by four satellites would keep their sigma for half an hour under any later sky. A
+filter that lets K grow without added noise would estimate t from the changes of ranges when
+satellites disappear, and be too sure of its position.
 
 Source: Groves, 2nd edition, 9.4.1 (G), 3.2.4 (Markov processes), B.2 of Bar-Shalom et al. (2001).
 """
@@ -83,8 +83,8 @@ def plausible(values: Array, clock: npt.NDArray[np.int64], marked: npt.NDArray[n
     """Mark satellites (n,) whose ranges agree with others of their clock; return the number of the
     rest.
 
-    A range disagrees if it differs by `INCONSISTENT_M` from more than half of them. Its range is
-    gated, and what is left displaces by itself."""
+    A range disagrees if it differs by `INCONSISTENT_M` from more than half of the others. It will
+    be gated, so the displacement is that of the other ranges."""
     n, odd = clock.shape[0], 0
     for k in range(n):
         own = values[rk.CORRECTED, k] - values[rk.RANGE, k]
@@ -116,9 +116,10 @@ def _invert(a: Array, m: int) -> None:
 
 @compiled("void(f8[:, ::1], f8[:, ::1])", allocates=True)
 def roots(b: Array, out: Array) -> None:
-    """Write (6, 3): the symmetric root of B (3, 3), and its inverse where B is not nearly 0."""
+    """Write (6, 3): the symmetric root of B (3, 3) and its inverse, in directions in which B is not
+    nearly 0."""
     a, v = b.copy(), np.eye(3)
-    for _ in range(12):  # Jacobi's rotations: the third round is exact to rounding
+    for _ in range(12):  # Jacobi's rotations, exact to rounding after the third round
         if a[0, 1] == 0.0 and a[0, 2] == 0.0 and a[1, 2] == 0.0:
             break
         for p in range(2):
@@ -163,12 +164,13 @@ def displace(
     effect: Array,
     out: Array,
 ) -> None:
-    """Write the effect of errors of `variance` (n,) on ranges that are weighted by `noise` (n,),
+    """Write the displacement by errors of `variance` (n,) of ranges with weights by `noise` (n,),
     and its roots.
 
     `effect` (3, n + 2): G and G S by rows' `values`; `out` (6, 3): K and its inverse.
 
-    `clock` (n,) below `clocks`: which of the clocks' offsets each has, known to `clock_m`.
+    `clock` (n,): index of each range's clock offset, below `clocks`; each offset is known to
+    `clock_m`.
     """
     n, shared = clock.shape[0], 3 + clocks
     m = shared + len(SHARED)
@@ -237,8 +239,8 @@ class Displacement(NamedTuple):
         clocks = int(rows.clock.max(initial=0)) + 1
         lasting, of = rows.values[rk.LASTING].copy(), (rows.values, rows.clock, clocks)
         noise = rows.values[rk.VARIANCE] - variance + lasting
-        # Fewer satellites than unknowns leave the clock as it was: free, it would take a direction
-        # of the place that the displacement of the sky before has.
+        # With fewer satellites than unknowns the clock keeps its prior: a free clock would use up a
+        # direction of the position that the previous sky's displacement covers.
         free = FREE_M if n >= 3 + clocks else CLOCK_M
         displace(*of, noise, lasting, free, gain, out)
         unknown = variance + FLOOR_M**2
@@ -284,7 +286,7 @@ class Displacement(NamedTuple):
         new = _times(_times(self.back, new), self.back)
         if not self.fresh:
             return kept, new
-        # What the sky before is off by, and how it goes with what this one is.
+        # Covariance of the previous sky's displacement, and its covariance with this one.
         own, both = np.zeros((3, 3)), np.zeros((3, 3))
         shared = before.gain[:, last:].copy()
         shared[:, 0] = 0.0

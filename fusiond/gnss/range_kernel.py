@@ -1,4 +1,4 @@
-r"""Range and range rate equations of an epoch, for all satellites at once.
+r"""Range and range rate equations of all satellites of an epoch.
 
     rho = |s - r|,  l = (s - r) / rho,   s = Rz(we tau) s_t,  tau = rho / c,  v = Rz(we tau) v_t
     P + c (dt - d) - T - I = rho + b_system + noise
@@ -14,21 +14,22 @@ the model's delay, p its unknown share, and sums over the satellites k of its gr
     s^2 = p^2 (I0 - M)^2 + (0.3 p I0)^2
     var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) p (I0 - M)
 
-as with known B a model that is too strong or too weak has the error p (I0 - M), and 0.3 p I0 from
-direction to direction. A group is the signals of one carrier of GPS, Galileo, BeiDou-3 or BeiDou-2;
-without pairs B = 0. So a satellite with one carrier, or a new one, has the model's delay at the
-level that the others measure.
+because with known B a model that is too strong or too weak has the error p (I0 - M), and another
+one of 0.3 p I0 in each direction. A group is the signals of one carrier of GPS, Galileo, BeiDou-3
+or BeiDou-2; without pairs B = 0. So a satellite with one carrier, or a new one, gets the model's
+delay, shifted to the level that the others measure.
 
-s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
-of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive while the
-distance grows); dt, ddt the satellite's clock offset and drift, d the signal's group delay; T, I
-troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
-D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
+s_t, v_t are the satellite's position and velocity at transmission, turned into the ECEF frame of
+the instant of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive
+while the distance grows); dt, ddt the satellite's clock offset and drift, d the signal's group
+delay; T, I troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s).
+The factor of D, worth up to 2 mm/s, is there because transmission time runs 1 - rhodot/c times as
+fast as reception time.
 
-A carrier is a range plus a constant: its length minus T, plus I0 (a phase is advanced as much as a
-code is delayed), with the satellite's clock, without group delay.
+A carrier gives a range plus a constant: its length minus T plus I0 (the ionosphere advances a phase
+as much as it delays a code), with the satellite's clock, without group delay.
 
-r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
+r is taken at the time of the receiver's clock: with an error of 1 ms it is off by 3 cm at 30 m/s.
 
 Variances: see `fusiond.gnss.ranges`. `LASTING` is the variance of errors that last for many minutes
 and belong to one satellite: orbit, clock, group delay, the local residual of the ionosphere, and
@@ -87,13 +88,13 @@ find metres on two makes of receivers."""
 _NEPERS = 0.1 * math.log(10.0)
 """A decibel of power as an exponent of e."""
 
-# What the plan says of each row.
+# Columns of the plan.
 SIGNAL_COLUMNS = 8
 (
     GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2, OWN_SLOT, OWN_ISSUE,
 ) = range(SIGNAL_COLUMNS)  # fmt: skip
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
-# Results; the first nineteen are what a measurement takes (fusiond.aiding.pseudorange).
+# Results; a measurement uses the first nineteen (fusiond.aiding.pseudorange).
 ROW_COLUMNS = 30
 RANGE_VALUES = 19
 (
@@ -115,7 +116,8 @@ NOISE_VALUES = 8
 def _take_off_ionosphere(
     signals: Array, carriers: Array, local: float, on_earth: bool, out: Array
 ) -> None:
-    """Determine each satellite's delay by model and carriers, and its residual."""
+    """Subtract each satellite's ionospheric delay by model and carriers; write its residual
+    variance."""
     n = signals.shape[0]
     weights, offsets, middles = np.zeros(n), np.zeros(n), np.zeros(n)
     for k in range(n):
@@ -213,11 +215,10 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (30, n) values of the satellites in the receiver's order.
+    """Write values (30, n) of the satellites, in the receiver's order.
 
-    `receiver` (3,) ECEF m, at GPS time `week`, `tow` of
-    its clock; returns the number of satellites below `least_elevation` (rad) or `least_cno` (dB
-    Hz).
+    `receiver` (3,) ECEF m, at GPS time `week`, `tow` of its clock. Returns the number of satellites
+    below `least_elevation` (rad) or `least_cno` (dB Hz).
 
     `states` (n, 8) of `choose`, `signals` (n, 8), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carrier_phase, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
@@ -241,11 +242,11 @@ def range_rows(
         x, y = xt, yt
         c, s = 1.0, 0.0
         distance = 0.0
-        for _ in range(2):  # unturned 27 m off, then 0.2 mm, then less than a nanometre
+        for _ in range(2):  # error 27 m without a turn, then 0.2 mm, then less than a nanometre
             dx, dy, dz = x - rx, y - ry, z - rz
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
             angle = EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S
-            c, s = 1.0 - 0.5 * angle * angle, angle  # 1e-5 rad: off by its cube over six, 1e-16
+            c, s = 1.0 - 0.5 * angle * angle, angle  # error angle^3 / 6, 1e-16
             x, y = c * xt + s * yt, c * yt - s * xt
         dx, dy, dz = x - rx, y - ry, z - rz
         distance = math.sqrt(dx * dx + dy * dy + dz * dz)

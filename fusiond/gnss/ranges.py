@@ -9,19 +9,19 @@ m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zeni
 noise at 45 dB-Hz (m), s_rx what the receiver states, s_sis orbit and clock, s_d the group delay
 left; r (m/s). If a receiver states none, C/N0 or s_rx is omitted.
 
-s_I is the unknown part of the ionosphere: with one carrier half the modelled delay, or 5 m m
+s_I is the unknown part of the ionosphere: with one carrier half the modelled delay, or 5 m times m
 without a model; with two the residual of `fusiond.gnss.range_kernel`. 0.12 m is the residual
-troposphere, s_2 the receiver's delay of BeiDou-2 relative to BeiDou-3. These are not noise: a model
-is too strong or too weak for the whole sky and for hours. So each has a column of its own, an
-unknown with unit variance (as in `fusiond.gnss.single_point`) or a state of a filter; 0.3 s_I is
-the part that differs between satellites.
+troposphere, s_2 the receiver's delay of BeiDou-2 relative to BeiDou-3. These errors are not noise,
+since a model is too strong or too weak for the whole sky and for hours. So each has its own column:
+an unknown with unit variance (as in `fusiond.gnss.single_point`), or a state of a filter. 0.3 s_I
+is the part that differs between satellites.
 
-a and b are those of `RangeNoise` until satellites with two carriers have shown this receiver's
+a and b are those of `RangeNoise` until satellites with two carriers have shown the receiver's own
 (`fusiond.gnss.carrier_phase`).
 
 Choice of a satellite's signals: `fusiond.gnss.signal_choice`.
 
-Refusals, by satellite, beside those of the plan: `weak_signal`, `low_elevation`, `multipath` (the
+Refusals of satellites, besides those of the plan: `weak_signal`, `low_elevation`, `multipath` (the
 code has diverged from its carrier); of carriers, which then wait for a new anchor, `lock_lost`,
 `cycle_slip`, and of all at once `clock_jump`.
 """
@@ -61,7 +61,7 @@ PLAN_HOLDS_S = 10.0
 
 
 class _Of:
-    """A view (n,) or (n, 3) of the values of rows."""
+    """Attribute that views values (n,) or (n, 3) of rows."""
 
     def __init__(self, which: int | slice) -> None:
         self._which = which
@@ -84,8 +84,8 @@ class Rows:
     `total_variance` (n,) of both; `carrier_m` (n,) the carrier as a range plus a constant, NaN
     without one, tracked for `span_s` (n,); `troposphere_m` and `ionosphere_m` (n,) have been
     subtracted; `refused` pairs of satellite and reason. `lasting` (n,) m^2 the part of `variance`
-    that lasts for many minutes. `values` (30, n) has all of them, as `range_kernel.range_rows`
-    writes it.
+    that lasts for many minutes. `values` (30, n) has all of these, as written by
+    `range_kernel.range_rows`.
     """
 
     satellites: tuple[str, ...]
@@ -116,12 +116,12 @@ class Rows:
 
     @property
     def azimuth_rad(self) -> Array:
-        """Azimuth (n,), from north to east, 0 .. 2 pi."""
+        """Azimuth (n,) from north to east, 0 .. 2 pi."""
         found: Array = np.arctan2(self.values[rk.EAST], self.values[rk.NORTH]) % (2.0 * np.pi)
         return found
 
     def only(self, keep: npt.NDArray[np.bool_]) -> Rows:
-        """Satellites marked in `keep` (n,)."""
+        """Rows of the satellites marked in `keep` (n,)."""
         return Rows(
             tuple(compress(self.satellites, keep)),
             tuple(compress(self.signals, keep)),
@@ -133,15 +133,13 @@ class Rows:
         )
 
     def without(self, satellites: Collection[str]) -> Rows:
-        """Rows without some satellites."""
+        """Rows without the named satellites."""
         return self.only(np.array([s not in satellites for s in self.satellites], bool))
 
 
 class ChosenSignals(NamedTuple):
-    """Chosen signals of an epoch.
-
-    `measured` (n, 7) as the receiver states them, the `second` ones (n, 7), NaN where absent, and
-    the satellites' `states` (n, 8) as they sent the first."""
+    """Chosen signals of an epoch: (n, 7) as `measured`, and the `second` ones (n, 7), NaN if
+    absent; `states` (n, 8) of the satellites as they sent the first."""
 
     plan: SignalChoice
     week: int
@@ -154,9 +152,9 @@ class ChosenSignals(NamedTuple):
 class TrackedSignals(NamedTuple):
     """Chosen signals with the results of their carriers (n, 6).
 
-    All that is independent of the receiver's position: the carriers' results after earlier epochs,
+    These parts do not depend on the receiver's position: the carriers' results by earlier epochs,
     the factors on the model's sigmas of codes, the carriers without a result, with the reason, and
-    the codes (n,) that have diverged from their carriers; None: none."""
+    the codes (n,) that have diverged from their carriers (None: none)."""
 
     picked: ChosenSignals
     carriers: Array
@@ -166,12 +164,12 @@ class TrackedSignals(NamedTuple):
 
 
 def initial_carriers() -> Array:
-    """Carriers before the first epoch."""
+    """State of the carriers before the first epoch."""
     return np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
 
 class RangeModel:
-    """Converter of epochs to rows, with the ephemerides of a store."""
+    """Converter of epochs to rows, by the ephemerides of a store."""
 
     def __init__(self, store: EphemerisStore, options: RangeOptions | None = None) -> None:
         self.store = store
@@ -182,15 +180,15 @@ class RangeModel:
         self._kept = initial_carriers()
 
     def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
-        """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
+        """Rows for a receiver at about (3,) ECEF m; an error of 100 m changes a correction by 1 cm.
 
-        A receiver nearer to the earth's centre than its surface is a first guess: elevations are
-        then 90 deg and the atmosphere is left out. Epochs are to come in the order of time.
+        A receiver below the earth's surface is a first guess: then elevations are 90 deg and the
+        atmosphere is neglected. Call it in the order of time.
         """
         return self.evaluate(self.followed(epoch), receiver)
 
     def followed(self, epoch: RawGnssEpoch) -> TrackedSignals:
-        """Epoch followed from earlier ones."""
+        """Signals of an epoch, tracked from earlier ones."""
         return self.follow(self.pick(epoch), self._kept)
 
     def pick(self, epoch: RawGnssEpoch) -> ChosenSignals:

@@ -1,15 +1,16 @@
 """Cached choice of an epoch's signals, valid until signals or ephemerides change.
 
-One signal of each satellite serves as range and carrier, a second one for its slant delay
-(`fusiond.gnss.carrier_phase`): of all pairs with known group delays the one whose ionosphere-free
-range is the least uncertain; without a pair the first of `PREFERRED` that is there.
+One signal of each satellite is used as range and carrier, a second one for its slant delay
+(`fusiond.gnss.carrier_phase`). They are the pair, of all with known group delays, whose
+ionosphere-free range has the smallest variance; without a pair the first available signal of
+`PREFERRED` is used alone.
 
     variance = (gamma^2 (s^2 + s_a^2) + s^2 + s_b^2) / (gamma - 1)^2,   gamma = (f_a / f_b)^2
 
-s of a code, s_a and s_b what stays unknown of the group delays.
+s is the sigma of a code, s_a and s_b are those of the group delays.
 
-Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
-its signals, or of none that is preferred), `no_correction` (of a system that goes by a service's:
+Refusals of satellites: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (for all
+its signals, or all preferred ones), `no_correction` (in a system that uses a service's:
 fusiond.gnss.corrections).
 """
 
@@ -72,15 +73,15 @@ tenfold, and receiver delays to metres."""
 
 @immutable()
 class RangeNoise:
-    """One sigma of the terms above.
+    """Noise of ranges and rates: one sigma of each term.
 
     `multipath_m`: RTCA DO-229D J.2.4 has 0.13 + 0.53 exp(-E / 10 deg) m on an aircraft; a vehicle
     drives between walls. `thermal_m`: code tracking of a 1 Hz loop at 45 dB-Hz (Groves 9.3.3). With
-    both and the receiver's own sigma the residuals of a walk with a hand-held antenna in the open
-    have 0.19 of the expected mean square: conservative, as errors there last for minutes.
-    `rate_m_s`: oscillator and walking antenna; 0.02 m/s are the signal's own at 45 dB-Hz.
-    `ionosphere_share`: a Klobuchar model takes out at least half (IS-GPS-200N 20.3.3.5.2.5);
-    without a model 5 m at the zenith, as on an afternoon of an active sun at middle latitudes.
+    both and the receiver's own sigma the mean square residual of a walk with a hand-held antenna in
+    the open is 0.19 of the expected one: conservative, because errors there last for minutes.
+    `rate_m_s`: oscillator and moving antenna; the signal itself has 0.02 m/s at 45 dB-Hz.
+    `ionosphere_share`: a Klobuchar model removes at least half (IS-GPS-200N 20.3.3.5.2.5); without
+    a model 5 m at the zenith, as in middle latitudes on an afternoon with an active sun.
     """
 
     multipath_m: float = 0.5
@@ -109,7 +110,7 @@ class RangeNoise:
 
 @immutable()
 class RangeOptions:
-    """Masks and choices. `systems`: which to use."""
+    """Masks and choices of ranges. `systems`: the systems to use."""
 
     systems: tuple[System, ...] = SYSTEMS
     elevation_mask_rad: float = np.radians(10.0)
@@ -140,8 +141,8 @@ class SignalChoice(NamedTuple):
 
 
 class _Served(NamedTuple):
-    """Signals of a satellite: the range, the second for the ionosphere, its group (system,
-    BeiDou-2, carrier), and its rows of the plan without the group's."""
+    """Chosen signals of a satellite: for the range, and for the ionosphere; group (system,
+    BeiDou-2, carrier); and the satellite's rows of the plan, without the group's."""
 
     at: int
     second: int | None
@@ -153,14 +154,14 @@ class _Served(NamedTuple):
 
 
 class SignalChooser:
-    """Factory of plans with the ephemerides of a store."""
+    """Factory of plans, by the ephemerides of a store."""
 
     def __init__(self, store: EphemerisStore, options: RangeOptions) -> None:
         self.store = store
         self.options = options
 
     def plan(self, epoch: RawGnssEpoch, now: float) -> SignalChoice:
-        """Plan for an epoch at `now` (s of GPS time)."""
+        """Plan for an epoch at GPS time `now` (s)."""
         by_satellite: dict[tuple[System, int], dict[str, int]] = {}
         all_signals = tuple(epoch.signals)
         for k, s in enumerate(all_signals):
@@ -201,7 +202,7 @@ class SignalChooser:
     def _corrected(
         self, epoch: RawGnssEpoch, satellites: dict[tuple[System, int], dict[str, int]]
     ) -> dict[System, dict[int, CorrectedEphemeris]]:
-        """Satellites with corrections, by system."""
+        """Corrected satellites by system."""
         found: dict[System, dict[int, CorrectedEphemeris]] = {}
         if not self.store.corrections:
             return found
@@ -312,8 +313,8 @@ class SignalChooser:
         return _Served(index, second, ephemeris, group, fixed, followed, columns)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
-        """Ionosphere model and its scale to the signal's frequency: the system's own, else any
-        received one. Of BeiDou's two models BDGIM, which covers the whole earth."""
+        """Ionosphere model, with its scale to the signal's frequency: the system's own, else any
+        received one. For BeiDou BDGIM is preferred, which covers the whole earth."""
         have = self.store.ionosphere
         carrier = CARRIER_HZ[signal.system, signal.signal[0]]
         if self.store.bdgim is not None and (signal.system == "C" or "G" not in have):
@@ -336,14 +337,14 @@ class SignalChooser:
 
 
 def _by_bias(applied: CorrectedEphemeris, signal: str) -> GroupDelay:
-    """Group delay that represents a bias, which is added to the range."""
+    """Group delay equivalent to a bias, which is added to the range."""
     return GroupDelay(-applied.bias[signal] / SPEED_OF_LIGHT_M_S)
 
 
 def _fixed(chosen: Sequence[_Served], issues: Sequence[int]) -> list[tuple[float, ...]]:
-    """Rows of the plan with the numbers of their groups. The receiver's delay between carriers is
-    part of the clock, if satellites with two carriers determine it; a satellite with one other
-    carrier does not share it."""
+    """Rows of the plan with the numbers of their groups. If satellites with two carriers determine
+    the clock, it includes the receiver's delay between the carriers; a satellite with a single
+    other carrier does not share that delay."""
     numbers: dict[tuple[System, bool, str], int] = {}
     paired: dict[tuple[System, bool], set[str]] = {}
     for s in chosen:
@@ -368,5 +369,5 @@ def _gamma(a: RawSignal, b: RawSignal) -> float:
 
 
 def _number(a: str, b: str) -> int:
-    """Positive number of a pair of signals."""
+    """Number, above 0, of a pair of signals."""
     return int.from_bytes((a + b).encode("ascii"))

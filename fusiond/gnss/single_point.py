@@ -3,24 +3,24 @@ r"""Least-squares position, velocity and clocks from a single epoch.
     y - rho(x) = H [dr, b, n] + noise,   H = [-l, clock columns, S],   n ~ N(0, I)
     dx = N^-1 H^T W (y - rho),   N = H^T W H + diag(0, .., 0, 1, 1, 1)
 
-l (n, 3) lines of sight, one clock offset for each present system, W = 1 / sigma^2; S n is the
-residual of ionosphere and troposphere common to the whole sky, and BeiDou-2's offset, with priors
-of their sigmas (`fusiond.gnss.ranges.Rows.common`). Iterated until the step is under 1 mm, from the
-earth's centre if nothing better is known. Velocity and drift the same way from the rates, with one
-drift. Residual test: the sum of squares over sigma^2, and |n|^2, against chi^2 with as many degrees
-of freedom as there are rows more than positions and clocks; while it fails, the row with the
-largest normalised residual
+l (n, 3) are lines of sight; there is one clock offset for each present system; W = 1 / sigma^2. S n
+is the residual of ionosphere and troposphere common to the whole sky, and BeiDou-2's offset, with
+their sigmas as priors (`fusiond.gnss.ranges.Rows.common`). The iteration starts at the earth's
+centre if no position is known, and ends with a step under 1 mm. The rates give velocity and one
+drift in the same way. Residual test: the sum of squares over sigma^2, and |n|^2, against chi^2 with
+as many degrees of freedom as there are rows more than positions and clocks; while it fails, the row
+with the largest normalised residual
 
     w_k = r_k / sqrt(S_kk),   S = W^-1 - H N^-1 H^T
 
-is taken out (`residual`), as long as one row more than unknowns is left.
+is removed (`residual`), as long as more rows than unknowns remain.
 
 Dilution of precision, from Q = (H^T H)^-1 with position in north-east-down:
 
     HDOP^2 = q_nn + q_ee,  VDOP^2 = q_dd,  PDOP^2 = HDOP^2 + VDOP^2
     TDOP^2 = sum of the clocks' q,  GDOP^2 = PDOP^2 + TDOP^2
 
-With several clocks TDOP is that of all of them, so GDOP^2 stays the trace of Q.
+With several clocks TDOP includes all of them, so that GDOP^2 is still the trace of Q.
 
 Source: Groves, 2nd edition, 9.4.1 and 9.4.3, residual test 17.4; Baarda, A Testing Procedure
 for Use in Geodetic Networks (1968), whose level of 0.001 is kept.
@@ -79,13 +79,13 @@ class SinglePoint(NamedTuple):
 
     @property
     def consistent(self) -> bool:
-        """True if the residual test passes; without redundancy there is nothing to test."""
+        """True if the residual test passes, or if there is no redundancy to test."""
         return self.redundancy == 0 or self.statistic <= self.bound
 
 
 def design(line_of_sight: Array, system: npt.NDArray[np.intp]) -> tuple[Array, list[int]]:
-    """Design matrix H (n, 3 + clocks) of positions and clocks, and the index of each clock's
-    system."""
+    """Design matrix H (n, 3 + clocks) of position and clocks, and the system index of each
+    clock."""
     present = sorted(set(system.tolist()))
     h = np.zeros((len(system), 3 + len(present)))
     h[:, :3] = -line_of_sight
@@ -119,7 +119,7 @@ class _Fit(NamedTuple):
 def single_point(
     model: RangeModel, epoch: RawGnssEpoch | TrackedSignals, guess: Array | None = None
 ) -> SinglePoint | str:
-    """Solve one epoch; `too_few`, `geometry` or `diverged` if there is no solution.
+    """Solve one epoch; returns `too_few`, `geometry` or `diverged` without a solution.
 
     `guess` (3,) ECEF m: approximate position of the receiver.
     """

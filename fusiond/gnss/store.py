@@ -1,11 +1,11 @@
-"""Broadcast ephemerides by satellite: choice of the valid one, or the reason for none.
+"""Store of broadcast ephemerides: the valid one of a satellite, or the reason for none.
 
     |t - toe| <= limit        t, toe in GPS time
 
-The closest toe is used. The last issues of a satellite are stored, so that a delayed measurement at
-a changeover still has the older one. A number given to another satellite shows by an impossible
-change of orbit: data of the old one are then dropped. Health is the satellite's last statement, for
-any issue.
+The ephemeris with the closest toe is used. The last issues of a satellite are stored, so that a
+delayed measurement at a changeover can still use the older one. An impossible change of orbit shows
+that the number was given to another satellite: the old one's data are dropped. Health is the
+satellite's last statement, whatever its issue.
 
 Outcomes: `no_ephemeris`, `unhealthy`, `stale_ephemeris`.
 """
@@ -73,7 +73,7 @@ class EphemerisStore:
         return len({key[:2] for key in self._kept})
 
     def add(self, message: NavigationMessage) -> None:
-        """Add a decoded message; a repetition only updates its instant."""
+        """Store a decoded message; a repetition only updates its instant."""
         if isinstance(message, Correction):
             self.corrections.add(message)
             self.version += 1
@@ -109,7 +109,8 @@ class EphemerisStore:
             self.version += 1
 
     def _of_another(self, message: Ephemeris) -> bool:
-        """True if the last ephemeris of that number is of another orbit: of another satellite."""
+        """True if the last ephemeris of that number has another orbit, so belongs to another
+        satellite."""
         kept = self._kept.get((message.system, message.prn, message.message))
         if not kept or (kept[-1].week, kept[-1].toe_s) == (message.week, message.toe_s):
             return False
@@ -120,14 +121,14 @@ class EphemerisStore:
         return bool(np.linalg.norm(old - new) > OTHER_ORBIT_M)
 
     def delay(self, ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
-        """Group delay of a signal by all data of its satellite; None if unknown."""
+        """Group delay of a signal, by all data of its satellite; None if unknown."""
         sent = self._delays.get((ephemeris.system, ephemeris.prn))
         return group_delay(ephemeris, signal, sent)
 
     def corrected(
         self, system: System, prn: int, week: int, tow_s: float
     ) -> CorrectedEphemeris | None:
-        """Ephemeris with the correction valid at a GPS time; None without one."""
+        """Ephemeris with the correction that is valid at a GPS time; None without one."""
         issue = self.corrections.issue(system, prn, week, tow_s)
         if issue is None:
             return None
@@ -144,8 +145,8 @@ class EphemerisStore:
     ) -> Ephemeris | Missing:
         """Ephemeris for a GPS time, or the reason for its absence.
 
-        `band` (first character of a signal): Galileo's clock for E5a is that of F/NAV, BeiDou's
-        delays for B1C and B2a are in B-CNAV; without it D1 is given, which has none.
+        `band` is the first character of a signal: Galileo's clock for E5a is that of F/NAV, and
+        BeiDou's delays for B1C and B2a are in B-CNAV; without `band` D1 is chosen, which has none.
         """
         outcome: Missing = "no_ephemeris"
         for message in _MESSAGES.get((system, band), _OTHERS[system]):

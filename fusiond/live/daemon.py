@@ -282,7 +282,7 @@ class Daemon:
                 case StartRecording():
                     return f"recording into {self.recorder.begin()}"
                 case StopRecording():
-                    return f"recorded {self.recorder.end('an operator said so')}"
+                    return f"recorded {self.recorder.end('by a command')}"
         except RecordingRefusedError as error:
             raise CommandRefusedError(str(error)) from error
         t_ns = self.clock.now_ns()
@@ -350,7 +350,7 @@ def run_daemon(
 
     try:
         if not config.sources:
-            raise ConfigError("sources: there is none: add [sources.imu] with a driver")
+            raise ConfigError("No [sources]: add [sources.imu] with a driver")
         if missing and not kernels_can_be_kept():
             log.warning("compiling %d kernels, at each start: %s", len(missing), _NOT_KEPT)
             for load in missing:

@@ -79,7 +79,7 @@ class CommandIntake:
         if self._limiting:
             return None
         self._limiting = True
-        text = f"too many commands: {RATE_HZ:.0f} a second are taken, the rest is not answered"
+        text = f"too many commands: {RATE_HZ:.0f} a second are executed, others get no reply"
         return self._reply(name, None, False, text)
 
     def _answer(self, name: str, payload: bytes, retained: bool) -> Answer:
@@ -97,7 +97,9 @@ class CommandIntake:
                 raise CommandRefusedError("not listed in mqtt.commands of the configuration")
             if (name, sent_id) in self._done:
                 self._counters["mqtt_commands_repeated"] += 1
-                text = "carried out already under this id: nothing done; a new command has a new id"
+                text = (
+                    "already executed under this id: nothing done; use a new id for a new command"
+                )
                 raise CommandRefusedError(text)
             said = self._handler(command)
             ok = True

@@ -347,7 +347,7 @@ class MqttPublisher:
             await client.unsubscribe(addresses)
             honour_cancellation()
             most = f"{incoming_publications.MESSAGES.per_s:.0f} a second"
-            text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
+            text = f"more messages for the daemon than {most}: not listening for {quiet_s:.0f} s"
             self._on_event("mqtt_flooded", text)
             await asyncio.sleep(quiet_s)
             coming.over()

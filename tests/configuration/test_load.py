@@ -76,13 +76,13 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         ("[mqtt]\nhost = 3", "mqtt.host = 3: expected text in quotes"),
         (
             '[mqtt]\nhost = "mqtt://10.0.0.1:1883"',
-            'mqtt.host = "mqtt://10.0.0.1:1883": a name or an address alone:'
-            " no scheme, port or path",
+            'mqtt.host = "mqtt://10.0.0.1:1883": give a name or an address only,'
+            " without scheme, port or path",
         ),
         (
             '[outputs.gpsd]\nhost = "127.0.0.1:2947"',
-            'outputs.gpsd.host = "127.0.0.1:2947": a name or an address alone:'
-            " no scheme, port or path",
+            'outputs.gpsd.host = "127.0.0.1:2947": give a name or an address only,'
+            " without scheme, port or path",
         ),
         ("state_file = 3", "state_file = 3: expected a path in quotes"),
         ("imu = 3", "imu = 3: expected a section"),

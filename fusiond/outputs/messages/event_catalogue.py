@@ -118,8 +118,8 @@ RECEIVERS: Mapping[str, Entry] = {
         "RMC has an unknown status; its velocity is not used.", "Check the firmware."
     ),
     "two_receivers": warning("Two receivers send on one line.", "Give each a port of its own."),
-    "course_missing": info("Speeds have no course, fixes no velocity.", "Switch the course on."),
-    "speed_held_at_zero": info("Slow speeds are printed as 0.", "Switch static navigation off."),
+    "course_missing": info("Speeds without course: no velocity.", "Switch on the course in RMC."),
+    "speed_held_at_zero": info("A receiver prints 0 when slow.", "Switch static navigation off."),
 }
 
 TERMINAL: Mapping[str, Entry] = {
@@ -176,7 +176,7 @@ MESSAGES: Mapping[str, Entry] = {
         "The card may not send messages.", "Have the service activated."
     ),
     "message_unsayable": warning(
-        "A message has characters that cannot be sent.", "Use other characters."
+        "The terminal cannot encode a message.", "Check card number and characters."
     ),
     "message_crc": warning("A message arrived damaged.", "Ask for it again."),
     "message_cut": warning("A message arrived incomplete.", "Ask for it again."),
