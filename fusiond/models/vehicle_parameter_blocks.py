@@ -25,8 +25,11 @@ BAROMETER_SCALE = "barometer_scale"
 BAROMETER_AIRFLOW = "barometer_airflow"
 
 # Random walk (s per root second) of a time offset: a serial line's load moves it by milliseconds in
-# minutes.
+# minutes, and two crystals part by as much.
 TIME_WALK_S_SQRT_S = 1e-3
+# The same beside a state of the rate: a crystal that warms by 10 K in five minutes gets 20 ppm off
+# its rate, and its time 3 ms off that rate's line.
+RATED_TIME_WALK_S_SQRT_S = 2e-4
 # One sigma of how much faster one of two clocks runs: crystals are within 50 ppm of each other,
 # ceramic resonators within 0.5 %, and NTP slews a host's clock by 500 ppm. The unit of drive_0708
 # and its receiver part by 250 ppm.
@@ -63,8 +66,8 @@ def wheel_rounding_block(name: str, sd: float) -> Block:
 
 def time_offset_block(name: str, sd_s: float, skew: str = "") -> Block:
     """Delay (s) of validity after its stamp; `skew` names the block of its rate."""
-    walk = TIME_WALK_S_SQRT_S**2
-    return Block(name, "s", ("t",), (-1,), initial=sd_s, white=walk, rate=skew)
+    walk = RATED_TIME_WALK_S_SQRT_S if skew else TIME_WALK_S_SQRT_S
+    return Block(name, "s", ("t",), (-1,), initial=sd_s, white=walk**2, rate=skew)
 
 
 def clock_skew_block(name: str) -> Block:

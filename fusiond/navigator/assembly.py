@@ -6,7 +6,7 @@ one runs. Each is imported on demand, as loading its kernels takes long.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from typing import TYPE_CHECKING
 
 from fusiond.configuration.aiding import GnssAiding
@@ -22,7 +22,12 @@ from fusiond.integrity.consistency_monitors import Verdicts
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle_parameter_blocks import ANTENNA_LEVER, CLOCK_SKEW, FIX_MARKOV
+from fusiond.models.vehicle_parameter_blocks import (
+    ANTENNA_LEVER,
+    CLOCK_SKEW,
+    FIX_MARKOV,
+    time_offset_block,
+)
 from fusiond.navigation.crosstalk_noise import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
@@ -51,14 +56,20 @@ def fitting(
         return make(extra)
     except TooManyStatesError as error:
         for unasked in (_skews, _wanders, _unasked, _carriers):
-            asked = [block for block in extra if not unasked(config, block)]
-            if len(asked) < len(extra):
-                return fitting(config, asked, make)
+            left_out = {block.name for block in extra if unasked(config, block)}
+            if left_out:
+                asked = [block for block in extra if block.name not in left_out]
+                return fitting(config, [_unrated(block, left_out) for block in asked], make)
         names = ", ".join(block.name for block in extra)
         raise ConfigError(
             f"estimator.model: {error}; the measurements add {names}: choose a smaller model,"
             " such as 'ins15', or fewer sections [aiding]"
         ) from error
+
+
+def _unrated(block: Block, left_out: Set[str]) -> Block:
+    """Block whose rate may be among those that are `left_out`: a time offset then walks more."""
+    return time_offset_block(block.name, block.initial) if block.rate in left_out else block
 
 
 def _skews(_: Config, block: Block) -> bool:

@@ -37,7 +37,7 @@ from fusiond.simulation.trajectories import Leg, follow
 from tests import runs
 
 Array = NDArray[np.float64]
-RATE_HZ, SECONDS = 50.0, 180.0
+RATE_HZ, SECONDS = 50.0, 210.0
 START_NS = 7_003 * runs.SECOND
 # What the owner does not know: the sensor is turned by so much (deg), wheels say 1.5 % too much.
 PITCH_DEG, YAW_DEG, SCALE = -3.0, 4.0, 0.015
