@@ -6,8 +6,9 @@ format; ASAM MDF 4.
 
 from __future__ import annotations
 
-import codecs
 import re
+
+from fusiond.files.log_bytes import utf_16
 
 FORMATS = (".log", ".asc", ".blf", ".trc", ".mf4")
 LOOKED_AT = 4096
@@ -22,7 +23,13 @@ _OTHERS = (
     ("***BUSMASTER", "a log of BUSMASTER"),
     ("Time Stamp,ID,Extended", "a table of SavvyCAN"),
     ("\n\r\r\n", "a capture of a network (pcapng)"),
+    ("PK\x03\x04", "a zip archive"),
+    ("\xfd7zXZ", "an xz file"),
+    ("BZh", "a bzip2 file"),
+    ("\x28\xb5\x2f\xfd", "a zstd file"),
+    ("7z\xbc\xaf", "a 7z archive"),
 )
+_PACKED = ("PK", "\xfd7z", "BZh", "\x28\xb5", "7z")
 _REMEDY = "save it as one of candump -L, ASC, BLF, TRC or MF4"
 
 
@@ -39,9 +46,9 @@ def foreign_kind(head: bytes) -> str:
     """Sentence on a log of a program whose format is not read; "" if unknown."""
     text = _text(head)
     name = next((name for begins, name in _OTHERS if text.startswith(begins)), "")
-    return f"this is {name}: {_REMEDY}" if name else ""
+    remedy = "unpack it, or pack it with gzip" if text.startswith(_PACKED) else _REMEDY
+    return f"this is {name}: {remedy}" if name else ""
 
 
 def _text(head: bytes) -> str:
-    marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return head.decode("utf-16" if marked else "latin-1", "replace").removeprefix("ï»¿")
+    return head.decode(utf_16(head) or "latin-1", "replace").removeprefix("ï»¿")

@@ -11,11 +11,9 @@ are taken as python-can does.
 from __future__ import annotations
 
 import contextlib
-import gc
 import gzip
 import importlib.util
 import logging
-import sys
 import time
 import zlib
 from collections import Counter
@@ -23,7 +21,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
-from drivers.can.python_can_import import can, with_mf4
+from drivers.can.python_can_import import can
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
 from fusiond.files.install_extra import install_command
 from fusiond.offline.blf_repair import DAY_S, Containers
@@ -40,6 +38,7 @@ from fusiond.offline.can_text_repair import (
     first_stamps,
     stamp_s,
 )
+from fusiond.offline.mf4_frames import Mf4Error, frames
 
 _GZIP = b"\x1f\x8b"
 _MOST_NAMED = 20
@@ -245,17 +244,11 @@ def _mf4(
 ) -> Iterator[can.Message]:
     if importlib.util.find_spec("asammdf") is None:
         raise MissingPackageError(f"MF4 logs need the package asammdf: {install_command('mf4')}")
-    with_mf4()
     log.path.open("rb").close()
-    failure = ""
     try:
-        yield from can.MF4Reader(log.path)
-    except Exception as error:  # whatever asammdf raises for a file that is none
-        failure = f"{type(error).__name__}: {error}"
-    if failure:
-        lost.add(0, "cut", f"the log ends in damage: {failure}")
-        with _deleted_in_silence():
-            gc.collect()
+        yield from frames(log.path)
+    except Mf4Error as error:
+        lost.add(0, "cut", f"the log ends in damage: {error}")
 
 
 def _report_zone(log: _Log, start: Any, on_zone: Callable[[str, str], None]) -> None:
@@ -287,16 +280,6 @@ def _warned(call: Callable[[], None]) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagated
-
-
-@contextlib.contextmanager
-def _deleted_in_silence() -> Iterator[None]:
-    """Suppress the second error of asammdf's unopened file at its deletion."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
 
 
 class _Forwarded(logging.Handler):

@@ -4,7 +4,9 @@ A reader pulls line after line. Before that, encoding and blocks of zeros (left 
 after a loss of power) are repaired here, and forms that python-can does not read are converted:
 
     candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
+    dates, raw length codes    candump -L -t A, -8: (2026-03-24 07:33:02.1) can0 7E8#0341..._9
     stamps as differences      candump -t d, ASC "timestamps relative": summed
+    months of another Windows  ASC "date Di Mrz 24 ...": in English
     stamps before the trigger  ASC -0.5: without the sign, which `before_trigger_s` remembers
     decimal commas             ASC and TRC 0,5 of a German or French Windows
     CANFD without a channel    ASC "CANFD   Start of measurement" and the like: no frame
@@ -24,12 +26,13 @@ from datetime import datetime
 from itertools import islice, pairwise
 from typing import BinaryIO
 
+from fusiond.files.log_bytes import utf_16
+
 LONGEST = 16_384
 """Bytes of a line. A frame of CAN XL, the longest there is, has 2048 bytes: 6144 characters in the
 terminal's form."""
 SHOWN = 60
 """Characters shown of a refused line."""
-_BOMS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _ERROR_FRAME = 0x2000_0000
 """CAN_ERR_FLAG of the identifier of an error frame (linux/can.h)."""
 
@@ -118,19 +121,18 @@ class TextLines:
 
 
 def _decoded(stream: BinaryIO) -> BinaryIO:
-    """Convert UTF-16 with a mark (PowerShell's `>`) to UTF-8, and carriage returns alone to line
-    feeds."""
+    """Convert UTF-16 (PowerShell's `>`) to UTF-8, and carriage returns alone to line feeds."""
     try:
         first = stream.read(LONGEST)
-        encoding = _BOMS.get(first[:2])
-        if encoding is None and (b"\r" not in first or b"\n" in first):
+        encoding = utf_16(first)
+        if not encoding and (b"\r" not in first or b"\n" in first):
             stream.seek(0)
             return stream
         whole = first + stream.read()
     except (EOFError, zlib.error, gzip.BadGzipFile):
         stream.seek(0)  # the first line will say so
         return stream
-    if encoding is not None:
+    if encoding:
         return io.BytesIO(whole.decode(encoding, "replace").encode())
     return io.BytesIO(whole.replace(b"\r", b"\n"))
 
@@ -140,9 +142,12 @@ def _decoded(stream: BinaryIO) -> BinaryIO:
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _TERMINAL = re.compile(
     r"\s*(?:\((?P<t>[^()]*)\)\s+)?(?P<channel>[^\s()]+)\s+(?:(?:RX|TX)(?:\s+[-A-Z])*\s+)?"
-    r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(?P<length>\d{1,4})\](?P<data>(?:\s+[0-9A-Fa-f]{2})*)"
-    r"(?P<rest>\s.*|$)"
+    r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+(?:\[(?P<length>\d{1,4})\]|\{[9A-F]\})"
+    r"(?P<data>(?:\s+[0-9A-Fa-f]{2})*)(?P<rest>\s.*|$)"
 )
+_COMPACT = re.compile(r"\s*\((?P<t>[^()]*)\)\s+(?=\S+\s+[0-9A-Fa-f]{3,8}#)")
+_RAW_LENGTH = re.compile(r"(?<=#)([0-9A-Fa-f]{16})_[9A-F](?=\s|$)")
+"""Eight bytes with a length code above 8 (CAN 2.0; `candump -8`)."""
 _FIRST_LINES = 1000
 """Lines examined for relative stamps; zero-based stamps never fall."""
 _BEGINS = 1.0
@@ -152,10 +157,11 @@ _BEGINS = 1.0
 class Candump:
     """Lines in the form of `candump -L`; the terminal's form is recognised by `[length]`."""
 
-    def __init__(self, stamps: list[float]) -> None:
-        """`stamps` of the first lines of the terminal's form."""
+    def __init__(self, stamps: list[float], *, is_dated: bool = False) -> None:
+        """`stamps` of the first lines."""
         self._differences = bool(stamps) and stamps[0] < _BEGINS and _fall_or_stand(stamps)
         self._sum_s = 0.0
+        self._converts = self._differences or is_dated
         self.unstamped = False
         """True if a frame without a time was found."""
 
@@ -163,7 +169,11 @@ class Candump:
         """The line in the form of a log."""
         if "\x1b" in line:
             line = _COLOUR.sub("", line)
-        if "[" not in line:
+        if "[" not in line and "{" not in line:
+            if self._converts:
+                line = self._restamped(line)
+            if "_" in line:
+                line = _RAW_LENGTH.sub(r"\1", line)
             hash_at = line.find("#")
             if hash_at >= 0 and "." in line[hash_at:]:  # 123#11.22.33, which canplayer reads
                 line = line[:hash_at] + line[hash_at:].replace(".", "")
@@ -176,14 +186,12 @@ class Candump:
         if found["t"] is None:
             self.unstamped = True
             return line
-        stamp = stamp_s(found["t"])
+        stamp = self._stamp_s(found["t"])
         if stamp is None:
             return line
-        if self._differences:
-            self._sum_s += max(0.0, stamp)
-            stamp = self._sum_s
         head = f"({stamp:.6f}) {found['channel']} {found['id']}#"
-        length, data = int(found["length"]), found["data"].split()
+        stated, data = found["length"] or "8", found["data"].split()
+        length = int(stated)
         if int(found["id"], 16) & _ERROR_FRAME:
             return _with_error_flag(head, len(head) - 1)
         if "remote request" in found["rest"]:
@@ -191,8 +199,22 @@ class Candump:
         if len(data) < length:
             return line
         # Two digits are CAN FD's, whose flags this form does not say.
-        fd = "#0" if len(found["length"]) > 1 else ""
+        fd = "#0" if len(stated) > 1 else ""
         return head + fd + "".join(data[:length])
+
+    def _restamped(self, line: str) -> str:
+        """Line of `candump -L` whose stamp is a date or a difference, with seconds."""
+        found = _COMPACT.match(line)
+        stamp = None if found is None else self._stamp_s(found["t"])
+        return line if found is None or stamp is None else f"({stamp:.6f}) {line[found.end() :]}"
+
+    def _stamp_s(self, text: str) -> float | None:
+        """Seconds of a stamp in brackets; None if it is none."""
+        stamp = stamp_s(text)
+        if stamp is None or not self._differences:
+            return stamp
+        self._sum_s += max(0.0, stamp)
+        return self._sum_s
 
 
 def _with_error_flag(line: str, hash_at: int) -> str:
@@ -218,23 +240,28 @@ def dated(stamp: str) -> bool:
 
 
 def first_stamps(stream: BinaryIO) -> list[str]:
-    """Stamps of the first lines in the terminal's form."""
+    """Stamps of the first lines."""
     lines = TextLines(stream, lambda line: line, lambda line, text: None)
-    first = islice(lines, _FIRST_LINES)
-    found = (_TERMINAL.fullmatch(_COLOUR.sub("", line).rstrip()) for line in first)
+    first = (_COLOUR.sub("", line).rstrip() for line in islice(lines, _FIRST_LINES))
+    found = (_TERMINAL.fullmatch(line) or _COMPACT.match(line) for line in first)
     return [each["t"] for each in found if each is not None and each["t"] is not None]
 
 
 def candump_of(stamps: list[str]) -> Candump:
     """Reader for a log with these first stamps."""
     seconds = [stamp_s(stamp) for stamp in stamps]
-    return Candump([s for s in seconds if s is not None])
+    found = [s for s in seconds if s is not None]
+    return Candump(found, is_dated=bool(stamps) and dated(stamps[0]))
 
 
 def _fall_or_stand(stamps: list[float]) -> bool:
-    """True if the stamps are differences: they fall, or are all alike from the second on."""
+    """True if the stamps are differences: they fall, and end no later than they have begun; or are
+    all alike from the second on. A log of two buses, each from its beginning, falls, too."""
     falls = any(after < before for before, after in pairwise(stamps))
-    return falls or (len(stamps) > 3 and stamps[1] > 0.0 and len(set(stamps[1:])) == 1)
+    half = len(stamps) // 2
+    grows = max(stamps[half:]) > max(stamps[: half + 1])
+    stands = len(stamps) > 3 and stamps[1] > 0.0 and len(set(stamps[1:])) == 1
+    return stands or (falls and not grows)
 
 
 # --------------------------------------------------------------------------- Vector's ASC
@@ -244,6 +271,23 @@ _RELATIVE = re.compile(r"\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
 _HEADER = re.compile(
     r"\s*(date\s+\w+\s|base\s|//|(no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE
 )
+_DATE = re.compile(r"(\s*date\s+)\S+\s+(?P<month>[^\W\d]+)\.?(?=\s)", re.IGNORECASE)
+_MONTHS = {
+    "Jan": "jan gen ene",
+    "Feb": "feb fev fév",
+    "Mar": "mar mär mrz mrt",
+    "Apr": "apr avr abr",
+    "May": "may mai mag mei",
+    "Jun": "jun giu juin",
+    "Jul": "jul lug juil",
+    "Aug": "aug ago aoû aou",
+    "Sep": "sep set",
+    "Oct": "oct okt ott out",
+    "Nov": "nov",
+    "Dec": "dec dez dic déc",
+}
+"""Beginnings of the months' names: English, German, French, Italian, Spanish, Portuguese, Dutch."""
+_ENGLISH = {name: month for month, names in _MONTHS.items() for name in names.split()}
 _HEADER_OVER = re.compile(r"\s*((no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE)
 _FD_EVENT = re.compile(r"\s*-?\d+[.,]\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
 HEADER_ENDS = "internal events logged"
@@ -291,6 +335,10 @@ class Asc:
         date in another language, and misses the lines after it."""
         self._relative |= _RELATIVE.match(line) is not None
         self.in_frames |= _HEADER_OVER.match(line) is not None
+        if found := _DATE.match(line):
+            word = found["month"].lower()
+            month = _ENGLISH.get(word[:4]) or _ENGLISH.get(word[:3], found["month"])
+            line = f"{found[1]}Thu {month}{line[found.end() :]}"
         return line if _HEADER.match(line) else None
 
     def _counted(self, found: re.Match[str], rest: str) -> str | None:

@@ -41,6 +41,19 @@ def test_what_powershell_wrote(encoding: str, tmp_path: Path) -> None:
     assert _of(tmp_path, (mark + text).encode(encoding)) == (text.encode(), [])
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_what_powershell_appended(encoding: str, tmp_path: Path) -> None:
+    text = "$GNGGA,073300.00,4712.0000,N*00\r\n"
+    assert _of(tmp_path, text.encode(encoding)) == (text.encode(), [])
+
+
+@pytest.mark.parametrize(
+    "data", [bytes(90), b"\x01\0" * 50, b"$\0" * 20, b"\xb5\0" * 50, b"$G\0\0" * 40]
+)
+def test_binary_with_zeros_is_no_text(data: bytes, tmp_path: Path) -> None:
+    assert _of(tmp_path, data)[0] == data
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [

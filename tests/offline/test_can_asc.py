@@ -123,7 +123,34 @@ def test_decimal_commas(stamps: str, tmp_path: Path, zone: Callable[[str], None]
     same(found, FRAMES, within_s=1e-3)
 
 
-@pytest.mark.parametrize("day", ["lun. juil. 25", "Mon Foo 25"])
+@pytest.mark.parametrize(
+    ("day", "days"),
+    [
+        ("Do Okt 9", 0),
+        ("Do. Dez. 9", 61),
+        ("So Mrz 9", -214),
+        ("So M\xe4r 9", -214),
+        ("mer. juil. 9", -92),
+        ("lun. juin 9", -122),
+        ("sam. ao\xfbt 9", -61),
+        ("gio ott 9", 0),
+        ("jue. ene. 9", -273),
+    ],
+)
+def test_dates_of_another_windows(
+    day: str, days: int, tmp_path: Path, zone: Callable[[str], None]
+) -> None:
+    zone("UTC")
+    path = asc(tmp_path / "bus.asc")
+    said = path.read_bytes().replace(b"Thu Oct 9", day.encode("cp1252"))
+    path.write_bytes(said)
+    found, refused, _ = read(path)
+    assert found[0].timestamp - FRAMES[0].timestamp == pytest.approx(days * 86_400.0)
+    assert len(found) == len(FRAMES)
+    assert refused.all() == []
+
+
+@pytest.mark.parametrize("day", ["lun. foo. 25", "Mon Foo 25"])
 def test_a_date_that_nobody_knows(day: str, tmp_path: Path) -> None:
     """What stands behind it is read: here that numbers are decimal."""
     header = f"date {day} 10:46:41.023 2021\nbase dec  timestamps absolute\n"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
+import lzma
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +35,9 @@ def _dotted(log: bytes) -> bytes:
         lambda log: re.sub(rb"(\.\d{3})\d{3}\)", rb"\1)", log),
         lambda log: log.replace(b"\n", b"\r"),
         lambda log: log.replace(b"\n", b" T\n"),
+        lambda log: re.sub(rb"(#[0-9A-F]{16})\n", rb"\1_9\n", log),
+        lambda log: log.decode().encode("utf-16-le"),
+        lambda log: log.decode().encode("utf-16-be"),
         gzip.compress,
     ],
 )
@@ -92,6 +97,9 @@ def test_content_counts_before_the_name(tmp_path: Path, kind: str, name: str) ->
         ),
         (b"\x0a\x0d\x0d\x0a\x1c\0\0\0", "a capture of a network"),
         (b"t7E880341\r", "candump writes logs with -L"),
+        (b"PK\x03\x04" + bytes(60), "this is a zip archive: unpack it"),
+        (bz2.compress(CANDUMP), "this is a bzip2 file: unpack it"),
+        (lzma.compress(CANDUMP), "this is an xz file: unpack it"),
     ],
 )
 def test_what_is_another_programs_is_named(tmp_path: Path, data: bytes, words: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,37 @@ def test_stamps_since_the_beginning_and_since_the_last_frame(tmp_path: Path) -> 
     assert [m.timestamp for m in read(between)[0]] == pytest.approx(first, abs=1e-3)
 
 
+def test_two_buses_of_one_file_are_no_differences(tmp_path: Path) -> None:
+    """Each counts from the beginning, and the file has a block of the one, then of the other."""
+    path = tmp_path / "zero.log"
+    lines = terminal(lambda t_s: delta(t_s - BEGIN_S))
+    blocks = [lines[k : k + 30] for k in range(0, len(lines), 30)]
+    path.write_text("\n".join(line for block in blocks for line in block * 2))
+    last = FRAMES[-1].timestamp - BEGIN_S
+    assert max(m.timestamp for m in read(path)[0]) == pytest.approx(last, abs=1e-5)
+
+
+@pytest.mark.parametrize("form", ["date", "difference"])
+def test_what_candump_logs_with_other_stamps(
+    form: str, tmp_path: Path, zone: Callable[[str], None]
+) -> None:
+    """`candump -L -t A` and `-t d`."""
+    zone("UTC")
+    path, last, lines = tmp_path / "bus.log", BEGIN_S, []
+    for m, line in zip(FRAMES, candump(iter(FRAMES)), strict=True):
+        day = datetime.fromtimestamp(m.timestamp)
+        stamp = f"{day:%Y-%m-%d %H:%M:%S.%f}" if form == "date" else f"{m.timestamp - last:010.6f}"
+        lines.append(f"({stamp}){line.partition(')')[2]}")
+        last = m.timestamp
+    path.write_text("\n".join(lines))
+    found, refused, told = read(path)
+    begin = BEGIN_S if form == "date" else 0.0
+    expected = [m.timestamp - BEGIN_S for m in FRAMES]
+    assert [m.timestamp - begin for m in found] == pytest.approx(expected, abs=1e-3)
+    assert refused.all() == []
+    assert len(told) == (form == "date")
+
+
 def test_dates_of_candump_are_of_this_computers_zone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zone: Callable[[str], None]
 ) -> None:
@@ -96,6 +128,8 @@ def test_dates_of_candump_are_of_this_computers_zone(
         (" (1.5)  can0  7E8  [12]  " + "AA " * 12, (0x7E8, False, b"\xaa" * 12)),
         (" (1.5)  can0  7E8  [02]  01 02", (0x7E8, False, b"\1\2")),
         (" (1.5)  can0  7E8   [0] ", (0x7E8, False, b"")),
+        (" (1.5)  can0  7E8   {C}  " + "AA " * 8, (0x7E8, False, b"\xaa" * 8)),
+        ("(1.5) can0 7E8#" + "AA" * 8 + "_C", (0x7E8, False, b"\xaa" * 8)),
         (" (1.5)  can0  7E8   [4]  remote request", "remote"),
         (" (1.5)  can0  20000004   [8]  00 01 00 00 00 00 00 00   ERRORFRAME", "error"),
         ("(1.5) can0 20000004#0001000000000000", "error"),

@@ -205,8 +205,9 @@ def test_rmc_status_that_tells_the_mode_leaves_velocity_and_time(status: str) ->
     assert fix.quality == 4
 
 
-def test_a_status_that_is_none_makes_rmc_count_for_nothing() -> None:
-    found, one = decode(GGA, changed(RMC, ",A,", ",Z,"))
+@pytest.mark.parametrize("status", ["Z", "a"])
+def test_a_status_that_is_none_makes_rmc_count_for_nothing(status: str) -> None:
+    found, one = decode(GGA, changed(RMC, ",A,", f",{status},"))
     (fix,) = fixes(found)
     assert (fix.quality, fix.v_ned_m_s) == (4, None)
     assert one.counters["unknown_status"] == 1
