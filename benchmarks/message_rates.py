@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ async def exchange(folder: Path, card_s: int, minutes: float) -> dict[str, Any]:
             await daemons[name].start()
             await daemons[name].ready()
         for name in CARDS:
-            await listener.until(lambda li, name=name: li.payloads(f"fusiond/{name}/nav"))
+            await listener.until(partial(Listener.payloads, topic=f"fusiond/{name}/nav"))
         before = {name: _counts(radio, name) for name in CARDS}
 
         async def killed_and_started() -> float:
