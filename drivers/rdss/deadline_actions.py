@@ -28,7 +28,6 @@ from drivers.rdss.state_tables import (
     BEAM_POLL_NS,
     BEAMS_STALE_NS,
     FEEDBACK_NS,
-    GIVE_UP_NS,
     POLL_NS,
     POLL_REPLY_NS,
     PROBE_NS,
@@ -121,11 +120,16 @@ class DeadlineActions:
 
     def _due_feedback(self, t_ns: int, actions: list[Action]) -> None:
         self.counters["timeout_feedback"] += 1
-        self._session.enter(State.AWAIT_FIX, (self._session.pace.requested_ns or t_ns) + GIVE_UP_NS)
+        self._session.await_fix()
 
     def _due_fix(self, t_ns: int, actions: list[Action]) -> None:
+        """AWAIT_FIX: a message while the fix is overdue, then the fix's end."""
         session = self._session
+        if session.deadline_ns is not None and t_ns < session.deadline_ns:
+            self._transmit(t_ns, actions)
+            return
         self.counters["timeout_fix"] += 1
+        session.fix_awaited = False
         session.timeouts += 1
         if session.timeouts == TIMEOUTS_ALARM:
             actions.append(
@@ -135,7 +139,7 @@ class DeadlineActions:
 
     def _due_message(self, t_ns: int, actions: list[Action]) -> None:
         self._session.outbox.unanswered()
-        self._session.enter(State.READY, None)
+        self._session.await_fix()
 
     def _due_blocked(self, t_ns: int, actions: list[Action]) -> None:
         """In HOLDING, SUPPRESSED and SILENT, only read until the hold is over, if it has an end."""
@@ -160,7 +164,7 @@ class DeadlineActions:
         if session.family is None or session.identity is None:
             session.search(t_ns)
             return
-        fix_due = t_ns >= session.pace.due_ns
+        fix_due = not session.fix_awaited and t_ns >= session.pace.due_ns
         message = session.outbox.next(t_ns) if t_ns >= session.pace.free_ns else None
         user = session.identity.user
         if message is not None and (session.turns.message_first or not fix_due):
@@ -203,7 +207,7 @@ class DeadlineActions:
         actions.append(Send(data, "request"))
         self.counters["requested"] += 1
         session.pace.written(t_ns, len(data), session.probe.baud, fix=True)
-        session.answerable = True
+        session.answerable = session.fix_awaited = True
         session.height_given = request.height_mode is not HeightMode.NONE
         session.height_sd_m = self.height.given_sd_m
         session.enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)

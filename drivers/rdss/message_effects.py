@@ -32,7 +32,6 @@ from drivers.rdss.state_tables import (
     BEAM_POLL_NS,
     DEFAULT_SERVICE_S,
     FIX_EXPECTED_NS,
-    GIVE_UP_NS,
     IN_FLIGHT,
     INBOUND_COMMANDS,
     MESSAGE_COMMANDS,
@@ -147,6 +146,7 @@ class MessageEffects:
 
     def _lose_beam(self, t_ns: int, actions: list[Action]) -> None:
         session = self._session
+        session.abandon()
         session.beam_reads = 0
         session.enter(State.NO_BEAM, t_ns + BEAM_POLL_NS)
         actions.append(Notice("rdss_no_beam", f"No beam to transmit on: {session.beams}"))
@@ -180,8 +180,7 @@ class MessageEffects:
             session.counters["accepted"] += 1
             self._refused.clear()
             session.permit.accepted()
-            if session.pace.requested_ns is not None:
-                session.enter(State.AWAIT_FIX, session.pace.requested_ns + GIVE_UP_NS)
+            session.await_fix()
         else:
             self._on_refusal(feedback, t_ns, actions)
 
@@ -198,7 +197,7 @@ class MessageEffects:
                 session.counters["late_feedback"] += 1
                 session.outbox.accepted(t_ns)
             return was_doubtful
-        session.enter(State.READY, None)
+        session.await_fix()
         if outcome is Outcome.OK:
             self._refused.clear()
             session.permit.accepted()
@@ -220,6 +219,7 @@ class MessageEffects:
         session.counters[refusal.counter] += 1
         self._refused[outcome] += 1
         self._forget_refused()
+        session.fix_awaited = False
         session.enter(State.READY, None)
         if outcome is Outcome.FREQUENCY:
             session.pace.too_early(t_ns, feedback.wait_s)
@@ -294,10 +294,11 @@ class MessageEffects:
             session.counters["slow_fix"] += 1
         if fix.multi_value:
             session.counters["multi_value"] += 1
+        if not session.fix_awaited:
+            session.counters["late_fix"] += 1
+        session.fix_awaited = False
         if session.state in IN_FLIGHT:
             session.enter(State.READY, None)
-        else:
-            session.counters["late_fix"] += 1
         time_of_day, uncertainty = fix.time_of_day_s, 0.005
         if fix.fraction is not None:
             part, uncertainty = self._fraction.read(fix.fraction)

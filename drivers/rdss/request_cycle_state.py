@@ -14,7 +14,6 @@ from drivers.rdss.probe import Probe
 from drivers.rdss.state_tables import (
     GIVE_UP_NS,
     HOLD_NS,
-    IN_FLIGHT,
     OFFLINE,
     SECOND,
     State,
@@ -28,8 +27,9 @@ class RequestCycleState:
     `levels` and `levels_ns`: beam levels and the instant of their reading; `beam_reads`: queries
     since then; `beams_said`: the last report of the beams. `answerable`: the last request may
     still bring a fix; `height_given`: it gave a height, of sigma `height_sd_m` (None: unknown).
-    `timeouts`: requests in a row without a fix. Spacing (`pace`), suppression and silence
-    (`permit`) and messages (`outbox`) outlive the line.
+    `fix_awaited`: it has neither brought one, nor been refused, nor been given up; a message may
+    be under way meanwhile. `timeouts`: requests in a row without a fix. Spacing (`pace`),
+    suppression and silence (`permit`) and messages (`outbox`) outlive the line.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str]) -> None:
@@ -47,6 +47,7 @@ class RequestCycleState:
         self.levels_ns: int | None = None
         self.beam_reads = 0
         self.answerable = False
+        self.fix_awaited = False
         self.height_given = False
         self.height_sd_m: float | None = None
         self.timeouts = 0
@@ -110,5 +111,13 @@ class RequestCycleState:
         waits, to avoid a delayed reply."""
         if self.state is State.AWAIT_MESSAGE:
             self.outbox.unanswered()
-        if self.state in IN_FLIGHT and self.pace.requested_ns is not None:
+        if self.fix_awaited and self.pace.requested_ns is not None:
             self.pace.not_before(self.pace.requested_ns + GIVE_UP_NS)
+        self.fix_awaited = False
+
+    def await_fix(self) -> None:
+        """Wait for the fix of the last request until it is given up, or be ready without one."""
+        if self.fix_awaited and self.pace.requested_ns is not None:
+            self.enter(State.AWAIT_FIX, self.pace.requested_ns + GIVE_UP_NS)
+        else:
+            self.enter(State.READY, None)

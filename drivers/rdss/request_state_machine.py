@@ -12,8 +12,9 @@ the actions they return, and `next_deadline_ns`, when to call `tick` next. Only 
 
 Never sent are a lift of radio silence and an emergency request. A request or a message is not sent
 while another is in flight, before the card's service interval has passed since the previous one,
-while the terminal is suppressed or silent, or without the option `transmit`. If a request and a
-message both wait, `outbox.StrideScheduler` decides. Figures: PROTOCOLS 1.1 and 1.5.
+while the terminal is suppressed or silent, or without the option `transmit`. An overdue fix holds up
+the next request, until it is given up, but no message. If a request and a message both wait,
+`outbox.StrideScheduler` decides. Figures: PROTOCOLS 1.1 and 1.5.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ from drivers.rdss.request_cycle_state import RequestCycleState
 from drivers.rdss.request_height import HeightSource
 from drivers.rdss.state_tables import (
     DETAIL,
-    IN_FLIGHT,
+    FIX_EXPECTED_NS,
+    NEVER_NS,
     READ_ONLY_DETAIL,
     SECOND,
     Action,
@@ -125,7 +127,7 @@ class Terminal:
         session = self._session
         self._t_ns = t_ns
         code = "rdss_request"
-        if session.state in IN_FLIGHT:
+        if session.fix_awaited:
             return Notice(code, "a request is in flight already")
         if session.state not in (State.READY, State.AWAIT_MESSAGE) or not self._options.transmit:
             return Notice(code, f"refused: {self.detail}")
@@ -174,13 +176,21 @@ class Terminal:
         if session.state is State.READY:
             due = session.next_poll_ns
             if self._options.transmit:
-                due = min(due, session.pace.due_ns)
-                if session.outbox.next_ns is not None:
-                    due = min(due, max(session.pace.free_ns, session.outbox.next_ns))
+                due = min(due, session.pace.due_ns, self._message_ns())
             due = max(due, self._deadlines.quiet_until_ns)
+        elif session.state is State.AWAIT_FIX and due is not None:
+            overdue_ns = (session.pace.requested_ns or 0) + FIX_EXPECTED_NS
+            due = min(due, max(overdue_ns, self._message_ns()))
         if due is not None and session.answered:
             due = min(due, session.received_ns + int(self._options.timeout_s * SECOND))
         return due
+
+    def _message_ns(self) -> int:
+        """Instant from which the next message may be written."""
+        session = self._session
+        if session.outbox.next_ns is None:
+            return NEVER_NS
+        return max(session.pace.free_ns, session.outbox.next_ns)
 
     @property
     def state(self) -> State:

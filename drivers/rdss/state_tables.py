@@ -15,6 +15,7 @@ from drivers.rdss.reply_time_fraction import FractionUnit
 from drivers.rdss.vehicle_message_envelope import Carriage
 
 SECOND = 1_000_000_000
+NEVER_NS = 2**63 - 1
 PROBE_BAUDS = (115200, 19200, 9600)
 PROBE_NS = 3 * SECOND
 """Wait for the answer to a harmless read (PROTOCOLS 1.1)."""

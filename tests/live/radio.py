@@ -33,7 +33,7 @@ driver = "rdss"
 port = "{folder}/{name}-rdss"
 baud = 115200
 family = "{family}"
-message_expiry_s = 60.0
+message_expiry_s = {expiry_s}
 [aiding.rdss]
 [mqtt]
 port = {port}
@@ -50,6 +50,10 @@ class Radio:
     loss_probability: float = 0.25
     refuse_probability: float = 0.1
     mute_probability: float = 0.05
+    drop_probability: float = 0.0
+    service_s: int = SERVICE_S
+    delay_s: tuple[float, float] = (0.2, 1.0)
+    mean_delay_s: float = 0.4
     levels: dict[str, int] = field(default_factory=dict)
     """Communication level of a card, where it is not the simulation's."""
     terminals: dict[str, RdssTerminal] = field(default_factory=dict)
@@ -71,9 +75,10 @@ class Radio:
             options = RdssOptions(
                 family=self.family,
                 user=card,
-                service_frequency_s=SERVICE_S,
-                delay_s=(0.2, 1.0),
-                mean_delay_s=0.4,
+                service_frequency_s=self.service_s,
+                delay_s=self.delay_s,
+                mean_delay_s=self.mean_delay_s,
+                drop_probability=self.drop_probability,
                 refuse_probability=self.refuse_probability,
                 mute_probability=self.mute_probability,
                 comm_level=self.levels.get(name, 3),
@@ -106,7 +111,8 @@ def said(listener: Listener, name: str, topic: str) -> list[dict[str, Any]]:
     return [json.loads(p) for p in listener.payloads(f"fusiond/{name}/{topic}")]
 
 
-def config(folder: Path, name: str, family: Family, port: int) -> Path:
+def config(folder: Path, name: str, family: Family, port: int, expiry_s: float = 60.0) -> Path:
     path = folder / f"{name}.toml"
-    path.write_text(CONFIG.format(name=name, folder=folder, family=family, port=port))
+    given = {"name": name, "family": family, "port": port, "expiry_s": expiry_s}
+    path.write_text(CONFIG.format(folder=folder, **given))
     return path

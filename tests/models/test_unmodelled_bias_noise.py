@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_continuous_are
+from scipy.linalg import solve_continuous_are, solve_discrete_are, solve_discrete_lyapunov
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
@@ -22,6 +22,7 @@ from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigator.alignment.start import Levelled, Place, build_start
 from fusiond.simulation.markov import gauss_markov
 
+Row = tuple[float, float, float]
 CLASSES = [Imu(sensor_class=name) for name in ("consumer", "mems", "tactical")]
 
 
@@ -119,3 +120,48 @@ def test_only_the_model_without_the_states_has_the_noise() -> None:
     plain = noise.force_noise**2
     assert whites["ins15"] == whites["ins20"] == whites["ins23"] == plain
     assert whites["ins17"] > 100.0 * plain
+
+
+def steady_nees(density: float, bias: float, gyro: float, velocity_sd: float, step_s: float) -> Row:
+    """NEES of the tilt, and of the velocity before and after a measurement, of the steady filter.
+
+    States v and phi with v' = g phi + force noise, phi' = gyro noise, v measured each `step_s`. The
+    filter has white noise of `density` for a constant bias; the truth has the bias, whose steady
+    effect is phi = -b / g and none on v."""
+    g, h, r = STANDARD_GRAVITY_M_S2, step_s, velocity_sd**2
+    f = np.array([[1.0, g * h], [0.0, 1.0]])
+    walk = gyro**2 * np.array([[g * g * h**3 / 3.0, g * h * h / 2.0], [g * h * h / 2.0, h]])
+    row = np.array([[1.0, 0.0]])
+    before = solve_discrete_are(f.T, row.T, walk + np.diag([density * h, 0.0]), np.array([[r]]))
+    gain = before[:, :1] / (before[0, 0] + r)
+    kept = np.eye(2) - gain @ row
+    after = kept @ before
+    error = solve_discrete_lyapunov(kept @ f, kept @ walk @ kept.T + r * gain @ gain.T)
+    drawn = f @ error @ f.T + walk
+    tilt = (error[1, 1] + (bias / g) ** 2) / after[1, 1]
+    return float(tilt), float(drawn[0, 0] / before[0, 0]), float(error[0, 0] / after[0, 0])
+
+
+def test_no_density_is_honest_about_tilt_and_velocity_at_once() -> None:
+    """A tactical unit whose velocity is measured to 0.02 m/s at 5 Hz, as by Doppler."""
+    g, bias, gyro = STANDARD_GRAVITY_M_S2, 9.81e-3, math.radians(0.05 / 60.0)
+    sd, step_s = 0.02, 0.2
+    honest = [
+        (0.7 <= tilt <= 1.4, 0.7 <= velocity <= 1.4)
+        for tilt, velocity, _ in (
+            steady_nees(q, bias, gyro, sd, step_s) for q in np.logspace(-9.0, 2.0, 111)
+        )
+    ]
+    tilts, velocities = zip(*honest, strict=True)
+    assert any(tilts)
+    assert any(velocities)
+    assert not any(t and v for t, v in honest)
+    # The density that states the tilt's own size: between measurements it adds q h to a variance
+    # to which the bias adds (b h)^2. Just after one the velocity is the measurement's. The tilt
+    # errs by the bias, and by half as much again from the gyro.
+    q = bias**2 * (bias / (g * gyro)) ** 2
+    tilt, before, after = steady_nees(q, bias, gyro, sd, step_s)
+    assert tilt == pytest.approx(1.5, abs=0.05)
+    assert after == pytest.approx(1.0, abs=0.05)
+    assert before == pytest.approx(sd**2 / (sd**2 + q * step_s), rel=0.1)
+    assert before < 0.01

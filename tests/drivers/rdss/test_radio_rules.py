@@ -34,6 +34,7 @@ class Referee(Bench):
         self.settled = True
         self.forbidden = False
         self.texted = False
+        self.fix_asked_s: float | None = None
         super().__post_init__()
 
     def watch(self, message: Message) -> None:
@@ -43,15 +44,21 @@ class Referee(Bench):
             return
         match message:
             case Fix():
-                self.settled = True
+                self.fix_asked_s = None
+                self.settled = self.settled or not self.texted
             case Feedback(outcome=Outcome.SUPPRESSED | Outcome.SILENCE):
                 self.settled = self.forbidden = True
+                self.fix_asked_s = None
             case Feedback(outcome=Outcome.SILENCE_OR_LIFTED) | SelfTest():
                 self.settled, self.forbidden = True, False  # may lift: no verdict
+                self.fix_asked_s = None
             case Feedback(inhibited=False):
                 self.settled, self.forbidden = True, False
+                self.fix_asked_s = None
             case Feedback(outcome=outcome) if outcome is not Outcome.OK or self.texted:
                 self.settled = True
+                if not self.texted:
+                    self.fix_asked_s = None
 
     def hear(self, message: Message, family: Family) -> None:
         if isinstance(message, PositionRequest | TextRequest):
@@ -60,10 +67,15 @@ class Referee(Bench):
             if self.asked_s is not None:
                 apart = self.t - self.asked_s
                 assert apart >= self.card_s - 1e-6, "closer than the card allows"
-                patience_s = 3 if self.texted else 10
+                texting = isinstance(message, TextRequest)
+                patience_s = 3 if self.texted else 5 if texting else 10
                 assert self.settled or apart >= patience_s - 1e-6, "two requests in flight"
+                if not texting and self.fix_asked_s is not None:
+                    assert self.t - self.fix_asked_s >= 10 - 1e-6, "two fixes in flight"
             self.asked_s, self.settled = self.t, False
             self.texted = isinstance(message, TextRequest)
+            if not self.texted:
+                self.fix_asked_s = self.t
         super().hear(message, family)
 
 
