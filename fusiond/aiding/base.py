@@ -190,7 +190,7 @@ class AidingMeasurement:
 
     @property
     def renewal(self) -> Renewal | None:
-        """Change of the shared errors at its instant."""
+        """Change of the shared errors at the measurement's instant."""
         return None
 
     def leaves(self, state: State, codes: Sequence[int]) -> Renewal | None:

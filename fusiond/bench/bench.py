@@ -3,35 +3,32 @@
     Phi @ P @ Phi.T + Q,   21x21, float64
 
 is timed before and after every single measurement, and each ratio is taken to the mean of those
-two, so that a processor which changes its clock in between does not matter. Time is CPU time of the
-process (user and system), so that what else runs does not count. Every figure is the median over
-the repetitions. OpenBLAS uses one thread for matrices of this size (interface/gemm.c:
-up to m n k = 262 144; here 9261).
+two, so that a change of the processor's clock in between does not matter. Time is CPU time of the
+process (user and system), which excludes other programs. Every figure is the median over the
+repetitions. OpenBLAS uses one thread for matrices of this size (interface/gemm.c: up to m n k = 262
+144; here 9261).
 
-The IMU runs at 200 Hz, but for `process` and the step of an estimator (100 Hz); the model is
-`ins21`.
+The IMU runs at 200 Hz, or 100 Hz for `process` and the steps of estimators; the model is `ins21`.
 
-`numpy_product_us`: the product. As ratios to it: `block_step_ratio`, strapdown and covariance
-over one of 4000 samples propagated in one call; `single_step_ratio`, a call from Python for
-one sample; `rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run
-again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
-`process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
-velocity in order of validity, files read and the solution written at every row;
-`raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
-`late_tick_ratio`, the tick in which a fix comes that is 10 s late
-(`fusiond.bench.delayed_fix`);
-`late_raw_tick_ratio`, the same of an RDSS fix 1.5 s late over raw epochs of 40 satellites
-(`fusiond.bench.delayed_raw`).
+`numpy_product_us`: the product. As ratios to it: `block_step_ratio`, strapdown and covariance over
+one of 4000 samples propagated in one call; `single_step_ratio`, a call from Python for one sample;
+`rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run again to the
+present, with a position fix five times a second and a checkpoint every 0.5 s;
+`process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and velocity in
+order of validity, files read and the solution written at every row; `raw_epoch_40_ratio`, an epoch
+of 40 satellites (`fusiond.bench.raw_epoch`); `late_tick_ratio`, the tick in which a fix arrives 10
+s late (`fusiond.bench.delayed_fix`); `late_raw_tick_ratio`, the tick in which an RDSS fix arrives
+1.5 s late, over raw epochs of 40 satellites (`fusiond.bench.delayed_raw`).
 
 Seconds: `process_start_s`, `fusiond process` before its first row
 (`fusiond.bench.process_startup`).
 
-As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
-multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
-`federated_step_ratio`, a second of a federated filter with three local filters (IMU at 100 Hz,
-one position of each of three sources, fault detection on, mode `no_reset`).
-`unscented_step_ratio` and `unscented_propagation_step_ratio`, of the unscented filter as it is
-by default and with sigma points in the propagation too.
+As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a multi-scale
+filter with M = 2 (IMU at 100 Hz, one position and one velocity); `federated_step_ratio`, a second
+of a federated filter with three local filters (IMU at 100 Hz, one position of each of three
+sources, fault detection on, mode `no_reset`). `unscented_step_ratio` and
+`unscented_propagation_step_ratio`, a second of the unscented filter by default, and with sigma
+points in the propagation, too.
 
 Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
 (`fusiond.studies.reduced_order.cost`).
@@ -180,7 +177,7 @@ def _product() -> Callable[[], float]:
     return timed
 
 
-# --------------------------------------------------------------------------- what is timed
+# --------------------------------------------------------------------------- timed work
 
 
 def _filter(steps: int, rate_hz: float = IMU_RATE_HZ) -> tuple[Model, KalmanEstimator, ImuBuffer]:
@@ -222,12 +219,12 @@ def _single(_: int) -> Callable[[], int]:
 
 
 def _fix(source: str, t_ns: int) -> PositionMeasurement:
-    lever, lat = (0.3, 0.0, -1.0), LAT + 1e-20 * t_ns  # a receiver that hangs takes another way
+    lever, lat = (0.3, 0.0, -1.0), LAT + 1e-20 * t_ns  # no value repeats
     return PositionMeasurement(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
 
 
 def _rewind(number: int) -> Callable[[], int]:
-    # One sample more each time: the fix falls anywhere between two checkpoints.
+    # One sample more each time, so that fixes fall anywhere between two checkpoints.
     steps = round(HISTORY_S * IMU_RATE_HZ) + 7 * number
     _model, estimator, buffer = _filter(steps)
     timeline = Timeline(estimator, buffer, keep_s=15.0, checkpoint_s=0.5)
@@ -310,7 +307,7 @@ def _process(folder: Path, duration_s: float) -> Callable[[int], Callable[[], in
 
 
 def _cpu() -> str:
-    """The processor's name."""
+    """Name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Cost of the worst tick: a fix arrives 10 s late, and the filter repeats these 10 s.
+"""Cost of the worst tick: a fix arrives 10 s late, and the filter repeats 10 s.
 
 IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at 100
 Hz. The tick in which the late fix arrives inserts it, repeats the last 10 s with 2000 samples and
@@ -39,7 +39,7 @@ class Driven(Protocol):
 
 
 def tick_of_delayed_fix(drive: Driven, at: int, now: int) -> Callable[[], int]:
-    """The tick at `now` (ns) in which an RDSS fix of the instant `at` comes."""
+    """Run the tick at `now` (ns) in which an RDSS fix, valid at `at`, arrives."""
     lat, lon, height = drive.truth.at(np.array([at * 1e-9])).position[0].tolist()
     fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
 
@@ -54,7 +54,7 @@ def tick_of_delayed_fix(drive: Driven, at: int, now: int) -> Callable[[], int]:
 
 
 class Drive:
-    """Navigator that is run from measurement to measurement, with delayed fixes inserted."""
+    """Navigator on a drive, run from measurement to measurement, with delayed fixes inserted."""
 
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
@@ -72,7 +72,8 @@ class Drive:
         self._row = 0
 
     def delayed(self, number: int) -> Callable[[], int]:
-        """Drive on to the next late fix and return the tick of its arrival as the work to time."""
+        """Drive on to the next delayed fix, and return the tick of its arrival as the work to
+        time."""
         self.go_on(AT_S + number * EVERY_S)
         row = self._row - round(DELAY_S * RATE_HZ)
         return tick_of_delayed_fix(self, int(self._times[row]), int(self._times[self._row - 1]))
@@ -134,7 +135,7 @@ class Drive:
 
 
 def delayed_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:
-    """Function that returns, at each call, the tick of the next late fix on one drive, to be
-    timed."""
+    """Make a function whose every call returns the tick of the next delayed fix as the work to
+    time."""
     drive, numbers = Drive(repetitions), count()
     return lambda _: drive.delayed(next(numbers))

@@ -1,8 +1,7 @@
-"""Late RDSS fix over raw GNSS epochs: the tick in which it comes.
+"""Cost of the tick in which a delayed RDSS fix arrives over raw GNSS epochs.
 
-IMU at 200 Hz, a receiver's raw epochs of 40 satellites with two frequencies at 10 Hz, ticks at
-100 Hz. The tick in which the late fix comes takes it in, runs its epochs again and reads the
-solution.
+IMU at 200 Hz, a receiver's raw epochs of 40 satellites with two frequencies at 10 Hz, ticks at 100
+Hz. The tick inserts the delayed fix, repeats the epochs since then, and reads the solution.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ SAMPLES, TICK_SAMPLES = round(RATE_HZ / EPOCHS_HZ), round(RATE_HZ / 100.0)
 
 
 class RawDrive:
-    """Navigator that is fed with raw epochs, tick by tick, with delayed fixes inserted."""
+    """Navigator on a drive with raw epochs, run tick by tick, with delayed fixes inserted."""
 
     def __init__(self, repetitions: int) -> None:
         scenario = SCENARIOS["drive"]
@@ -47,7 +46,8 @@ class RawDrive:
         self._row = self._epoch = 0
 
     def delayed(self, number: int) -> Callable[[], int]:
-        """Drive on to the next late fix; the work is the tick in which it comes."""
+        """Drive on to the next delayed fix, and return the tick of its arrival as the work to
+        time."""
         self.go_on(AT_S + number * EVERY_S)
         now = int(self._times[self._row - 1])
         return tick_of_delayed_fix(self, now - round(DELAY_S * 1e9), now)
@@ -75,6 +75,7 @@ class RawDrive:
 
 
 def delayed_raw(repetitions: int) -> Callable[[int], Callable[[], int]]:
-    """Works of one drive, each the tick of a late fix; asked for in turn."""
+    """Make a function whose every call returns the tick of the next delayed fix as the work to
+    time."""
     drive, numbers = RawDrive(repetitions), count()
     return lambda _: drive.delayed(next(numbers))

@@ -1,9 +1,9 @@
-"""Functions and modules that an ordinary fix passes, from its arrival to the published sigma.
+"""Trace of the functions and modules of an ordinary fix, from its arrival to the published sigma.
 
-A navigating vehicle has its IMU samples; a fix with velocity arrives, the filter runs, the solution
-is read. To explain a published sigma, a person has to read the Python functions that are counted
-here. Compiled kernels are not counted. The fix with the median count of five is taken: it has none
-of the rare work (a checkpoint, a verdict).
+While the vehicle navigates, a fix with velocity arrives, the filter runs, and the solution is read.
+The trace counts the Python functions that a person has to read to explain a published sigma,
+without compiled kernels. Of five fixes the one with the median count is used, which excludes rare
+work (a checkpoint, a verdict).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class FixPath(NamedTuple):
 
 
 def ordinary_fix() -> FixPath:
-    """Median of `FIXES` fixes under way."""
+    """Trace of the fix with the median number of modules, of `FIXES` fixes during a drive."""
     drive = Drive(1)
     drive.go_on(AT_S)
     ways = []

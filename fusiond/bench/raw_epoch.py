@@ -4,7 +4,7 @@ From the decoded epoch, whose signals the decoder has packed, to the filter that
 signals chosen, carriers followed from the epoch before, which is their anchor, satellites and
 corrections computed, 80 rows (ranges, carriers) linearised, gated one by one, folded in and tested
 by their residuals, the solution corrected; then what `health` and the verdicts keep. The same epoch
-comes again and again after the same one, so the choice of signals and ephemerides holds, as it does
+is repeated after the same previous one, so the choice of signals and ephemerides stays valid, as
 for up to 10 s in the daemon.
 """
 
@@ -57,7 +57,7 @@ def raw_epoch(_: int) -> Callable[[], int]:
     instants = count(1)
     first = raw.measurement(before, 0)
     estimator.update(first.at(nav))  # the carriers' anchor
-    # In place of a propagation: the vehicle has moved since, and the clock.
+    # Replaces a propagation: vehicle and clock have moved since the last epoch.
     for slot in (6, 7, 8, *model.slots_of(CARRIER_CLOCK)):
         estimator.covariance[slot, slot] += 10.0**2
 
@@ -77,7 +77,7 @@ def raw_epoch(_: int) -> Callable[[], int]:
 
 
 class Crowd:
-    """A receiver's epochs with 40 satellites each, whose ephemerides `raw` knows.
+    """Epochs of a receiver with 40 satellites each, whose ephemerides `raw` has.
 
     Half of them are doubles under numbers that the simulated constellations leave free, BeiDou's of
     the same kind of orbit.
@@ -103,7 +103,7 @@ class Crowd:
         self._few = set(list(self._doubles)[: SATELLITES - len(self._doubles)])
 
     def of(self, epoch: RawGnssEpoch) -> RawGnssEpoch:
-        """The epoch with its doubles."""
+        """Epoch with the doubled satellites added."""
         copied = [
             replace(s, prn=self._doubles[s.system, s.prn])
             for s in epoch.signals

@@ -195,7 +195,7 @@ class Mqtt(Section):
 
 
 class Source(BaseModel):
-    """A device: which driver serves it; the other keys are that driver's options."""
+    """Device: its driver, and the driver's options as further keys."""
 
     model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
     driver: str

@@ -305,7 +305,7 @@ def verdict_of(average: float, q: float, limits: Limits, shared: bool = False) -
 
 
 def word(index: int, shared: bool) -> Verdict:
-    """One of `WORDS`."""
+    """Verdict, one of `WORDS`."""
     return "cannot_tell" if shared and WORDS[index] == "pessimistic" else WORDS[index]
 
 

@@ -29,7 +29,7 @@ NO_SLIDING = "non_holonomic"
 
 
 class Sensed(NamedTuple):
-    """Ended windows, and the measurements that hold."""
+    """Ended windows of the detector, and the constraints that hold as measurements."""
 
     windows: list[Window]
     measurements: list[AidingMeasurement]

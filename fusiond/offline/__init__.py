@@ -1,1 +1,1 @@
-"""Recorded files through the daemon's navigator; comparison with a truth."""
+"""Runs of the daemon's navigator over recorded files; comparison with a truth."""

@@ -1,11 +1,11 @@
 """Repair of a damaged Vector BLF file's containers, so that python-can reads the intact part.
 
-A BLF file is a header and containers of some 128 kB, mostly zipped, with objects in them that may
-go on in the next one. Here containers are split into objects, an unreadable piece is skipped up to
-the next readable one, and complete objects are passed on in new containers.
+A BLF file is a header and containers of some 128 kB, mostly zipped, whose objects may continue in
+the next container. Containers are split into objects, unreadable data are skipped up to the next
+readable container, and complete objects are passed on in new containers.
 
-A stamp counts from the header's time, as 64 bits without a sign: frames before the trigger have
-2^64 - n. So all stamps are moved by a day, and the reader's start by a day back.
+A stamp counts from the header's time as an unsigned 64-bit number: frames before the trigger have
+2^64 - n. So all stamps are shifted by a day, and the reader's start back by a day.
 
 Source: python-can, `can.io.blf`, after Toby Lorenz' Vector BLF library.
 """
@@ -49,8 +49,7 @@ _DAY_TICKS = {True: DAY_S * 10**5, False: DAY_S * 10**9}
 
 
 class Containers:
-    """BLF file in the form that python-can's reader expects: the header, then containers of whole
-    objects.
+    """BLF file as python-can's reader expects it: the header, then containers of complete objects.
 
     `refused(text)` receives each lost piece.
     """
@@ -71,11 +70,11 @@ class Containers:
         """Keep the file open: the reader closes its input, and the opener closes the file."""
 
     def body(self) -> None:
-        """The header has been read: containers follow."""
+        """Note that the header has been read, and containers follow."""
         self._header = False
 
     def read(self, size: int) -> bytes:
-        """The next bytes, as of a file."""
+        """Read the next bytes, like a file."""
         if self._header:
             return self._stream.read(size)
         while len(self._rest) < size:
@@ -89,7 +88,7 @@ class Containers:
     # ------------------------------------------------------------------ the file
 
     def _take(self, size: int) -> bytes:
-        """Bytes of the file itself; fewer at its end."""
+        """Read bytes of the file itself; fewer at its end."""
         piece, self._ahead = self._ahead[:size], self._ahead[size:]
         if len(piece) < size:
             try:
@@ -110,7 +109,7 @@ class Containers:
                 continue
             cut = len(body) < size - _BASE.size
             content = self._content(body)
-            if content is None:  # its size may be wrong, and others stand in what was taken for it
+            if content is None:  # the size may be wrong, with other containers inside
                 self._find_next(head + body)
                 continue
             if cut and self.damage is None:
@@ -121,7 +120,7 @@ class Containers:
                 yield _container(objects)
 
     def _find_next(self, bad: bytes) -> int:
-        """Skip damaged data up to the next container; the number of bytes."""
+        """Skip damaged data up to the next container; return the number of bytes."""
         self._tail, self._lost = b"", True
         passed, window = 1, bad[1:]
         while True:
@@ -181,7 +180,7 @@ class Containers:
             _, header, version, size, kind = _BASE.unpack_from(data, at)
             if not _BASE.size <= header <= size <= _LONGEST_OBJECT:
                 self._refused("an object of an impossible size")
-                self._lost = True  # told already
+                self._lost = True  # reported before
                 at += len(_SIGNATURE)
                 continue
             if len(data) - at < size:
@@ -200,7 +199,7 @@ class Containers:
 
 
 def _move_time(data: bytearray, at: int) -> bool:
-    """Move an object's stamp by a day; False for one that then is still before the beginning."""
+    """Shift an object's stamp by a day; False if it is still before the beginning."""
     (flags,) = struct.unpack_from("<L", data, at + _BASE.size)
     (ticks,) = struct.unpack_from("<q", data, at + _TIME_AT)
     ticks += _DAY_TICKS[flags == can.io.blf.TIME_TEN_MICS]

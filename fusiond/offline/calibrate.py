@@ -3,7 +3,7 @@
 The drive passes through the daemon's navigator twice, the second time with the first result as
 configured values and with the same configured sigmas: a mounting that is 10 deg off affects lever
 arms and the start, and the remainder in the second pass is small. The sigmas are those of the
-second pass alone, so that nothing counts twice.
+second pass alone, so that no measurement counts twice.
 
 Roll of the mounting has no effect on wheels or axle. It is estimated from gravity: roads lean to
 either side by their crown, 2 to 2.5 % to the kerb, so the mean roll of driving straight on is that
@@ -57,16 +57,17 @@ Pass = Callable[[Config, Callable[[Navigator], None]], dict[str, Any]]
 the report of `process`."""
 
 PASSES = 2
-# The solution is looked at this often (ns): a bend or a stop takes seconds.
+# Interval between two looks at the solution (ns): a bend or a stop takes seconds.
 STEP_NS = 500_000_000
-# It drives, bends and changes its speed from here on: 3 deg/s at 10 m/s is a bend of 190 m radius
-# and pushes by 0.5 m/s^2, three times what a road's unevenness does to a filtered velocity.
+# Least speed, turn rate and acceleration of driving, a bend and a change of speed: 3 deg/s at 10
+# m/s is a bend of 190 m radius with 0.5 m/s^2, three times the effect of a road's unevenness on a
+# filtered velocity.
 DRIVING_M_S = 2.0
 BEND_RAD_S = 3.0 * DEG
 CHANGE_M_S2 = 0.5
-# So many seconds of it are a drive, bends and changes of speed: two corners, two stops.
+# Least seconds of a drive, of bends and of changes of speed: two corners, two stops.
 LEAST_S = {"driving": 60.0, "bends": 10.0, "changes of speed": 10.0}
-# Straight on at an even speed for this long in sum (s) is a kilometre of road.
+# Least time straight on at an even speed (s), in all: a kilometre of road.
 STRAIGHT_S = 60.0
 STRAIGHT_RAD_S, EVEN_M_S2, STRAIGHT_M_S = 1.0 * DEG, 0.3, 5.0
 # One sigma of a road's lean: the usual crown is 2 % (AASHTO Green Book, section 4.2: 1.5 to 2 %).
@@ -174,7 +175,7 @@ def _finding(name: str, p: Parameter, key: str, value: float, drive: _Drive) -> 
 
 
 def _why(p: Parameter, drive: _Drive) -> str:
-    """Text on a parameter's state."""
+    """Explain a parameter's state."""
     if p.name == ROLL:
         how = "the mean of driving straight on; roads lean by as much"
         return how if _seen(p) else f"left as it is: {p.value:+.2g} is less than its sigma; {how}"
@@ -195,7 +196,7 @@ def _why(p: Parameter, drive: _Drive) -> str:
 class _Drive:
     """Watch of a navigator: its calibration, and the vehicle's motion that shows it.
 
-    `rolled`: an earlier pass has taken a roll out.
+    `rolled`: an earlier pass has removed a roll.
     """
 
     def __init__(self, rolled: bool) -> None:
@@ -268,7 +269,7 @@ class _Drive:
         return f"what was fused narrows its sigma by less than {share:.0f} %"
 
     def more(self, p: Parameter) -> str:
-        """Motion that would determine it better."""
+        """Motion that would determine a parameter better."""
         shown = self.shown_s()
         said = ", ".join(f"{shown[what]:.0f} s of {what}" for what in SHOWN_BY[p.kind])
         return f"the drive has {said}: more is needed"

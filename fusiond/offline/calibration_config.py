@@ -1,13 +1,12 @@
 """Configuration of a calibration: which keys change, and the lines of TOML for them.
 
-With C_vb the matrix of `imu.mounting_deg`, m the estimated rest of the mounting, rho the roll, and
-tau the time from the stamps of fixes to their validity:
+With C_vb the matrix of `imu.mounting_deg`, m the estimated remaining mounting angles, rho the roll,
+and tau the time from the stamps of fixes to their validity:
 
-    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.si_units.sensor_to_body)
-    lever arm of an antenna <- C(rho) exp[m x] (l + dl), where dl was observed
-    imu.time_offset_s <- time_offset_s - tau,   and all other sources against it:
-    velocity_delay_s <- velocity_delay_s - tau_v + tau,   latency_s <- latency_s + tau_w + tau
-    scale <- scale (1 + k)
+    C_vb <- C(rho) exp[m x] C_vb          (fusiond.configuration.si_units.sensor_to_body) lever arm
+    of an antenna <- C(rho) exp[m x] (l + dl), where dl was observed imu.time_offset_s <-
+    time_offset_s - tau,   and, relative to it, all other sources: velocity_delay_s <-
+    velocity_delay_s - tau_v + tau,   latency_s <- latency_s + tau_w + tau scale <- scale (1 + k)
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ KINDS_OF: Mapping[type[Aiding], tuple[str, ...]] = {
 
 
 def source_of(config: Config, p: Parameter) -> str:
-    """The source that a parameter belongs to; empty for one of the vehicle or of the IMU."""
+    """Source of a parameter; empty for one of the vehicle or of the IMU."""
     for name, section in config.aiding.items():
         own = p.kind if name == section.kind else f"{p.kind}_{name}"
         if p.kind in KINDS_OF.get(type(section), ()) and p.block == own:
@@ -62,7 +61,7 @@ def source_of(config: Config, p: Parameter) -> str:
 
 
 def calibrated(config: Config, found: Mapping[str, Parameter]) -> Config:
-    """The configuration with the values that were observed; its sigmas stay."""
+    """Configuration with the observed values and unchanged sigmas."""
     seen = {n: p for n, p in found.items() if p.state is not CalibrationState.NOT_OBSERVED}
     turn = _turn(seen)
     tau_s = _fix_time_s(seen)
@@ -85,15 +84,15 @@ def calibrated(config: Config, found: Mapping[str, Parameter]) -> Config:
         mine = [p for p in seen.values() if source_of(config, p) == name]
         changed = _of_section(section, mine, turn, tau_s)
         if isinstance(section, GnssAiding) and "lever_arm_m" in changed:
-            # Given from now on, and as poorly known as it was.
+            # The lever arm is now given, but its sigma stays the same.
             changed["lever_arm_sd_m"] = lever_sd_m(section, config.aiding)
         aiding[name] = section.model_copy(update=changed)
     return config.model_copy(update={"imu": imu, "constraints": constraints, "aiding": aiding})
 
 
 def configured(config: Config, before: Config, p: Parameter) -> tuple[str, float]:
-    """Key and value of a parameter in the configuration that `calibrated` made of `before`; an
-    empty key and the parameter's own value without a key."""
+    """Key and value of a parameter in the result of `calibrated`, made of `before`. A parameter
+    without a key has an empty key and its own value."""
     imu = config.imu
     if p.kind == MOUNTING:
         axis = (ROLL, PITCH, YAW).index(p.name)
@@ -140,7 +139,7 @@ def fragment(
             times = (FIX_TIME, VELOCITY_TIME)
             keys |= _sigma("time_offset_sd_s", mine, times, section.time_offset_sd_s)
             if any(p.kind == ANTENNA_LEVER for p in mine):
-                # One sigma for three axes: of those not observed, too.
+                # One sigma for all three axes, also those not observed.
                 axes = [p for p in found.values() if source_of(now, p) == name]
                 before = lever_sd_m(section, now.aiding)
                 sd = _sigma("lever_arm_sd_m", axes, (ANTENNA_LEVER,), before)
@@ -159,7 +158,7 @@ def _axis(p: Parameter) -> str:
 
 
 def _first_receiver(config: Config) -> str:
-    """Reference receiver of the time: the first with an offset."""
+    """Reference receiver for time: the first one with an offset."""
     for name, section in config.aiding.items():
         if isinstance(section, GnssAiding) and section.time_offset_sd_s:
             return name
@@ -219,7 +218,8 @@ def _changed(before: Any, now: Any, keys: tuple[str, ...]) -> dict[str, Any]:
 def _sigma(
     key: str, seen: list[Parameter], kinds: tuple[str, ...], before: float
 ) -> dict[str, float]:
-    """The sigma of a key: of the widest parameter, with what may change until the next start."""
+    """Sigma of a key: the largest of its parameters', with the possible change until the next
+    start."""
     sds = [math.hypot(p.sd, CHANGES[p.kind]) for p in seen if p.kind in kinds and p.name != ROLL]
     return {key: max(sds)} if sds and max(sds) < before else {}
 

@@ -1,4 +1,4 @@
-"""Kind of a CAN log by its content, for files whose name says another, or none.
+"""Kind of a CAN log by its content, for files with a misleading name or suffix.
 
 Sources: file(1); can-utils, candump.c; Vector, ASC and BLF format descriptions; PEAK, TRC file
 format; ASAM MDF 4.
@@ -34,7 +34,7 @@ _REMEDY = "save it as one of candump -L, ASC, BLF, TRC or MF4"
 
 
 def kind_of(head: bytes) -> str:
-    """Suffix of the format that the first bytes of a log are of; "" if unknown."""
+    """Suffix of a log's format, by its first bytes; "" if unknown."""
     for magic, suffix in _MAGIC.items():
         if head.startswith(magic):
             return suffix
@@ -43,7 +43,7 @@ def kind_of(head: bytes) -> str:
 
 
 def foreign_kind(head: bytes) -> str:
-    """Sentence on a log of a program whose format is not read; "" if unknown."""
+    """Sentence on a log in another program's format, which is not read; "" if unknown."""
     text = _text(head)
     name = next((name for begins, name in _OTHERS if text.startswith(begins)), "")
     remedy = "unpack it, or pack it with gzip" if text.startswith(_PACKED) else _REMEDY

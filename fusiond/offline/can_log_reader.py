@@ -1,11 +1,11 @@
-"""Frames of a recorded CAN bus, by python-can's readers; unreadable ones are skipped.
+"""Reader of a recorded CAN bus, by python-can's readers; unreadable frames are skipped.
 
     .log   candump -L, -l, and its terminal form with stamps     .blf   Vector, binary
     .asc   Vector, text                                          .mf4   ASAM MDF 4 (asammdf)
     .trc   PEAK, versions 1.0 to 2.1
 
-Each but the last may end in .gz as well. The content counts before the name. Dates without a zone
-are taken as python-can does.
+Each but the last may also end in .gz. The content takes precedence over the name. Dates without a
+zone are interpreted as by python-can.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _DATED_LOG = "the dates of candump -t A have no zone: taken as local time of thi
 
 
 class Refusals:
-    """Unread lines of a log: the first of it with line and text, of the rest the number."""
+    """Unreadable lines of a log: line and text of the first one, and the number of others."""
 
     def __init__(self) -> None:
         self._named: list[Rejection] = []
         self._more = Counter[str]()
 
     def add(self, line: int, reason: str, detail: str) -> None:
-        """Count a refusal; `line` is 0 where lines are unknown."""
+        """Count a refusal; `line` is 0 if unknown."""
         if len(self._named) < _MOST_NAMED:
             self._named.append(Rejection(line, reason, detail))
         else:
@@ -75,7 +75,7 @@ class Refusals:
 
     @property
     def first(self) -> str:
-        """The first one, in words."""
+        """First refusal in words."""
         return str(self._named[0]) if self._named else ""
 
     def all(self) -> list[Rejection]:
@@ -107,7 +107,7 @@ def messages(
         for message in read(log, lost, stack, on_zone):
             count += 1
             yield message
-    if log.suffix != ".trc":  # whose lines are refused by their number
+    if log.suffix != ".trc":  # lines are refused by number
         lost.count(odd)
     if not count and lost.first:
         hint = "; candump writes logs with -L or -l" if log.suffix == ".log" else ""
@@ -115,7 +115,7 @@ def messages(
 
 
 def channels(path: Path) -> set[Any]:
-    """Channels of a log, without those that damage has made. Raises as `messages` does."""
+    """Channels of a log, without spurious ones from damage. Raises as `messages` does."""
     frames: Counter[Any] = Counter(_channel_words(path))
     frames = frames or Counter(m.channel for m in messages(path))
     return {name for name, n in frames.items() if n * _STRAY >= frames.total()}
@@ -129,7 +129,7 @@ class _Log(NamedTuple):
     suffix: str
 
     def open(self) -> BinaryIO:
-        """Open a log, unpacked if it is a gzip file of any name."""
+        """Open a log; a gzip file, whatever its name, is unpacked."""
         with self.path.open("rb") as file:
             zipped = file.read(len(_GZIP)) == _GZIP
         opened = gzip.open if zipped else open
@@ -137,7 +137,7 @@ class _Log(NamedTuple):
 
 
 def _format(path: Path) -> _Log:
-    """Format by the content, or else by the name. Raises `TableError`."""
+    """Format by content, or else by name. Raises `TableError`."""
     suffixes = [s.lower() for s in path.suffixes]
     zipped = suffixes[-1:] == [".gz"]
     suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
@@ -153,8 +153,8 @@ def _format(path: Path) -> _Log:
 
 
 def _channel_words(path: Path) -> Iterator[str | int]:
-    """Channels by the second word of the lines of `candump -L`, as parsing every frame would take
-    as long as the drivers' own parsing. None for a log of another form."""
+    """Channels by the second word of `candump -L`'s lines, which is much faster than parsing every
+    frame. None for a log of another form."""
     log = _format(path)
     if log.suffix != ".log":
         return
@@ -201,9 +201,9 @@ def _text(
                     _report_zone(log, getattr(reader, "start_time", None), on_zone)
                 yield message
             break
-        except Exception:  # whatever a reader raises for a line that is none
+        except Exception:  # a reader may raise anything for an invalid line
             lines.refuse()
-            if lines.number == pulled:  # not for a line: for what its header lacks, at the end
+            if lines.number == pulled:  # not of a line, but of an incomplete header, at the end
                 break
             if asc.in_frames:
                 lines.put_before(HEADER_ENDS)
@@ -225,7 +225,7 @@ def _binary(
     containers = Containers(stream, lambda text: lost.add(0, "unreadable", text))
     try:
         reader = can.BLFReader(cast(BinaryIO, containers))
-    except Exception:  # whatever it raises for a file that is none
+    except Exception:  # it may raise anything for another file
         lost.add(0, "unreadable", "its header is cut, or none of BLF")
         return
     containers.body()
@@ -271,7 +271,7 @@ def _zone(t_s: float | None) -> str:
 
 @contextlib.contextmanager
 def _warned(call: Callable[[], None]) -> Iterator[None]:
-    """Collect the lines of which python-can only warns, and keep the warnings from the terminal."""
+    """Collect the lines for which python-can only logs a warning, and hide the warnings."""
     logger, handler = logging.getLogger("can.io"), _Forwarded(call)
     propagated, logger.propagate = logger.propagate, False
     logger.addHandler(handler)

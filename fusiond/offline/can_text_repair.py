@@ -1,7 +1,7 @@
 r"""Normalisation of text CAN logs for python-can's readers, which skips bad lines.
 
-A reader pulls line after line. Before that, encoding and blocks of zeros (left by a file system
-after a loss of power) are repaired here, and forms that python-can does not read are converted:
+The lines that a reader pulls are repaired before: encoding, and blocks of zeros that a file system
+leaves after a power cut. Forms that python-can does not read are converted:
 
     candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
     dates, raw length codes    candump -L -t A, -8: (2026-03-24 07:33:02.1) can0 7E8#0341..._9
@@ -80,7 +80,7 @@ class TextLines:
         """Keep the file open: the reader closes its input, and the opener closes the file."""
 
     def refuse(self) -> None:
-        """The line that was pulled last is not read."""
+        """Refuse the line that was pulled last."""
         if self.number > self._refused_line:
             self._refused_line = self.number
             shown = self._line.strip()
@@ -92,7 +92,8 @@ class TextLines:
         self._again = line
 
     def _read(self) -> bytes:
-        """The next line; of one that is too long, or has zeros in it, what follows them."""
+        """Read the next line; of a line that is too long or contains zeros, only the part
+        behind."""
         try:
             raw = self._stream.readline(LONGEST)
             if b"\0" not in raw and len(raw) < LONGEST:
@@ -130,7 +131,7 @@ def _decoded(stream: BinaryIO) -> BinaryIO:
             return stream
         whole = first + stream.read()
     except (EOFError, zlib.error, gzip.BadGzipFile):
-        stream.seek(0)  # the first line will say so
+        stream.seek(0)  # the first line shows it
         return stream
     if encoding:
         return io.BytesIO(whole.decode(encoding, "replace").encode())
@@ -155,10 +156,11 @@ _BEGINS = 1.0
 
 
 class Candump:
-    """Lines in the form of `candump -L`; the terminal's form is recognised by `[length]`."""
+    """Lines of candump, converted to the form of `candump -L`; `[length]` marks the terminal's
+    form."""
 
     def __init__(self, stamps: list[float], *, is_dated: bool = False) -> None:
-        """`stamps` of the first lines."""
+        """`stamps` are those of the first lines."""
         self._differences = bool(stamps) and stamps[0] < _BEGINS and _fall_or_stand(stamps)
         self._sum_s = 0.0
         self._converts = self._differences or is_dated
@@ -166,7 +168,7 @@ class Candump:
         """True if a frame without a time was found."""
 
     def plain(self, line: str) -> str:
-        """The line in the form of a log."""
+        """Convert a line to the form of `candump -L`."""
         if "\x1b" in line:
             line = _COLOUR.sub("", line)
         if "[" not in line and "{" not in line:
@@ -175,7 +177,7 @@ class Candump:
             if "_" in line:
                 line = _RAW_LENGTH.sub(r"\1", line)
             hash_at = line.find("#")
-            if hash_at >= 0 and "." in line[hash_at:]:  # 123#11.22.33, which canplayer reads
+            if hash_at >= 0 and "." in line[hash_at:]:  # 123#11.22.33, a form that canplayer reads
                 line = line[:hash_at] + line[hash_at:].replace(".", "")
             if hash_at >= 8 and line[hash_at - 8 : hash_at - 7] in "2367":
                 return _with_error_flag(line, hash_at)
@@ -198,7 +200,7 @@ class Candump:
             return f"{head}R{length}"
         if len(data) < length:
             return line
-        # Two digits are CAN FD's, whose flags this form does not say.
+        # Two digits mark CAN FD, whose flags this form lacks.
         fd = "#0" if len(stated) > 1 else ""
         return head + fd + "".join(data[:length])
 
@@ -248,15 +250,15 @@ def first_stamps(stream: BinaryIO) -> list[str]:
 
 
 def candump_of(stamps: list[str]) -> Candump:
-    """Reader for a log with these first stamps."""
+    """Make the converter for a log with these first stamps."""
     seconds = [stamp_s(stamp) for stamp in stamps]
     found = [s for s in seconds if s is not None]
     return Candump(found, is_dated=bool(stamps) and dated(stamps[0]))
 
 
 def _fall_or_stand(stamps: list[float]) -> bool:
-    """True if the stamps are differences: they fall, and end no later than they have begun; or are
-    all alike from the second on. A log of two buses, each from its beginning, falls, too."""
+    """True if the stamps are differences: they decrease, and end no later than they began; or they
+    are equal from the second on. Stamps of a log of two buses, one after the other, decrease, too."""
     falls = any(after < before for before, after in pairwise(stamps))
     half = len(stamps) // 2
     grows = max(stamps[half:]) > max(stamps[: half + 1])
@@ -295,7 +297,7 @@ HEADER_ENDS = "internal events logged"
 
 
 class Asc:
-    """Lines of an ASC file in python-can's form."""
+    """Lines of an ASC file, converted to python-can's form."""
 
     def __init__(self) -> None:
         self.in_frames = False
@@ -307,8 +309,8 @@ class Asc:
         self._header_ended = False
 
     def plain(self, line: str) -> str | None:
-        """Line with its stamp counted from the beginning, without sign; None for an event without
-        channel. Before the first frame the line that ends a header is added where there is none."""
+        """Convert a line: its stamp counts from the beginning, without sign; None for an event
+        without channel. A missing last line of the header is added before the first frame."""
         said = self._plain(line)
         if said is None or self._header_ended or not self.in_frames:
             return said
@@ -331,8 +333,8 @@ class Asc:
         return f"{stamp}{line[found.end() :]}" if found[1] or found[3] == "," else line
 
     def _of_header(self, line: str) -> str | None:
-        """Line before the first frame. The reader ends the header at an unknown line, such as a
-        date in another language, and misses the lines after it."""
+        """Convert a line before the first frame. The reader ends the header at an unknown line,
+        such as a date in another language, and would miss the lines after it."""
         self._relative |= _RELATIVE.match(line) is not None
         self.in_frames |= _HEADER_OVER.match(line) is not None
         if found := _DATE.match(line):
@@ -342,7 +344,7 @@ class Asc:
         return line if _HEADER.match(line) else None
 
     def _counted(self, found: re.Match[str], rest: str) -> str | None:
-        """A difference to the event before, of whatever kind that was: summed."""
+        """Sum the difference to the previous event, of whatever kind."""
         ns = int(found[2]) * 10**9 + int(found[4][:9].ljust(9, "0"))
         self._sum_ns += -ns if found[1] else ns
         seconds, fraction = divmod(max(0, self._sum_ns), 10**9)
@@ -364,7 +366,7 @@ class Trc:
         self.version = ""
 
     def plain(self, line: str) -> str:
-        """Line with decimal points in its numbers."""
+        """Convert a line to decimal points."""
         if found := _VERSION.match(line):
             self.version = found[1]
         return _COMMA.sub(r"\1.\2", line, count=1) if "," in line else line

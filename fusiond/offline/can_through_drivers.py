@@ -1,6 +1,6 @@
-"""Recorded CAN bus through the daemon's drivers: `fusiond process --can LOG`.
+"""Run of the daemon's drivers over a recorded CAN bus: `fusiond process --can LOG`.
 
-Frames go to the configured drivers, and their stamps to the daemon's own `Clock`, with the log as
+The configured drivers get the frames, and the daemon's own `Clock` their stamps, with the log as
 host time: the recorder's stamp of a frame is its arrival, and the recorder's clock is the system
 clock, which may be set (fusiond.clock.recorder_clock). Times are those of the log, POSIX seconds if
 the recorder knew the date; if its clock was set, those of the clock at the end.
@@ -86,8 +86,8 @@ class CanLog(NamedTuple):
 
 
 class _LogTime:
-    """Host whose clocks are the log's: real time is the recorder's stamp of the frame without
-    slews, monotonic and boot time the same without the steps of the recorder's clock."""
+    """Host with the log's clocks: real time is the recorder's stamp of the frame without slews;
+    monotonic and boot time are the same without the steps of the recorder's clock."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -116,7 +116,7 @@ def read_can_log(path: Path, config: Config) -> CanLog:
 
 
 class _Replay:
-    """Drivers, clock and their results."""
+    """Drivers and clock of one reading, with their results."""
 
     def __init__(self, path: Path, config: Config, slews: tuple[Slew, ...] = ()) -> None:
         self._path = path
@@ -184,10 +184,10 @@ class _Replay:
         return CanLog(imu, self._arrivals, rejected, self._events, frames.number, units)
 
     def _buses(self) -> dict[Any, list[CanDriver[Any]]]:
-        """Owners of the frames of each channel of the log.
+        """Drivers that get the frames of each channel of the log.
 
-        A log of one channel is everybody's bus. In one of several each source has the channel of
-        its name, or `canN` of number N.
+        All drivers share the only channel of a log. Of several channels a source has the one with
+        its channel's name, or number N for `canN`.
         """
         there = sorted(channels(self._path), key=str)
         if not there:
@@ -207,7 +207,7 @@ class _Replay:
         return buses
 
     def _scouts(self, emit: Emit) -> dict[Any, list[CanDriver[Any]]]:
-        """Other drivers in the places of the drivers."""
+        """Second set of drivers, to read ahead."""
         scouts = self._make_drivers(emit)
         names = {id(driver): name for name, driver in self._drivers.items()}
         return {
@@ -235,7 +235,8 @@ class _Replay:
         )
 
     def _report_pause(self, passed_ns: int) -> None:
-        """Report a pause, which resembles a step of the clock if no device reports UTC."""
+        """Report a pause, which cannot be distinguished from a step of the clock if no device
+        reports UTC."""
         if passed_ns > PAUSE_NS:
             text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
             if not self.reports:
@@ -243,8 +244,8 @@ class _Replay:
             self._on_refusal("recorder_paused", text)
 
     def _report_error(self) -> None:
-        """Report the final offset of a dated recorder from a receiver's UTC, which reveals a wrong
-        time zone."""
+        """Report the final offset of a dated recorder from a receiver's UTC, such as a wrong time
+        zone."""
         status = self._clock.status()
         off_s = (status.system_error_s or 0.0) + self._recorder.slewed_ns * 1e-9
         if abs(off_s) >= OFF_S and plausible_date(self._host.stamp_ns):
@@ -252,7 +253,7 @@ class _Replay:
             self._on_refusal("recorder_clock_off", f"the recorder's clock is off {how}")
 
     def _shift(self) -> None:
-        """Shift times to the recorder's clock at the end."""
+        """Convert times to the recorder's clock at the end."""
         if not (by_ns := self._recorder.ahead_ns):
             return
         self._imu = [
@@ -260,7 +261,7 @@ class _Replay:
         ]
         self._arrivals = [_later(arrival, by_ns) for arrival in self._arrivals]
 
-    # ------------------------------------------------------------------ what drivers make
+    # ------------------------------------------------------------------ results of drivers
 
     def _emit(self, item: Emitted) -> None:
         """Emit an item as `fusiond.live.sources` does, at the instant of the frame."""
@@ -287,7 +288,7 @@ class _Replay:
                 self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s, utc_ns))
 
     def _imu_table(self) -> ImuTable:
-        """IMU samples of the first source that sent any, as in the daemon."""
+        """IMU samples of the first source that sends any, as in the daemon."""
         spare = self._config.imu.spare
         spare_name = None if spare is None else spare.source
         first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)
@@ -309,7 +310,7 @@ def _on_a_bus(config: Config) -> dict[str, tuple[Any, Any]]:
 
 
 def _later(arrival: Arrival, by_ns: int) -> Arrival:
-    """Arrival with all times shifted by `by_ns`."""
+    """Shift all times of an arrival by `by_ns`."""
     m: Any = arrival.measurement
     seen_ns = m.t_seen_ns + by_ns
     moved = replace(m, t_seen_ns=seen_ns, stamp=MonotonicStamp(m.stamp.t_ns + by_ns))

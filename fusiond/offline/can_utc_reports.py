@@ -1,8 +1,8 @@
-"""Reports of UTC in a recorded CAN bus, as evidence on its recorder's clock.
+"""Reports of UTC in a recorded CAN bus, which show steps and slews of the recorder's clock.
 
-Reports before and after a jump of the stamps show the step of the clock; all of them together show
-its slew (fusiond.clock.recorder_clock, recorder_rate). Reports ahead of the present frame are read
-by separate drivers, whose state is discarded.
+Reports before and after a jump of the stamps show a step; all reports together show a slew
+(fusiond.clock.recorder_clock, recorder_rate). Separate drivers, whose state is discarded, read the
+reports ahead of the present frame.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Scouts = Callable[[Emit], dict[Any, list[CanDriver[Any]]]]
 
 
 class Reports:
-    """Reports of each source with the recorder's stamps, less its slews."""
+    """Reports of each source with the recorder's stamps, corrected for its slews."""
 
     def __init__(self, recorder: RecorderClock, scouts: Scouts) -> None:
         self._recorder = recorder
@@ -53,7 +53,7 @@ class Reports:
         return any(self._last.values())
 
     def add(self, report: TimeReport, stamp_ns: int) -> None:
-        """Take one that is trusted."""
+        """Take a trusted report."""
         last = self._last.setdefault(report.source, deque(maxlen=REPORTS))
         last.append(stamp_ns - report.utc_ns)
         every = self._all.setdefault(report.source, [])
@@ -67,13 +67,13 @@ class Reports:
                 reports[k] = ahead_ns + set_ns
 
     def slews(self, drift_ppm: float) -> tuple[str, tuple[Slew, ...]]:
-        """Slews by the source that reported most often, with its name."""
+        """Slews by the source with most reports, and its name."""
         source = max(self._all, key=lambda name: len(self._all[name]), default="")
         return source, slews(self._all.get(source, ()), drift_ppm)
 
     def set_before(self, frames: Ahead, first: can.Message, first_ns: int) -> int | None:
-        """Step of the recorder's clock before this frame, by the sources that report before and
-        after it, also across further steps."""
+        """Find the step of the recorder's clock before this frame, by sources that report before
+        and after it, even across further steps."""
         known = {name for name, reports in self._last.items() if reports}
         if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None
@@ -112,7 +112,7 @@ class Reports:
 
 
 class Ahead:
-    """Data frames of a log with their stamps (ns), with a lookahead. Other contents are counted in
+    """Data frames of a log with stamps (ns) and lookahead. Other contents are counted in
     `refused`."""
 
     def __init__(self, messages: Iterator[can.Message], refused: Counter[str]) -> None:
@@ -131,7 +131,7 @@ class Ahead:
             yield each
 
     def ahead(self, number: int | None = None) -> Iterator[tuple[can.Message, int]]:
-        """Next frames in order, at most so many; they remain."""
+        """Next frames in order, up to a number, without removing them."""
         yield from list(islice(self._kept, number))
         while number is None or len(self._kept) < number:
             if (each := self._read()) is None:
@@ -154,6 +154,6 @@ class Ahead:
 
 
 def frame(message: can.Message, t_ns: int, stamp_ns: int) -> CanFrame:
-    """Frame of a message that came at `t_ns` and has a recorder's stamp."""
+    """Frame of a message that arrived at `t_ns`, with the recorder's stamp."""
     can_id, extended = message.arbitration_id, message.is_extended_id
     return CanFrame(can_id, extended, bytes(message.data), t_ns, stamp_ns)

@@ -31,16 +31,16 @@ Report: TypeAlias = dict[str, float | int | None]
 
 
 class NothingToCompareError(Exception):
-    """Solution and truth have no common epoch; the text has the times that each covers."""
+    """Error: solution and truth have no common epoch; the text has the times of both."""
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
     """Solution minus truth at n common epochs `t_s`, and the solution's sigma.
 
-    All (n, 3): `position` (m) and `velocity` (m/s) north, east, down, `attitude` (rad) roll, pitch,
-    yaw; `sd_*` likewise; NaN for values that a file lacks. `not_covered` epochs of the truth have
-    no solution.
+    Shapes are (n, 3): `position` (m) and `velocity` (m/s) north, east, down, `attitude` (rad) roll,
+    pitch, yaw; `sd_*` likewise; NaN for missing values. `not_covered` counts epochs of the truth
+    without a solution.
     """
 
     t_s: Floats
@@ -128,7 +128,7 @@ def report_of(errors: Errors) -> Report:
 
 
 class _Epochs:
-    """Places of the truth's epochs between the solution's usable rows."""
+    """Interpolation of the solution's usable rows to the truth's epochs."""
 
     def __init__(self, t: Floats, usable: Flags, wanted: Floats) -> None:
         self._rows = np.flatnonzero(usable)
@@ -145,17 +145,17 @@ class _Epochs:
         self.bridged = exact | (inside & short)
 
     def linear(self, column: Floats) -> Floats:
-        """A column (n,) at the wanted epochs; meaningful where `bridged`."""
+        """Interpolate a column (n,) to the epochs; valid where `bridged`."""
         if not len(self._t):
             return np.full(len(self._wanted), np.nan)
         return np.interp(self._wanted, self._t, column[self._rows])
 
     def columns(self, table: Floats) -> Floats:
-        """Columns of a table (n, k) at the wanted epochs, each as `linear`."""
+        """Interpolate columns (n, k) of a table, each as `linear`."""
         return np.stack([self.linear(column) for column in table.T], axis=1)
 
     def angle(self, column: Floats) -> Floats:
-        """A column of angles (rad), through the shorter arc between rows."""
+        """Interpolate a column of angles (rad) along the shorter arc between rows."""
         values = column[self._rows].copy()
         known = np.isfinite(values)
         values[known] = np.unwrap(values[known])
@@ -165,7 +165,7 @@ class _Epochs:
 
 
 def _wrapped(angle: Floats) -> Floats:
-    """Into [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
@@ -193,7 +193,7 @@ def _consistency(position: Floats, sigma: Floats) -> Report:
     horizontal = normalised[:, 0] + normalised[:, 1]
     horizontal = horizontal[np.isfinite(horizontal)]
     total = normalised.sum(axis=1)
-    total = total[np.isfinite(total)]  # none where the height is held, not estimated
+    total = total[np.isfinite(total)]  # none if the height is held, not estimated
     report: Report = {}
     for k in (1, 2, 3):
         share = float(np.mean(horizontal <= k * k)) if len(horizontal) else None

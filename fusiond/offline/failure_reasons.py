@@ -24,8 +24,8 @@ _TIMES = {"time_backwards", "time_ahead"}
 
 @immutable()
 class FileRead:
-    """Rows of a file: s of its own time from the first to the last used one (None: none), their
-    number, and the rejected ones. Frames of a bus are not measurements."""
+    """Rows of a file: its own times (s) of the first and last used row (None: none), the number of
+    used rows, and the rejected ones. Frames of a bus do not count as measurements."""
 
     span_s: tuple[float, float] | None
     used: int
@@ -34,7 +34,7 @@ class FileRead:
 
     @property
     def refused(self) -> int:
-        """Rows that are not used."""
+        """Number of rejected rows."""
         return sum(rejection_counts(self.rejected).values())
 
     @property
@@ -44,7 +44,7 @@ class FileRead:
 
 
 def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
-    """Sentence on forces or rates in other units than the columns' names state."""
+    """Sentence on forces or rates in other units than those of the columns' names."""
     if not len(imu.t_s):
         return None
     return force_unit(median(magnitudes(imu.samples))) or _rate_unit(imu, section, arrivals)
@@ -78,10 +78,9 @@ def _course_turns(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> C
 def nothing_navigated(
     files: Mapping[str, FileRead], refused: Mapping[str, Mapping[str, int]], reason: str
 ) -> str:
-    """The sentence for a run without a solution.
+    """Sentence for a run without a solution.
 
-    `files` by name, the first is the IMU's; `refused` outcomes by source; `reason` is the
-    alignment's.
+    `files` by name, the IMU's first; `refused`: outcomes by source; `reason`: the alignment's.
     """
     for name, file in files.items():
         if file.refused > file.used:
@@ -106,7 +105,7 @@ def nothing_navigated(
 
 
 def without_overlap(files: Mapping[str, FileRead]) -> list[str]:
-    """Lines on measurement files without common time with the first file, the IMU's."""
+    """Lines on measurement files whose times do not overlap the IMU's, the first file."""
     if not files:
         return []
     imu_name, imu, measurements = _measurements(files)
@@ -120,7 +119,7 @@ def without_overlap(files: Mapping[str, FileRead]) -> list[str]:
 def _measurements(
     files: Mapping[str, FileRead],
 ) -> tuple[str, FileRead, list[tuple[str, FileRead]]]:
-    """Split into the IMU's file, the first one, and those of measurements."""
+    """Split the files into the IMU's, the first one, and those of measurements."""
     (imu_name, imu), *others = files.items()
     return imu_name, imu, [(name, file) for name, file in others if file.is_measurement]
 
@@ -131,7 +130,7 @@ def _refused_rows(name: str, file: FileRead) -> str:
     if times > file.refused / 2:
         return f"{name}: its times run backwards in {times} of {file.rows} rows"
     if len(by_reason) > 1:
-        del by_reason["unpaired"]  # frames, of which several make a row
+        del by_reason["unpaired"]  # several frames make one row
     most, number = by_reason.most_common(1)[0]
     said = f"{name}: {number} of {file.rows} rows are refused as {most}"
     return f"{said}: {file.rejected[0]}" if file.rejected[0].line else said

@@ -66,8 +66,8 @@ _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset"
 
 
 class Arrival(NamedTuple):
-    """Arrival of a measurement or broadcast message, with one sigma of its instant; `utc_ns` where
-    the device stamped it with a date (POSIX)."""
+    """Arrival of a measurement or broadcast message, with one sigma of its instant; `utc_ns`
+    (POSIX) if the device's stamp has a date."""
 
     t_arrival_ns: int
     measurement: Measurement | RawEvent
@@ -91,11 +91,11 @@ _SECTIONS: dict[str, type[Aiding]] = {
 
 
 def source_of(kind: str, config: Config) -> str:
-    """The source that a file's measurements are taken to come from.
+    """Source to which a file's measurements are assigned.
 
-    The kind of the file (`gnss` for those of a receiver, `sar` for `bearing`), or else the first
-    section of that kind of measurement in the configuration; an attitude is a star tracker's where
-    there is one and no [aiding.attitude], raw data are of the section of kind `raw`.
+    It has the name of the file's kind (`gnss` for a receiver, `sar` for `bearing`), or else of the
+    first section for that kind of measurement in the configuration. An attitude belongs to a star
+    tracker if there is one and no [aiding.attitude], raw data to the section of kind `raw`.
     """
     name = "gnss" if kind in OF_A_RECEIVER else {"bearing": "sar"}.get(kind, kind)
     if name in config.aiding or kind in config.aiding:
@@ -205,7 +205,7 @@ def _read_bearing(path: Path, _: ImuTable, source: str) -> _Read:
 
 
 def _step_of(values: Array) -> float:
-    """Step to which values were rounded: the smallest difference of two; 0 for too few values."""
+    """Rounding step of values: the smallest difference of two; 0 for too few values."""
     found = np.unique(values)
     return float(np.diff(found).min()) if len(found) >= FEWEST_VALUES else 0.0
 
@@ -250,7 +250,7 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
 
 
 def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
-    """Read NMEA bytes of a wire. They hold UTC, so the IMU's `t_s` must be GPS second of week
+    """Read recorded NMEA bytes. They contain UTC, so the IMU's `t_s` must be GPS second of week
     (below 604800) or POSIX seconds."""
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     posix = len(imu.t_s) and not of_week
@@ -260,11 +260,11 @@ def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
-    """Read UBX or RTCM 3 bytes of a wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
-    must be GPS second of week or POSIX seconds.
+    """Read recorded UBX or RTCM 3 bytes, or RINEX. Epochs have GPS time, so the IMU's `t_s` must be
+    GPS second of week or POSIX seconds.
 
-    Broadcast data are known from the first epoch on, as to a receiver that has been on for some
-    minutes; a recording would need half a minute or more to repeat them.
+    Broadcast data are known from the first epoch on, as if the receiver had been on for some
+    minutes; otherwise they would be missing for half a minute or more.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
     from fusiond.offline.receiver_logs import read_rinex, rinex_text  # noqa: PLC0415
@@ -278,7 +278,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     if not of_week and len(imu.t_s):
-        decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
+        decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are resolved by the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
     corrections: list[Correction] = []

@@ -1,11 +1,11 @@
-"""NMEA file, read by the daemon's decoders: `--aid nmea=FILE`.
+"""Reader of NMEA files by the daemon's decoders: `--aid nmea=FILE`.
 
 The receiver's decoder has the options of its source in the configuration, so the file is read like
 the daemon's line: fixes, headings and attitudes of its antennas. HDG, HDM and HDT of other talkers
 belong to a compass, and are used if one is configured; so is any HDT in a file without a receiver.
 
-A file has no arrivals, so a measurement arrives at its validity. A sentence without a time belongs
-to the epoch before it in the file, and several of a kind in an epoch are spread evenly over it:
+A file has no arrival times, so a measurement arrives at its instant of validity. A sentence without
+a time belongs to the preceding epoch; several of one kind in an epoch are spread evenly over it:
 
     t = t_epoch + (k / n) (t_next - t_epoch),    k = 0 ... n - 1
 """
@@ -42,7 +42,7 @@ from fusiond.files.mistaken_log_kind import mistaken_log_kind
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.week_rollover import rollover_of
 
-# A recording may be old; before selective availability ended there was no receiver worth replaying.
+# Earliest date: the end of selective availability, before which fixes were too poor to be of use.
 EARLIEST_DATE = date(2000, 5, 1)
 _COMPASS = re.compile(
     rb"\$(?:[A-Z]{2}HD[GM]|(?!(?:%s)HDT)[A-Z]{2}HDT)," % "|".join(sorted(TALKERS)).encode()
@@ -55,7 +55,7 @@ _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
 
 
 class Receiver(NamedTuple):
-    """Owner of the sentences, by the configuration: source and options of the receiver, and of a
+    """Sources of the sentences by the configuration: names and options of the receiver, and of a
     compass, if any."""
 
     source: str
@@ -95,8 +95,8 @@ def receiver_of(source: str, config: Config) -> Receiver:
 def read_nmea(
     path: Path, imu_s: tuple[float, float] | None, by: Receiver
 ) -> tuple[list[Received], list[Rejection]]:
-    """Measurements in the file's order; times are POSIX, as the IMU's from and to `imu_s`, or GPS
-    second of week if that is None. A note tells what would improve them.
+    """Read measurements in the file's order. Times are POSIX, like the IMU's range `imu_s`, or GPS
+    second of week if that is None. Notes state how to improve the receiver's output.
 
     Raises `TableError` for a file without a single measurement, with the reason.
     """
@@ -112,7 +112,7 @@ def read_nmea(
         compass = CompassDecoder(
             by.compass, by.compass_decoding or CompassDecoding.model_validate({}), Counter()
         )
-        if not any(map(_POSITION.search, lines)):  # its HDT is no receiver's
+        if not any(map(_POSITION.search, lines)):  # then HDT is not the receiver's
             of_compass = list(enumerate(lines))
             receiver = [m for m in receiver if isinstance(m, TimeReport)]
         untimed += _fed(compass, of_compass)
@@ -139,7 +139,7 @@ def read_nmea(
     in_order = sorted(found, key=lambda each: each[0])
     received = [_received(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
     cautions = decoder.cautions
-    cautions.pop("compass_left_out", None)  # it is heard here, or counted
+    cautions.pop("compass_left_out", None)  # used here, or counted
     notes = [Rejection(0, *note, 0) for note in (*cautions.items(), *said)]
     return received, [
         *log.notes,
@@ -149,12 +149,12 @@ def read_nmea(
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:
-    """Measurements of the lines; a measurement's arrival is the number of its line."""
+    """Measurements of the lines; the arrival of each is its line number."""
     return [m for number, line in lines for m in decoder.feed(line, number)]
 
 
 class _Epochs:
-    """Lines at which epochs begin, and their instants (UTC, ns)."""
+    """First lines of epochs, and the epochs' instants (UTC, ns)."""
 
     def __init__(self, lines: list[bytes], measurements: Iterable[Any]) -> None:
         begins = _begins(lines)
@@ -168,7 +168,7 @@ class _Epochs:
         self.times = [places[line] for line in self._lines]
 
     def spread(self, untimed: list[Any]) -> list[tuple[int, Any]]:
-        """Stamp measurements without time with the epochs' instants, less the stated latency."""
+        """Stamp measurements without time by the epochs' instants, less the stated latency."""
         if not self.times:
             return []
         found: list[tuple[int, Any]] = []
@@ -185,7 +185,7 @@ class _Epochs:
 
 
 def _begins(lines: list[bytes]) -> list[int]:
-    """The lines that begin an epoch: the first of each time."""
+    """Lines that begin an epoch: the first one of each time."""
     found: list[int] = []
     last = b""
     for number, line in enumerate(lines):
@@ -211,7 +211,7 @@ def _is_refusal(name: str) -> bool:
 
 
 def _why_nothing(decoder: NmeaDecoder, refused: Counter[str], kind: str) -> str:
-    """Reason for the absence of measurements; `kind` is the file's probable kind."""
+    """Reason why the file has no measurements; `kind` is its probable kind."""
     if refused["undated"] or refused["untimed"]:
         absent = "that of RMC is empty" if decoder.received.used["RMC"] else "RMC or ZDA missing"
         cautions = decoder.cautions

@@ -1,4 +1,4 @@
-"""Windows in which recorded measurements are withheld, to test the navigator without them."""
+"""Outages: windows in which recorded measurements are withheld, to test the navigator."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ def withheld(source: str, t_s: float, outages: Sequence[Outage]) -> bool:
 
 
 def named(outages: Sequence[Outage]) -> set[str]:
-    """The sources that the windows name."""
+    """Names of the sources in the windows."""
     return {name for _, _, *names in outages for group in names for name in group}

@@ -1,4 +1,5 @@
-"""`fusiond process`: the daemon's navigator over recorded files, causal, a solution a sample.
+"""`fusiond process`: the daemon's navigator over recorded files, causal, with a solution at each
+sample.
 
 Samples come from a table or a recorded CAN bus, measurements from that bus and from files, in order
 of arrival (`t_arrival_s`, or `t_s` without it). The solution at each sample is the daemon's at that
@@ -46,12 +47,11 @@ from fusiond.offline.solution_rows import Rows, RowsWriter
 if TYPE_CHECKING:
     from fusiond.offline.smooth import SmoothedRows
 
-# Samples handed over at once where no late measurement arrives in between: the solution's mode is
-# judged at this spacing, and what ends the navigation is noticed at it, by which time later
-# measurements have been handed over. At 100 Hz that is half a second; ten times as many take a
-# seventh less time.
+# Samples handed over at once if no delayed measurement arrives in between: half a second at 100 Hz.
+# The mode, and an end of the navigation, are noticed only at this spacing, after later measurements
+# have been handed over. Ten times as many would save a seventh of the time.
 CHUNK = 50
-# Objects that are made before the garbage collector looks through them: some 10 MB.
+# New objects, some 10 MB, after which the garbage collector runs.
 YOUNG = 50_000
 _SHOWN = 20
 _REPORT_EVERY = 2000
@@ -72,14 +72,15 @@ def process(
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
-    The result on the solution: its rows, by mode too; its start; a sentence `why` if there is none.
-    Samples whose units contradict their columns are not navigated, and no `out` is written.
-    `systems` are the satellite systems of raw data to use, instead of the configuration's.
-    `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` receives the
-    navigator after each advance; `progress(done, total)` counts samples. With `smooth` the solution
-    at each sample uses all measurements, later ones too. Raises `TableError` for a file that is not
-    of its stated kind, and for an outage of an unknown source; `ConfigError` for a filter that
-    cannot be smoothed; `MissingPackageError` for a format whose package is not installed.
+    The result has the number of the solution's rows, in all and by mode, its start, and a sentence
+    `why` if there is none. Samples whose units contradict their columns are not navigated, and no
+    `out` is written. `systems` are the satellite systems of raw data to use, instead of the
+    configuration's. `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch`
+    receives the navigator after each advance; `progress(done, total)` counts samples. With `smooth`
+    the solution at each sample uses all measurements, later ones too. Raises `TableError` for a
+    file that is not of its stated kind, and for an outage of an unknown source; `ConfigError` for a
+    filter that cannot be smoothed; `MissingPackageError` for a format whose package is not
+    installed.
     """
     with _imports_left_alone():
         read = read_recorded(config, imu_path, measurements, outages or (), systems, can_log)
@@ -88,9 +89,9 @@ def process(
 
 @contextmanager
 def _imports_left_alone() -> Iterator[None]:
-    """Exempt imports, numba above all, from garbage collection, which would take a tenth of a
-    second each time that enough measurements have been made. New objects are collected less often
-    than by default, since nearly all of them live on."""
+    """Exempt imported objects, above all numba's, from garbage collection: each collection would
+    take a tenth of a second longer. New objects are collected less often than by default, since
+    nearly all of them stay in use."""
     thresholds = gc.get_threshold()
     gc.freeze()
     gc.set_threshold(YOUNG, *thresholds[1:])
@@ -147,7 +148,7 @@ def _process(
     }
 
 
-# The smoother's kernels are loaded where it is asked for.
+# Load the smoother's kernels only when used.
 
 
 def _taped(config: Config, model: Model, kinds: Sequence[Kind]) -> Estimator:
@@ -204,10 +205,10 @@ def _run(
     progress: Callable[[int, int], None],
 ) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
-    # A sample is there once its time has come; its own time offset shifts validity, not arrival.
-    # One whose stamp goes back comes no earlier for that.
+    # A sample arrives at its stamp; the IMU's time offset shifts validity, not arrival. A sample
+    # whose stamp goes back arrives after the previous one.
     came = np.maximum.accumulate(times)
-    # So many samples have come when arrival k comes.
+    # Number of samples that have arrived before arrival k.
     breaks = np.searchsorted(came, [a.t_arrival_ns for a in arrivals], side="right").tolist()
     waits = _waits(arrivals, navigator.config)
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
@@ -218,7 +219,7 @@ def _run(
             reported = done
             progress(done, len(times))
         if navigator.started is None:
-            # The daemon tries to align at each tick, with all that has come until then.
+            # The daemon tries to align at each tick, with all input until then.
             begin = [int(t) for t in came[done : done + 1]]
             begin += [a.t_arrival_ns for a in arrivals[given : given + 1]]
             now_ns = -(-min(begin) // tick_ns) * tick_ns
@@ -232,8 +233,8 @@ def _run(
             recorder.take()
             done = upto
             continue
-        # Samples up to the next arrival that must find the filter where it then stood. One that is
-        # valid when it comes need not: the timeline keeps it until the samples reach it.
+        # Samples up to the next delayed arrival, which must find the filter at its arrival. An
+        # arrival that is valid at once need not: the timeline keeps it until the samples reach it.
         ahead = given
         upto = min(len(times), done + CHUNK)
         alone = _has_gap(times[max(done - 1, 0) : upto], gap_ns)
@@ -294,14 +295,14 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
         navigator.learn(m)
         return
     t_ns = valid_ns(m)
-    if arrival.utc_ns is not None:  # of the date a compass' declination depends
+    if arrival.utc_ns is not None:  # a compass's declination depends on the date
         m = replace(m, stamp=UtcStamp(arrival.utc_ns))
     navigator.add(m, t_ns, arrival.sd_time_s, arrival.t_arrival_ns)
 
 
 def _waits(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
-    """True for each arrival that samples of its validity, or of a measurement that it contains,
-    precede."""
+    """True for each arrival that is preceded by samples later than its validity, or than that of a
+    measurement in it."""
     ahead = config.imu.time_offset_s > 0.0
     delayed = {
         source
@@ -314,7 +315,7 @@ def _waits(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
         if isinstance(m, BROADCAST):
             return False
         if isinstance(m, RawGnssEpoch):
-            return True  # corrected for the place where the filter has come to
+            return True  # corrected for the filter's present position
         return ahead or m.source in delayed or valid_ns(m) < t_ns
 
     return [is_delayed(arrival.t_arrival_ns, arrival.measurement) for arrival in arrivals]
@@ -325,7 +326,7 @@ def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
 
 
 class _Recorder:
-    """Recorder of each sample's first solution; counts, modes and start."""
+    """Recorder of each sample's first solution, with counts, modes and start."""
 
     def __init__(
         self,

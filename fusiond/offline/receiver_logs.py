@@ -1,4 +1,4 @@
-"""Logs of receivers as measurements with their arrivals: UBX-NAV, BESTPOS, SBF, and RINEX."""
+"""Reader of receivers' logs (UBX-NAV, BESTPOS, SBF, RINEX) as measurements with arrivals."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ _COMPRESSED = (b"\x1f\x9d", b"PK", b"BZ")
 
 
 def decoding_of(source: str, config: Config) -> SolutionDecoding:
-    """The options of the configured receiver, as of the daemon's; a log may be of any date."""
+    """Options of the configured receiver, as in the daemon, but for a log of any date."""
     points = driver_entry_points()
     found: dict[str, Any] = {}
     for name, section in config.sources.items():
@@ -107,8 +107,8 @@ def decoding_of(source: str, config: Config) -> SolutionDecoding:
 def read_solutions(
     kind: str, path: Path, imu: ImuTable, source: str, decoding: SolutionDecoding
 ) -> Read:
-    """Read fixes and headings of a receiver's own protocol. They hold UTC, so the IMU's `t_s` must
-    be GPS second of week or POSIX seconds. TableError without a fix."""
+    """Read fixes and headings in a receiver's own protocol. They contain UTC, so the IMU's `t_s`
+    must be GPS second of week or POSIX seconds. TableError without a fix."""
     decoder = _DECODERS[kind](source, decoding)
     log = log_bytes(path)
     found = [*decoder.feed(log.data, 0), *decoder.flush()]
@@ -149,8 +149,8 @@ _LINE = 200
 
 
 def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
-    """Text of the file, unpacked (Hatanaka, compress, zip), and its losses; None for a file that is
-    not RINEX. MissingPackageError, TableError."""
+    """Text of a RINEX file, unpacked (Hatanaka, compress, zip), and a text on lost data; None for
+    any other file. MissingPackageError, TableError."""
     data = data.removeprefix(codecs.BOM_UTF8).lstrip(b"\r\n")
     first = data[:_LINE].partition(b"\n")[0].decode("ascii", "replace")
     label = first[LABEL].strip()
@@ -176,7 +176,7 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
             warnings.simplefilter("always")
             text = str(hatanaka.decompress(data).decode("ascii", "replace"))
         return text, [Rejection(0, "damaged", _said(doubt), 0) for doubt in doubts]
-    except Exception as error:  # it hands on what zip, ncompress and crx2rnx raise
+    except Exception as error:  # it passes on errors of zip, ncompress and crx2rnx
         text = _before_damage(data) if label == COMPRESSED_LABEL else ""
         if not text:
             raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
@@ -185,13 +185,13 @@ def rinex_text(path: Path, data: bytes) -> tuple[str, list[Rejection]] | None:
 
 
 def _said(doubt: warnings.WarningMessage) -> str:
-    """Message of the unpacking program on omitted data, on one line."""
+    """Unpacking program's message on omitted data, in one line."""
     return f"the unpacking says: {' '.join(str(doubt.message).split())}"
 
 
 def _before_damage(data: bytes) -> str:
-    """Epochs of Hatanaka's compression before the damage, as far as the package's program has
-    written them; "" without any."""
+    """Epochs of a damaged Hatanaka file that the unpacking program has written before the damage;
+    "" without any."""
     program = importlib.resources.files("hatanaka.bin") / "crx2rnx"
     with importlib.resources.as_file(program) as path:
         done = subprocess.run([path, "-"], input=data, capture_output=True, check=False)
@@ -202,8 +202,8 @@ def _before_damage(data: bytes) -> str:
 def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
     """Read epochs of an observation file, or messages of a navigation file.
 
-    An ephemeris arrives when it was sent; the first of each satellite is known from the start, as
-    to a receiver that has been on. TableError for any other file."""
+    An ephemeris arrives when it was sent, but the first of each satellite is known from the start,
+    as if the receiver had been on before. TableError for any other file."""
     counters = Counter[str]()
     try:
         text = as_version_3(text)
@@ -232,7 +232,7 @@ def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:
 
 
 def _kind(message: NavigationMessage) -> tuple[str, str]:
-    """Kind of a message that the next of its kind replaces: satellite and message, or ionosphere
+    """Key of a message, by which a later one replaces it: satellite and message, or ionosphere
     model."""
     if isinstance(message, Correction):
         return message.satellite, message.part

@@ -1,4 +1,4 @@
-"""Input of a run: samples and measurements of files or of a recorded bus, in order of arrival."""
+"""Input of a run: samples and measurements from files or a recorded bus, in order of arrival."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def read_recorded(
     files: dict[str, FileRead] = {}
     units: list[tuple[int, ImuSample]] = []
     if can_log is not None:
-        # python-can and the DBC files' reader come only where there is a bus to be read.
+        # Import python-can and the DBC reader only for a recorded bus.
         from fusiond.offline.can_through_drivers import read_can_log  # noqa: PLC0415
 
         log = read_can_log(can_log, config)
@@ -125,7 +125,7 @@ def _read_measurement(
     source = source_of(kind, config)
     if kind == "nmea":
         return read_nmea_by(path, imu, receiver_of(source, config))
-    if kind in OF_A_RECEIVER:  # their decoders come only where there is such a file
+    if kind in OF_A_RECEIVER:  # import their decoders only for such a file
         from fusiond.offline.receiver_logs import decoding_of, read_solutions  # noqa: PLC0415
 
         return read_solutions(kind, path, imu, source, decoding_of(source, config))
@@ -137,7 +137,7 @@ BROADCAST = Ephemeris, Klobuchar, Bdgim, SignalDelays, Correction
 
 
 def valid_ns(m: Measurement | RawGnssEpoch) -> int:
-    """Validity of a recorded measurement, on the IMU's clock."""
+    """Instant of validity of a recorded measurement, by the IMU's clock."""
     stamp = getattr(m, "stamp", None)
     assert isinstance(stamp, MonotonicStamp)
     return stamp.t_ns
@@ -159,8 +159,8 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Span of the measurements' instants; broadcast messages have none, so a file of these has the
-    span of arrivals."""
+    """First and last instant (s) of the measurements, or of the arrivals in a file of broadcast
+    messages, which have no instants."""
     instants = [
         valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
     ] or [row.t_arrival_ns for row in rows]

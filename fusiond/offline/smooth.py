@@ -1,10 +1,10 @@
-"""`fusiond process --smooth`: the solution at each sample from all measurements, later ones too.
+"""`fusiond process --smooth`: the solution at each sample by all measurements, also later ones.
 
 The filter runs as usual and records a tape (fusiond.estimators.smoothing). The daemon's solution at
 each sample, in the last pass over it, is kept until the navigation has ended; then the smoother
-runs backward over the tape and corrects it. Each start of the filter is smoothed separately:
-measurements before an alignment are no evidence on the navigation after it. Invalid solutions
-remain invalid: measurements that contradicted the filter do not improve it backward.
+runs backward over the tape and corrects it. Each start of the filter is smoothed separately,
+because measurements before an alignment do not bear on the navigation after it. Invalid solutions
+remain invalid: measurements that contradicted the filter cannot improve it backward.
 
 Measurements at 12 instants a second make 0.3 GB of tape an hour, samples at 100 Hz 0.06 GB of
 solutions. An hour is kept in memory; anything beyond it goes to a temporary file without a name in
@@ -36,15 +36,15 @@ from fusiond.offline.solution_rows import Rows, RowsWriter
 Held = list[NDArray[Any]] | tuple[int, int]
 """Arrays, or their place in the file and number."""
 
-# Nodes and solutions that are put aside at once, some 13 MB and 1.4 MB; beyond so many bytes of
-# them into a file.
+# Nodes and solutions that are put aside at once, some 13 MB and 1.4 MB; above the third number
+# (bytes) they go to a file.
 BLOCK_NODES, BLOCK_ROWS, MOST_BYTES = 2048, 8192, 512_000_000
 _SMOOTHED, _INVALID = STATUS.index(SMOOTHED), STATUS.index(Mode.INVALID)
 
 
 def taped(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> TapedKalman:
-    """The estimator of a configuration, with a tape; it computes no protection levels, which are
-    not of a smoothed solution. ConfigError for a filter that has no tape."""
+    """Estimator of a configuration, with a tape and without protection levels, which do not apply
+    to a smoothed solution. ConfigError for a filter that has no tape."""
     if config.estimator.filter != "kalman":
         raise ConfigError(
             f"estimator.filter: {config.estimator.filter!r} cannot be smoothed; choose 'kalman'"
@@ -75,7 +75,8 @@ class SmoothedRows:
         self.rows = self.nodes = self.starts = 0
 
     def follow(self) -> None:
-        """The navigator has advanced: rows of an earlier pass are of the last one again."""
+        """Update after an advance of the navigator: rows of an earlier pass are replaced by the
+        last one's."""
         e, imu = self._estimator, self._navigator.imu
         since = max(e.rewound, self._first, imu.start)
         upto = min(e.sample, self._first + self._count)
@@ -124,7 +125,7 @@ class SmoothedRows:
     def _finish(self, newest: Node) -> None:
         """Smooth the navigation since one start and write its rows."""
         nodes, _ = nodes_of(newest, self._kept, NEVER)
-        # A filter whose numbers failed is given up at once: what it left last is no part of it.
+        # A filter that has failed numerically is given up at once: its last node is not used.
         unsound = np.flatnonzero(~np.isfinite(nodes.bodies).all(axis=1))
         if unsound.size:
             nodes = nodes.first(int(unsound[0]))

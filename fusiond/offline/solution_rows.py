@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 
 
 class Rows(NamedTuple):
-    """Solutions of successive samples: `times` (m,) ns, `nav` (m, 10), `sigmas` (m, 9) in the order
-    of the file, `status` (m,) indices into `fusiond.files.solution_csv.STATUS`."""
+    """Solutions of successive samples: `times` (m,) ns, `nav` (m, 10), `sigmas` (m, 9) in the
+    file's order, `status` (m,) indices into `fusiond.files.solution_csv.STATUS`."""
 
     times: NDArray[np.int64]
     nav: Array
@@ -31,8 +31,8 @@ class Rows(NamedTuple):
 
 
 class RowsWriter:
-    """Writer of rows to a file; a value that the model holds (not `stated`, (9,)) has no sigma, and
-    an unknown height an empty cell."""
+    """Writer of rows to a file. A value that the model holds (not `stated`, (9,)) has no sigma; an
+    unknown height has an empty cell."""
 
     def __init__(self, out: Path, stated: NDArray[np.bool_]) -> None:
         self._writer = SolutionWriter(out)

@@ -1,7 +1,7 @@
-"""Fixes of a receiver whose GPS week has rolled over: their dates are 1024 weeks early.
+"""Detection of fixes from a receiver after a rollover of its GPS week: dates 1024 weeks early.
 
-An IMU with POSIX time reveals fixes that are 1024 weeks off. With GPS second of week nothing
-reveals it, and only the leap seconds are wrong, those of the wrong date.
+The POSIX times of an IMU reveal fixes that are 1024 weeks off. GPS second of week cannot reveal it;
+then only the leap seconds are wrong, since they are those of the wrong date.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ ROLLOVER_NS = ROLLOVER.days * 86_400 * 1_000_000_000
 
 
 class Rollover(NamedTuple):
-    """Correction of instants (ns), and text, by a name."""
+    """Correction of instants (ns), with a named text."""
 
     add_ns: int = 0
     said: tuple[tuple[str, str], ...] = ()
 
 
 def rollover_of(utc_ns: Sequence[int], imu_s: tuple[float, float] | None) -> Rollover:
-    """Rollover of fixes at `utc_ns`, by an IMU's times (POSIX; None: not POSIX)."""
+    """Find the rollover of fixes at `utc_ns` by an IMU's times (POSIX; None: not POSIX)."""
     if not utc_ns:
         return Rollover()
     first_ns, last_ns = min(utc_ns), max(utc_ns)

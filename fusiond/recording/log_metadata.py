@@ -23,7 +23,7 @@ _PACKAGES = ("numpy", "numba", "scipy", "mcap")
 
 
 def about_run(config: Config, run: str, epoch_ns: int, sources: Iterable[str]) -> About:
-    """Metadata of a run of the daemon. `epoch_ns`: the log's time minus CLOCK_MONOTONIC."""
+    """Metadata of a run of the daemon. `epoch_ns`: the log's time minus the daemon's clock."""
     metadata = {
         "format": FORMAT,
         "version": version("fusiond"),

@@ -58,7 +58,7 @@ class LogError(Exception):
 
 
 class LogMessage(NamedTuple):
-    """A message of a log. `t_log_ns` is CLOCK_MONOTONIC plus the log's `epoch_ns`."""
+    """Message of a log. `t_log_ns` is the daemon's clock plus the log's `epoch_ns`."""
 
     topic: str
     t_log_ns: int

@@ -1,4 +1,4 @@
-"""Host clocks of a replay: they read what was recorded."""
+"""Host clocks of a replay, which return the recorded readings."""
 
 from __future__ import annotations
 

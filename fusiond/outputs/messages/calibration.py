@@ -15,7 +15,7 @@ class CalibratedParameter(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    value: float = Field(description="beyond the configured value")
+    value: float = Field(description="difference from the configured value")
     sd: float = Field(description="one sigma")
     prior_sd: float = Field(description="the configured sigma, before anything is observed")
     state: CalibrationState
@@ -24,7 +24,7 @@ class CalibratedParameter(BaseModel):
 class CalibrationMessage(Message):
     """Calibration by the filter: mounting, lever arms, offsets in time and scales."""
 
-    settled: bool = Field(description="all that is estimated has settled")
+    settled: bool = Field(description="every estimated parameter has settled")
     parameters: dict[str, CalibratedParameter]
 
 

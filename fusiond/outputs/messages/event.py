@@ -15,7 +15,7 @@ class EventMessage(Message):
     code: str = Field(description="stable, for rules")
     source: str
     text: str
-    advice: str = Field(default="", description="next step; empty: there is nothing to do")
+    advice: str = Field(default="", description="next step; empty if none is needed")
 
 
 def event_message(utc_ns: int | None, *, source: str, code: str, text: str) -> EventMessage:

@@ -16,15 +16,15 @@ class FaultReport(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: str = Field(description="the device at fault")
-    kind: str = Field(description="of the catalogue, such as `velocity`")
-    axis: str | None = Field(description="on which it is largest; null where there is one")
-    size: Number = Field(description="on that axis, in `unit`")
+    kind: str = Field(description="kind of fault, such as `velocity`")
+    axis: str | None = Field(description="axis of its largest part; null without axes")
+    size: Number = Field(description="size on that axis, in `unit`")
     sd: Number = Field(description="one sigma of `size`, in `unit`")
     unit: str
-    since_s: float = Field(description="s ago that it began")
-    log_odds: float = Field(description="natural, against nothing being wrong")
+    since_s: float = Field(description="seconds since its start")
+    log_odds: float = Field(description="natural logarithm of its odds against no fault")
     action: Literal["left out", "corrected"]
-    text: str = Field(description="the same for people")
+    text: str = Field(description="the fault as a sentence")
 
 
 def fault_report(finding: Finding, source: str, t_ns: int) -> FaultReport:

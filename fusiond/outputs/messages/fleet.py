@@ -22,7 +22,7 @@ class FleetMessage(Message):
     by: Literal["report", "centre"] = Field(
         description="`report`: its own solution; `centre`: a fix that the centre passed on"
     )
-    received_ms: Milliseconds | None = Field(description="when it came, POSIX milliseconds, UTC")
+    received_ms: Milliseconds | None = Field(description="arrival, POSIX milliseconds, UTC")
     mode: Mode | None
     lat_deg: QuarterTurn
     lon_deg: HalfTurn

@@ -22,7 +22,7 @@ class SatelliteHealth(BaseModel):
 
     azimuth_deg: Number = Field(default=None, description="clockwise from true north")
     elevation_deg: Number = None
-    cno_db_hz: Number = Field(default=None, description="of its strongest signal")
+    cno_db_hz: Number = Field(default=None, description="C/N0 of the strongest signal")
 
 
 class SkyHealth(BaseModel):
@@ -31,7 +31,7 @@ class SkyHealth(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     used: tuple[str, ...] = Field(default=(), description="satellites, such as C21")
-    refused: dict[str, str] = Field(default_factory=dict, description="satellite to reason")
+    refused: dict[str, str] = Field(default_factory=dict, description="reason by satellite")
     gdop: Number = None
     pdop: Number = None
     hdop: Number = None
@@ -41,7 +41,7 @@ class SkyHealth(BaseModel):
         default=None, description="of the ranges used, normalised; 1 is expected"
     )
     satellites: dict[str, SatelliteHealth] = Field(
-        default_factory=dict, description="all of the epoch; no direction for what had no ephemeris"
+        default_factory=dict, description="all of the epoch; without ephemeris no direction"
     )
 
 
@@ -50,12 +50,12 @@ class BeamHealth(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    levels: tuple[Count, ...] = Field(description="of power, 0 to 4; one of 2 or more is usable")
+    levels: tuple[Count, ...] = Field(description="power of each beam, 0 to 4; usable from 2 on")
     serving: Count | None = Field(
-        description="that answers: named by the terminal, else the strongest; null: none is heard"
+        description="beam in use: named by the terminal, else the strongest; null: none"
     )
     time_difference: Count | None = Field(
-        description="the second satellite's, where the terminal names it"
+        description="beam of the second satellite, if the terminal names it"
     )
 
 
@@ -68,24 +68,24 @@ class SourceHealth(BaseModel):
     detail: str = ""
     received: Count = 0
     fused: Count = 0
-    rejected: dict[str, Count] = Field(default_factory=dict, description="by reason")
-    age_s: Number = Field(default=None, description="since the last measurement came in")
+    rejected: dict[str, Count] = Field(default_factory=dict, description="number by reason")
+    age_s: Number = Field(default=None, description="since the last arrival")
     fused_age_s: Number = Field(default=None, description="since the last one was fused")
-    latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
+    latency_s: Number = Field(default=None, description="validity to arrival, of the last one")
     counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
     service: Service | None = Field(
-        default=None, description="state of its worst series; null: none of it is fused"
+        default=None, description="state of its worst series; null: nothing is fused"
     )
     series: dict[str, Service] = Field(
-        default_factory=dict, description="state of each series that it sends, by its name"
+        default_factory=dict, description="state of each of its series, by name"
     )
     isolated: str | None = Field(
-        default=None, description="why the series of its name is left out; null: it is not"
+        default=None, description="reason why the series of this name is excluded; null: it is not"
     )
     diagnosis: FaultReport | None = Field(
-        default=None, description="its latest fault that is not over; null: none is known"
+        default=None, description="its latest active fault; null: none"
     )
-    verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
+    verdict: Verdict | None = Field(default=None, description="see topic `consistency`")
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
     beams: BeamHealth | None = Field(default=None, description="of an RDSS terminal")
 
@@ -127,9 +127,9 @@ class HealthMessage(Message):
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
-    lateness_sum_s: float = Field(description="of all ticks")
+    lateness_sum_s: float = Field(description="sum over all ticks")
     lateness_at_most_s: dict[str, Count] = Field(
-        description="ticks that were no later than so many seconds"
+        description="number of ticks up to so many seconds late"
     )
     gc_max_ms: float
     utc_source: str

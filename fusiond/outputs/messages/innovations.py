@@ -16,10 +16,10 @@ class Innovation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: str
-    t_ms: Milliseconds | None = Field(description="of validity, POSIX milliseconds, UTC")
+    t_ms: Milliseconds | None = Field(description="instant of validity, POSIX milliseconds, UTC")
     outcome: str = Field(description="`fused`, `gated`, ... as `health` counts them")
-    nis: Number = Field(description="nu^T S^-1 nu; null where there was none")
-    degrees: Count = Field(description="of freedom: what `nis` is expected to be")
+    nis: Number = Field(description="nu^T S^-1 nu; null without an innovation")
+    degrees: Count = Field(description="degrees of freedom: the expected `nis`")
 
 
 class InnovationsMessage(Message):

@@ -22,21 +22,21 @@ class ShortMessage(Message):
     its restart: the same `serial` marks the same message.
     """
 
-    serial: Count = Field(description="grows with each; the same again says the same")
+    serial: Count = Field(description="grows with each report; equal in a repetition")
     direction: Literal["sent", "received"]
-    source: str = Field(description="the terminal")
-    card: Card = Field(description="the other one: whom it is for, or whom it is from")
-    id: str | None = Field(description="of the command that sent it; null for one that came")
+    source: str = Field(description="name of the terminal")
+    card: Card = Field(description="the other card: receiver or sender")
+    id: str | None = Field(description="id of its command; null for a received message")
     kind: Kind
     state: Stage | Literal["received"]
-    over: bool = Field(description="nothing more comes of it")
-    why: str = Field(description="what it waits for, or why this is its end")
-    text: str | None = Field(description="null where it is none, such as a report")
-    hex: str = Field(description="as the terminal carries it")
-    attempts: Count = Field(description="how often it was sent, as far as is known")
-    receipt: bool = Field(description="a receipt was asked for")
-    repeated: bool = Field(description="the same text came before: its receipt was lost")
-    fault: Fault | None = Field(description="what is wrong with one that came; null: nothing")
+    over: bool = Field(description="last report of this message")
+    why: str = Field(description="reason for the wait, or for the end")
+    text: str | None = Field(description="null if it is no text, such as a report")
+    hex: str = Field(description="bytes as the terminal carries them")
+    attempts: Count = Field(description="number of transmissions, as far as known")
+    receipt: bool = Field(description="a receipt was requested")
+    repeated: bool = Field(description="the text came before: its receipt was lost")
+    fault: Fault | None = Field(description="defect of a received message; null if none")
     sent_at: str | None = Field(description="hh:mm by the centre, in the terminal's zone")
 
 

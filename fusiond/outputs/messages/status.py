@@ -32,11 +32,11 @@ class StatusMessage(Message):
     mode: Mode
     why: str
     protection: BoundState
-    imu: str | None = Field(description="the source whose samples are used")
+    imu: str | None = Field(description="source of the samples in use")
     faults: tuple[FaultReport, ...] = Field(
-        default=(), description="of all devices, as far as they are not over; the latest at the end"
+        default=(), description="active faults of all devices, the latest last"
     )
-    calibrated: bool = Field(description="all of `calibration` has settled")
+    calibrated: bool = Field(description="every parameter of `calibration` has settled")
     since_utc: str | None
     since_ms: Milliseconds | None
     version: str
@@ -46,11 +46,11 @@ class StatusMessage(Message):
     overruns: Count
     fused: Count
     rejected: Count
-    recording: RecordingState = Field(description="of the log; `waiting`: for an event")
+    recording: RecordingState = Field(description="state of the log; `waiting`: until an event")
     recording_file: str | None = Field(description="the file that is being written")
-    recording_dropped: Count = Field(description="messages that the disk was too slow for")
-    disk_free_mb: Number = Field(description="where it is written, 10^6 bytes")
-    injected: tuple[str, ...] = Field(description="faults put in by `cmd/inject`, while they last")
+    recording_dropped: Count = Field(description="messages lost to a slow disk")
+    disk_free_mb: Number = Field(description="free space for the log, 10^6 bytes")
+    injected: tuple[str, ...] = Field(description="active faults of `cmd/inject`")
     mqtt_published: Count
     mqtt_dropped: Count
     mqtt_reconnects: Count
