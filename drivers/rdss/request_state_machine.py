@@ -12,8 +12,8 @@ the actions they return, and `next_deadline_ns`, when to call `tick` next. Only 
 
 Never sent are a lift of radio silence and an emergency request. A request or a message is not sent
 while another is in flight, before the card's service interval has passed since the previous one,
-while the terminal is suppressed or silent, or without the option `transmit`. An overdue fix holds up
-the next request, until it is given up, but no message. If a request and a message both wait,
+while the terminal is suppressed or silent, or without the option `transmit`. An overdue fix holds
+up the next request, until it is given up, but no message. If a request and a message both wait,
 `outbox.StrideScheduler` decides. Figures: PROTOCOLS 1.1 and 1.5.
 """
 
