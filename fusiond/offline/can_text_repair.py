@@ -258,7 +258,7 @@ def candump_of(stamps: list[str]) -> Candump:
 
 def _fall_or_stand(stamps: list[float]) -> bool:
     """True if the stamps are differences: they decrease, and end no later than they began; or they
-    are equal from the second on. In a log of two buses, one after the other, stamps decrease, too."""
+    are equal from the second on. They also decrease in a log of two buses, one after the other."""
     falls = any(after < before for before, after in pairwise(stamps))
     half = len(stamps) // 2
     grows = max(stamps[half:]) > max(stamps[: half + 1])
