@@ -25,6 +25,8 @@ import numpy as np
 
 from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDriver
+from drivers.nmea.driver import NmeaDriver
+from drivers.port import ByteBudget
 from fusiond.bench.fix_call_trace import FixPath, Trace, median
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.load import load_config
@@ -49,9 +51,9 @@ AHEAD_NS = 1_796_083_200_000_000_000 - BEGIN_NS
 """Begin of the drive on the host's monotonic clock, and the lead of UTC: it is 2026-12-01."""
 LEFT_OUT = frozenset(
     {"Wired._samples", "Sources.poll", "Sources.catch_up", "Sources.take_imu", "Navigator.add_imu"}
-    | {"ReceiverDriver._watch"}
+    | {"ReceiverDriver._watch", "SerialLine._serve", "SerialLine.run"}
 )
-"""Entrances of samples, and a timer: nothing of a fix is called from there."""
+"""Entrances of samples, and timers of the host: nothing of a fix is called from there."""
 CONFIG = """
 vehicle = "bench"
 state_file = "{folder}/state.json"
@@ -123,7 +125,7 @@ class Wired:
         self.daemon = Daemon(config, Clock(config.clock, self.host))
         self.daemon.scheduler._sleep = self._sleep
         self._woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._sample = self._epoch = 0
+        self._sample = self._epoch = self._sent = 0
 
     async def _sleep(self, _: float) -> None:
         self._woken = asyncio.get_running_loop().create_future()
@@ -135,7 +137,8 @@ class Wired:
         mqtt = cast(MqttPublisher, daemon.outputs["mqtt"])
         mqtt._flowing.set()
         self._line.plug()
-        self.gnss = daemon.sources.all["gnss"].driver
+        self.gnss = cast(NmeaDriver, daemon.sources.all["gnss"].driver)
+        self.gnss._line._budget = ByteBudget(now_s=lambda: self.host.t_ns * 1e-9)
         tasks = (
             self.gnss.run(),
             daemon.scheduler.run(),
@@ -154,9 +157,12 @@ class Wired:
         t_s = float(self._receiver.t_arrival_s[self._epoch])
         if BEGIN_NS + t_s * 1e9 <= deadline:
             self.host.t_ns = BEGIN_NS + round(t_s * 1e9)
-            assert self._line.write(self._receiver.nmea(self._epoch, BEGIN_NS + AHEAD_NS))
+            data = self._receiver.nmea(self._epoch, BEGIN_NS + AHEAD_NS)
+            assert self._line.write(data)
             self._epoch += 1
-            await self._turns()
+            self._sent += len(data)
+            while self.gnss.counters["bytes_in"] < self._sent:  # noqa: ASYNC110 (nobody sets one)
+                await asyncio.sleep(0)
         self.host.t_ns = deadline
         self._woken.set_result(None)
         await self._turns()

@@ -60,7 +60,9 @@ class Spacing:
         found, longest_ns = checkpoints[:1], self._longest_ns
         for one, later in pairwise(checkpoints[1:]):
             before_ns = found[-1].snapshot.t_ns
-            asked_ns = min(longest_ns, max(CLOSEST_NS, (latest_ns - before_ns) // SHARE_OF_AGE))
-            if later.snapshot.t_ns - before_ns > asked_ns:
+            gap_ns = later.snapshot.t_ns - before_ns
+            if gap_ns > longest_ns or (
+                gap_ns > CLOSEST_NS and gap_ns > (latest_ns - before_ns) // SHARE_OF_AGE
+            ):
                 found.append(one)
         checkpoints[:] = [*found, *checkpoints[1:][-1:]]
