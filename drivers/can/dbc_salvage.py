@@ -197,8 +197,8 @@ class _Reader:
         return _read([*heads, *self._shared, *own])
 
     def _partly(self, unit: _Unit, reason: str) -> list[Message]:
-        """Message without its unreadable attributes or signals; empty if other signals depend on one
-        of them."""
+        """Message without its unreadable attributes or signals; empty if other signals depend on
+        one of them."""
         plain = unit.without_attributes()
         if not isinstance(found := self._together([plain.text()]), str):
             self._left_out[f"an attribute of {unit.name}"] = reason
