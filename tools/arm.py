@@ -3,7 +3,7 @@
 | step | what |
 |---|---|
 | `import` | Debian's Python for arm64 imports the locked wheels for aarch64 |
-| `kernel` | numba compiles a kernel there, which gives the bytes that it gives here |
+| `kernel` | numba compiles a kernel and two that it calls, or links them: the bytes of here |
 | `drive` | `fusiond process` over 10 s of driving writes the file that it writes here |
 
 All three without an argument. `drive` compiles the kernels first, for ten minutes and more; what is
@@ -14,6 +14,7 @@ build/arm/root, with lists of their own, and run by `qemu-aarch64-static`.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -32,9 +33,15 @@ SECONDS = 10
 REST_S = 60
 """The scenario `drive` stands for that long first."""
 KERNEL = """
+import os, sys
+os.environ["NUMBA_CACHE_DIR"] = sys.argv[1]
 import numpy as np
-from fusiond.navigation.rotation import rotation_vector_to_quaternion
-print(np.array(rotation_vector_to_quaternion(0.1, -0.2, 2.5)).tobytes().hex())
+from fusiond.navigation import kernel_cache
+kernel_cache.CALLED_FROM = 1  # by their symbols, as a large kernel is
+from fusiond.navigation.rotation import turn_to_dcm
+dcm = np.empty((3, 3))
+turn_to_dcm(0.1, -0.2, 2.5, dcm)
+print(dcm.tobytes().hex())
 """
 IMPORTS = """
 import platform
@@ -120,11 +127,15 @@ def check_import() -> None:
 
 
 def check_kernel() -> None:
-    """One kernel gives the same bits."""
-    here, there = output([sys.executable, "-c", KERNEL], None), emulated(["-c", KERNEL])
-    if here != there:
-        sys.exit(f"arm: a kernel gives {there.strip()}, on this machine {here.strip()}")
-    say(f"rotation_vector_to_quaternion gives the same 32 bytes: {there.strip()[:16]}...")
+    """Kernels that call each other give the same bits, compiled and linked from the cache."""
+    cache = FOLDER / "kernel"
+    shutil.rmtree(cache, ignore_errors=True)
+    here = output([sys.executable, "-c", KERNEL, str(cache / "here")], None)
+    for how in ("compiled", "from the cache"):
+        there = emulated(["-c", KERNEL, str(cache / "there")])
+        if here != there:
+            sys.exit(f"arm: {how}, a kernel gives {there.strip()}, on this machine {here.strip()}")
+        say(f"{how}, turn_to_dcm gives the same 72 bytes: {there.strip()[:16]}...")
 
 
 def check_drive() -> None:

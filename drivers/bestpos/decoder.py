@@ -2,7 +2,8 @@
 
     BESTPOS, BESTGNSSPOS, RTKPOS, PSRPOS   height above the sea + undulation = ellipsoidal height
     BESTVEL, BESTGNSSVEL, RTKVEL, PSRVEL   speed over ground, track, vertical speed upwards
-    BESTNAV                                position, its sigmas, velocity and its two, in one log
+    BESTNAV, ADRNAV, SPPNAV                position, its sigmas, velocity and its two, in one log
+    PPPNAV                                 the same without a velocity
     HEADING, HEADING2, UNIHEADING, DUALANTENNAHEADING    with a sigma
     TIME                                   UTC offset, where the header does not say leap seconds
 
@@ -24,9 +25,15 @@ from drivers.raw.weeks import utc_as_reported
 from drivers.solution import Solution
 from drivers.solution_decoder import SolutionDecoder
 
-POSITIONS = ("BESTGNSSPOS", "BESTNAV", "BESTPOS", "RTKPOS", "PPPPOS", "PSRPOS")
+POSITIONS = (
+    *("BESTGNSSPOS", "BESTNAV", "BESTPOS", "ADRNAV", "RTKPOS"),
+    *("PPPNAV", "PPPPOS", "SPPNAV", "PSRPOS"),
+)
 """Best first: BESTPOS of a receiver with an IMU is its inertial solution, BESTGNSSPOS is not."""
-VELOCITIES = ("BESTGNSSVEL", "BESTNAV", "BESTVEL", "RTKVEL", "PPPVEL", "PSRVEL")
+VELOCITIES = (
+    *("BESTGNSSVEL", "BESTNAV", "BESTVEL", "ADRNAV", "RTKVEL", "PPPVEL", "SPPNAV", "PSRVEL"),
+)
+_WITH_BOTH = frozenset(POSITIONS) & frozenset(VELOCITIES)
 HEADINGS = frozenset({"HEADING", "HEADING2", "UNIHEADING", "DUALANTENNAHEADING"})
 TYPES: dict[str, int | str] = {
     "SINGLE": 1,
@@ -181,9 +188,9 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
         )
 
     def _velocity(self, log: Log) -> tuple[_Velocity, _VelocitySd | None] | None:
-        """Velocity; None if the receiver has none, or its firmware lacks BESTNAV."""
+        """Velocity; None if the receiver has none, or its firmware's log lacks one."""
         f = log.fields
-        if log.name == "BESTNAV":
+        if log.name in _WITH_BOTH:
             if len(f) < _BOTH:
                 return None
             f = f[_VELOCITY_AT:]
@@ -198,7 +205,7 @@ class BestposDecoder(SolutionDecoder[Log, _Epoch]):
             self.counters["velocity_latent"] += 1
         course = math.radians(track)
         v = speed * math.cos(course), speed * math.sin(course), -up
-        if log.name != "BESTNAV" or len(f) < 9:
+        if log.name not in _WITH_BOTH or len(f) < 9:
             return v, None
         level, vertical = _number(f[7]), _number(f[8])
         return v, (level, level, vertical)

@@ -101,6 +101,11 @@ class _Unit:
         own = [line for name, line in self.own if name is None or name in left]
         return "\n".join((self.head, *lines)), "\n".join(own)
 
+    def without_attributes(self) -> _Unit:
+        """The message without what no frame depends on, such as a format that no list has."""
+        own = [(name, line) for name, line in self.own if not line.startswith("BA_")]
+        return _Unit(self.name, self.head, self.signals, own, self.marked)
+
     @property
     def selectors(self) -> set[str]:
         """Multiplexer signals, which select others."""
@@ -192,7 +197,12 @@ class _Reader:
         return _read([*heads, *self._shared, *own])
 
     def _partly(self, unit: _Unit, reason: str) -> list[Message]:
-        """Message without its unreadable signals; None if other signals depend on one of them."""
+        """Message without its unreadable attributes or signals; empty if other signals depend on
+        one of them."""
+        plain = unit.without_attributes()
+        if not isinstance(found := self._together([plain.text()]), str):
+            self._left_out[f"an attribute of {unit.name}"] = reason
+            return found
         bad: dict[str, str] = {}
         selectors = unit.selectors
         for name in unit.signals:

@@ -41,6 +41,8 @@ def print_bench(figures: dict[str, Any], console: Console | None = None) -> None
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     rows = [[name, what, f"{figures[name]:.4g}", to] for name, (what, to) in _ROWS.items()]
     print_table(console, ["figure", "processor time of", "ratio", "to"], rows)
-    functions, modules = figures["fix_functions"], figures["fix_modules"]
-    way = f"way of an ordinary fix: {functions} Python functions in {modules} modules"
-    console.print(way, highlight=False, markup=False, soft_wrap=True)
+    for prefix, of in (("", "arrival to solution"), ("wired_", "bytes on a line to `nav`")):
+        functions = figures[f"{prefix}fix_functions"]
+        modules = figures[f"{prefix}fix_modules"]
+        way = f"way of an ordinary fix, {of}: {functions} Python functions in {modules} modules"
+        console.print(way, highlight=False, markup=False, soft_wrap=True)

@@ -170,6 +170,9 @@ def calibrate(
     if not found.result["solution_rows"]:
         typer.echo(f"fusiond: No solution: {found.result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
+    if not found.toml.strip():
+        typer.echo(f"fusiond: Nothing to calibrate by: {found.result['why']}", err=True)
+        raise typer.Exit(EXIT_DATA)
     typer.echo(found.toml, nl=False, err=json_path == "-")
     if out is not None:
         with data_errors():

@@ -339,12 +339,12 @@ class Estimator:
     def adopt(self, mean: Array, spread: Array) -> None:
         """Subtract a fault's effect of mean (n,) from the state and add its `spread` (n, n) to
         P."""
-        n = self.model.size
+        n, xi = self.model.size, self.xi.copy()
         self._correct(mean)
+        if self.hypotheses is not None:
+            self.hypotheses.decided(self.t_ns, self.nav, self.step, mean, xi, self._cov)
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
-        if self.hypotheses is not None:
-            self.hypotheses.begin(self.t_ns, self.nav, self.step, mean)
 
     def _correct(self, mean: Array) -> None:
         """Subtract a fault's effect (n,) from the state, as an update does."""

@@ -96,10 +96,13 @@ LOG_PRIOR = 7
 # row width of the transition, by how much the unit has been found to have turned on the vehicle in
 # pitch and yaw (rad), the epoch (s) whose odds nobody has read yet, or infinity, what has been fed
 # back of the velocity in all (m/s), when (s) something measured was in service last, and the mean
-# of y^2 that rows of neither positions nor velocities nor speeds have shown.
+# of y^2 that rows of neither positions nor velocities nor speeds have shown; then the mounting's
+# pitch and yaw (rad) as the last decision left them, and what chance may make of the squares of
+# their changes since.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED, WIDTH, TURNED_BY = range(10, 20)
 UNWEIGHED, FED_BACK, LAST_MEASURED, SHOWN, HEAD = 21, 22, 25, 26, 32
+SAT_AT, BY_CHANCE = 27, 29
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -237,6 +240,17 @@ def column_of(bank: Array, number: int, component: int) -> int:
     return column
 
 
+@compiled("f8(f8[::1], i8, f8)")
+def turned_by(bank: Array, k: int, sits: float) -> float:
+    """Turn (rad) of the unit in pitch (k = 0) or yaw (1).
+
+    It is what decisions have found, and the filter after them; the mounting is now at `sits`."""
+    change = sits - bank[SAT_AT + k]
+    beyond = math.sqrt(max(0.0, change * change - bank[BY_CHANCE + k]))
+    found: float = bank[TURNED_BY + k] + math.copysign(beyond, change)
+    return found
+
+
 @compiled("b1(f8[::1], i8, f8, b1)", forceinline=True)
 def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
     """True if hypotheses are judged at such rows: they are `measured`, or a constraint while
@@ -245,6 +259,19 @@ def is_evidence(bank: Array, measures: int, t_s: float, measured: bool) -> bool:
         bank[LAST_MEASURED] = t_s
     alone: bool = measured or (measures != NOTHING and t_s - bank[LAST_MEASURED] > ALONE_S)
     return alone
+
+
+@compiled("f8(f8[::1], u8, f8)", forceinline=True)
+def dispersion(bank: Array, j: np.uint64, size: float) -> float:
+    """Chi-square that the group at `j` leaves over that of chance, where it is beyond chance; else
+    1."""
+    unsigned = np.uint64
+    if not bank[j + unsigned(UNEXPLAINED)] > 0.0:
+        return 1.0
+    degrees = max(bank[j + unsigned(N_AT)] - size, 1.0)
+    left = bank[j + unsigned(J_AT)] - bank[j + unsigned(EXPLAINED)]
+    ratio: float = max(left / degrees, 1.0)
+    return ratio
 
 
 @compiled("f8(f8[::1], f8[::1], u8, u8)", forceinline=True)

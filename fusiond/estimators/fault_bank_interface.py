@@ -14,6 +14,7 @@ from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
     ALL,
     BEGINS_AT,
+    BY_CHANCE,
     COUNTS_BY,
     E_ROWS,
     EXPLAINED,
@@ -32,6 +33,7 @@ from fusiond.estimators.fault_bank import (
     RESTARTED,
     RESTARTS,
     ROLLS,
+    SAT_AT,
     SENSITIVITIES,
     SIZE,
     SLOTS_OF,
@@ -47,6 +49,7 @@ from fusiond.estimators.fault_bank import (
     columns_of,
     group_at,
     is_evidence,
+    turned_by,
 )
 from fusiond.estimators.fault_mixture import estimate, mixture
 from fusiond.estimators.fault_odds import FOUND, judge
@@ -138,15 +141,32 @@ class Hypotheses:
         """True if V has not been propagated since the last measurement."""
         return self.bank.item(WAITS) != 0.0
 
-    def begin(self, t_ns: int, nav: Array, step: Array, mean: Array | None = None) -> None:
-        """Restart all hypotheses at `t_ns` with the filter's state (10,) and last step.
+    def begin(self, t_ns: int, nav: Array, step: Array) -> None:
+        """Restart all hypotheses at a start at `t_ns`, with the filter's state (10,) and last
+        step."""
+        for k, (_, by_chance) in enumerate(self.mounting.tolist()):
+            self.bank[TURNED_BY + k] = self.bank[SAT_AT + k] = 0.0
+            self.bank[BY_CHANCE + k] = by_chance
+        self._begin(t_ns, nav, step)
 
-        At a start, or after removal of a fault's `mean` (n,) from the error state; a change of the
-        mounting in it is a turn.
+    def decided(
+        self, t_ns: int, nav: Array, step: Array, mean: Array, xi: Array, cov: Array
+    ) -> None:
+        """Restart all hypotheses before removal of a fault's `mean` (n,) from the parameters (n,).
+
+        A change of the mounting in it is a turn, and so is what the filter has found since the last
+        decision and P did not allow it then; `cov` is P of now.
         """
         for k, slot in enumerate(self.mounting[:, 0].astype(int).tolist()):
-            turned = 0.0 if mean is None or slot < 0 else self.bank[TURNED_BY + k] + mean[slot]
-            self.bank[TURNED_BY + k] = turned
+            if slot >= 0:
+                turned = turned_by(self.bank, k, xi.item(slot)) + mean.item(slot)
+                self.bank[TURNED_BY + k] = turned
+                self.bank[SAT_AT + k] = xi.item(slot) + mean.item(slot)
+                by_chance = min(self.bank.item(BY_CHANCE + k), RARE * cov.item(slot, slot))
+                self.bank[BY_CHANCE + k] = by_chance
+        self._begin(t_ns, nav, step)
+
+    def _begin(self, t_ns: int, nav: Array, step: Array) -> None:
         self.bank[LAST_MEASURED] = t_ns * 1e-9
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 

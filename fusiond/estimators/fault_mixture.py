@@ -24,6 +24,7 @@ from fusiond.estimators.fault_bank import (
     THREES,
     WEIGHT,
     column_of,
+    dispersion,
     group_at,
 )
 from fusiond.estimators.fault_odds import solve
@@ -46,10 +47,11 @@ def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
         weight = bank[at + WEIGHT]
         if weight < LEAST_WEIGHT:
             continue
-        solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
+        share = dispersion(bank, np.uint64(at), size)
+        solve(bank, at, size, numbers[number // RESTARTS], share, m)
         for c in range(size):
             for d in range(size):
-                x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
+                x[c, d] = weight * (share * m[3 * c + d] + m[9 + c] * m[9 + d])
             first = column_of(bank, number, c)
             for i in range(q):
                 rows[c, i] = v[first + i * columns]

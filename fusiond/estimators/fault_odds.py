@@ -4,9 +4,13 @@ r"""Odds of a bank's hypotheses.
                         for a kind of known size
                         log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
                         + e^T m - m^T L m / 2
-    weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
-                        a hypothesis does not explain what has come
+    weight              w_f = odds_f / (1 + sum of all odds): the posterior probability
     left unexplained    J - l against N - p by chi-square's mean and variance
+
+A hypothesis that leaves more than chance does counts its evidence by 1 / c, c = (J - l) / (N - p):
+L and e in odds, size and weight (over-dispersion; McCullagh and Nelder, Generalized linear models,
+1989, section 4.5). It is never identified; but where none explains what has come, nothing wrong
+does so least, and its sigma alone would be published.
 
 The gain of p unknowns by chance is subtracted, by the number of rows (Schwarz) or by the expected
 size of such a fault, whichever is more: a far smaller fault cannot be distinguished from unmodelled
@@ -68,10 +72,12 @@ from fusiond.estimators.fault_bank import (
     SUSPECTS,
     THREES,
     TINY,
+    TURNED,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
     UNJUDGED,
     WEIGHT,
+    dispersion,
     explained_by_three,
     group_at,
 )
@@ -96,6 +102,9 @@ One in a hundred of chi-square of three is smaller; 0.27 % are larger, as of one
 MOST_OF_UNIT = 10.0
 """Largest size of a unit's fault in prior sigmas: 10 deg/s, half a g, more than a right angle. A
 reversed velocity is no force of four g."""
+MOST_TURNED = 0.25 * math.pi
+"""Largest turn (rad) whose linear estimate is a first step of its correction: another of a quarter
+of that is left."""
 _NOTHING = -40.0
 """Log of a negligible weight, which a sum of doubles cannot show."""
 APART = 4.0
@@ -109,11 +118,12 @@ BEST, BEST_ODDS, AHEAD, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
     """Write M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,).
 
-    With `share` 1 the mean of its kind's `numbers` (7,) is used. Gauss-Jordan elimination of a
-    positive definite matrix. Returns e^T b: without a mean the explained chi-square l.
+    With a `share` of 1 or more the mean of its kind's `numbers` (7,) is used. Gauss-Jordan
+    elimination of a positive definite matrix. Returns e^T b: without a mean the explained
+    chi-square l.
     """
     a = np.empty((3, 6))
-    mean = numbers[MEAN] if share == 1.0 else 0.0
+    mean = numbers[MEAN] if share >= 1.0 else 0.0
     for i in range(size):
         for j in range(size):
             a[i, j] = bank[at + L_ROWS[i, j]]
@@ -207,6 +217,17 @@ def _larger(bank: Array, numbers: Array, at: int, size: int, unit: bool, m: Arra
     return 0.5 * math.log(max(square / size, 1.0))
 
 
+@compiled("f8(f8[::1], f8[::1], i8, f8[::1])", forceinline=True)
+def _second_order(bank: Array, numbers: Array, at: int, m: Array) -> float:
+    """Chi-square that a turn of the unit leaves, as its rows are linear.
+
+    A turn b changes a force f by b x f + b x (b x f) / 2 + ..., of which V has the first: a share
+    of |b| / 2 of what it does is not explained."""
+    solve(bank, at, 3, numbers, MOST_OF_UNIT**-2, m)
+    square: float = m[9] * m[9] + m[10] * m[10] + m[11] * m[11]
+    return 0.25 * square * bank[at + EXPLAINED] if square <= MOST_TURNED**2 else 0.0
+
+
 @compiled("b1(f8[::1], f8[::1], i8, f8[::1])", forceinline=True)
 def _of_its_size(bank: Array, numbers: Array, at: int, m: Array) -> bool:
     """True if a fault of three numbers is neither too small nor too large for its kind."""
@@ -241,12 +262,16 @@ def _odds(
         by_rows = 0.5 * size * counts[restart, 1]
         for c in range(int(size)):
             by_rows -= numbers[kind, LOG_PRIOR + c]
-        gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
-        if rate + gained > 0.0 and bank[at + UNEXPLAINED] <= 0.0:
-            by_size += size * _larger(bank, numbers[kind], at, int(size), ints[kind, CLASS] == 0, m)
-            gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
+        unit, by = ints[kind, CLASS] == 0, np.uint64(at)
+        if ints[kind, SIGNATURE] == TURNED and bank[at + UNEXPLAINED] > 0.0:
+            bank[at + UNEXPLAINED] -= _second_order(bank, numbers[kind], at, m)
+        gained = 0.5 * bank[at + EXPLAINED] / dispersion(bank, by, size) - max(by_rows, by_size)
+        if rate + gained > 0.0:
+            by_size += size * _larger(bank, numbers[kind], at, int(size), unit, m)
+            gained = 0.5 * bank[at + EXPLAINED] / dispersion(bank, by, size)
+            gained -= max(by_rows, by_size)
     else:
-        gained = bank[at + LOG_ODDS] - by_size
+        gained = bank[at + LOG_ODDS] / dispersion(bank, np.uint64(at), size) - by_size
         if number >= threes:
             off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
             other = abs(off) > MOST_OFF * numbers[kind, PRIOR]
@@ -304,13 +329,13 @@ def judge(
     for number in range(groups):
         _odds(bank, ints, numbers, lanes, number, m, counts)
         at = group_at(bank, number)
-        if bank[at + UNEXPLAINED] <= 0.0:
+        if bank[at + UNEXPLAINED] < np.inf:
             largest = max(largest, bank[at + LOG_ODDS])
     nothing = math.exp(-largest)
     total = nothing
     for number in range(groups):
         at = group_at(bank, number)
-        if bank[at + UNEXPLAINED] <= 0.0:
+        if bank[at + UNEXPLAINED] < np.inf:
             less = bank[at + LOG_ODDS] - largest
             if less > _NOTHING:
                 bank[at + WEIGHT] = math.exp(less)

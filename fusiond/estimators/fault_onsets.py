@@ -44,6 +44,7 @@ from fusiond.estimators.fault_bank import (
     UNWEIGHED,
     WEIGHT,
     column_of,
+    dispersion,
     group_at,
 )
 from fusiond.estimators.fault_carried import begin_transition
@@ -77,7 +78,7 @@ def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Arra
         if ints[kind, SIGNATURE] <= FOLLOWED or weight < COUNTS:
             continue
         size = 3 if number < int(bank[THREES]) else 1
-        solve(bank, at, size, numbers[kind], 1.0, m)
+        solve(bank, at, size, numbers[kind], dispersion(bank, np.uint64(at), size), m)
         followed[n] += weight
         for c in range(size):
             first = column_of(bank, number, c)

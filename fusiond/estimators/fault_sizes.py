@@ -43,8 +43,9 @@ from fusiond.estimators.fault_bank import (
     P_AT,
     SENSITIVITIES,
     THREES,
-    TURNED_BY,
     WEIGHT,
+    dispersion,
+    turned_by,
 )
 from fusiond.estimators.fault_odds import identified, judge
 from fusiond.estimators.published_state import MOVING, moving, opened_variances
@@ -84,13 +85,14 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
         for k in range(length):
             lane = unsigned(k)
             j, c = own + lane, of + lane
-            d_0 = bank[j + unsigned(L_AT)] + lanes[c + unsigned(P_AT)]
+            share = dispersion(bank, j, 3.0)
+            d_0 = bank[j + unsigned(L_AT)] + share * lanes[c + unsigned(P_AT)]
             a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
             l_1, l_2 = a_1 / d_0, a_2 / d_0
-            d_1 = bank[j + unsigned(L11)] + lanes[c + unsigned(P_AT + LANES)] - l_1 * a_1
+            d_1 = bank[j + unsigned(L11)] + share * lanes[c + unsigned(P_AT + LANES)] - l_1 * a_1
             a_3 = bank[j + unsigned(L21)] - l_2 * a_1
             l_3 = a_3 / d_1
-            d_2 = bank[j + unsigned(L22)] + lanes[c + unsigned(P_AT + 2 * LANES)]
+            d_2 = bank[j + unsigned(L22)] + share * lanes[c + unsigned(P_AT + 2 * LANES)]
             d_2 -= l_2 * a_2 + l_3 * a_3
             e_0 = bank[j + unsigned(E_AT)]
             e_1 = bank[j + unsigned(E1)] - l_1 * e_0
@@ -100,9 +102,9 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
             factors[lane] = l_1
             factors[unsigned(LANES) + lane] = l_2
             factors[unsigned(2 * LANES) + lane] = l_3
-            factors[unsigned(3 * LANES) + lane] = 1.0 / d_0
-            factors[unsigned(4 * LANES) + lane] = 1.0 / d_1
-            factors[unsigned(5 * LANES) + lane] = 1.0 / d_2
+            factors[unsigned(3 * LANES) + lane] = share / d_0
+            factors[unsigned(4 * LANES) + lane] = share / d_1
+            factors[unsigned(5 * LANES) + lane] = share / d_2
             factors[unsigned(6 * LANES) + lane] = e_0 / d_0 - l_1 * b_1 - l_2 * b_2
             factors[unsigned(7 * LANES) + lane] = b_1
             factors[unsigned(8 * LANES) + lane] = b_2
@@ -111,9 +113,10 @@ def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors:
             lane = unsigned(k)
             j, c = own + lane, of + lane
             information, mean = bank[j + unsigned(L_AT)], lanes[c + unsigned(MEAN_AT)]
-            over = 1.0 / (information + lanes[c + unsigned(P_AT)])
+            share = dispersion(bank, j, 1.0)
+            over = 1.0 / (information + share * lanes[c + unsigned(P_AT)])
             beyond = bank[j + unsigned(E_AT)] - information * mean
-            factors[unsigned(3 * LANES) + lane] = over
+            factors[unsigned(3 * LANES) + lane] = share * over
             factors[unsigned(6 * LANES) + lane] = mean + over * beyond
 
 
@@ -276,9 +279,7 @@ def judge_and_widen(
         slot = int(mounting[k, 0])
         if slot < 0:
             continue
-        turned = bank[TURNED_BY + k]
-        at_start = xi[slot] - turned
-        open_ = turned * turned + max(0.0, at_start * at_start - mounting[k, 1])
+        open_ = turned_by(bank, k, xi[slot]) ** 2
         wider[7 + k] += open_
         if k == 1:
             wider[6] += open_ * sp * sp / max(1e-12, 1.0 - sp * sp)

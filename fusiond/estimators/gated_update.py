@@ -17,6 +17,7 @@ from fusiond.estimators.fault_bank import (
     UNWEIGHED,
     WEIGHT,
     column_of,
+    dispersion,
     group_at,
 )
 from fusiond.estimators.fault_odds import judge, solve
@@ -50,13 +51,14 @@ def nis_if_sensors_fail(
             continue
         likely += weight
         size = ints[kind, SIZE]
-        solve(bank, at, size, numbers[kind], 1.0, m)
+        share = dispersion(bank, np.uint64(at), size)
+        solve(bank, at, size, numbers[kind], share, m)
         for a in range(rows):
             for b in range(rows):
                 for i in range(size):
                     s_a = np.float64(work[a * columns + column_of(bank, number, i)])
                     for j in range(size):
-                        x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
+                        x = weight * (share * m[3 * i + j] + m[9 + i] * m[9 + j])
                         s_b = work[b * columns + column_of(bank, number, j)]
                         c[a, b] += s_a * s_b * x
     if likely < 0.5:

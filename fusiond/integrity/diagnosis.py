@@ -34,7 +34,7 @@ from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
 from fusiond.estimators.fault_bank_interface import Estimated, Hypotheses
-from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
+from fusiond.estimators.fault_odds import APART, BEST, EXPLAINS, identified
 from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
 from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
@@ -229,8 +229,7 @@ class Diagnosis(ServiceTable):
         self, measurement: AidingMeasurement, estimator: Estimator, bank: Hypotheses, found: Array
     ) -> Correction:
         """Faults that are identified."""
-        best, odds = found.item(BEST), found.item(BEST_ODDS)
-        taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
+        taken = self._alike(bank, int(found.item(BEST)))
         correction, best_fit = mixed(taken), max(each.log_likelihood for each in taken)
         finding = self._finding(measurement.t_ns, max(taken, key=lambda each: each.log_odds))
         steps = [each for each in taken if self._kinds[each.kind].signature == POSITION]
@@ -316,15 +315,16 @@ class Diagnosis(ServiceTable):
             added.append(bank.adds(measurement, self._kinds.index(f.kind), b, age_s, estimator.nav))
         return np.array(added) if added else None
 
-    def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
-        """Hypotheses of the class and device of a kind with nearly its likelihood."""
-        explains, log_odds = bank.explains, bank.log_odds
+    def _alike(self, bank: Hypotheses, best: int) -> list[Estimated]:
+        """Hypotheses of the class and device of the group `best` with nearly its likelihood."""
+        explains, fit, kind = bank.explains, bank.log_likelihood, self._kinds[best // RESTARTS]
+        least = fit.flat[best] - ALIKE
         return [
             bank.estimated(RESTARTS * row + restart)
             for row, each in enumerate(self._kinds)
             if each.of == kind.of and each.device == kind.device and not each.opens
             for restart in range(RESTARTS)
-            if explains[row, restart] and log_odds[row, restart] > odds - ALIKE
+            if explains[row, restart] and fit[row, restart] > least
         ]
 
     def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:

@@ -297,7 +297,7 @@ def _linked(
     for initialise in initialisers:
         initialise()
     library = _Linked(codegen, name, path, native, bitcode)
-    if _is_called(function, native):
+    if not bitcode:
         _call(function, library)
     codegen._engine._defined_symbols |= {
         function.llvm_func_name,

@@ -60,6 +60,8 @@ def measurements(
     if since_s >= 0.0:
         place += b * {"position": 1.0, "position_drift": since_s}.get(fault, 0.0)
         speed += b * {"velocity": 1.0, "velocity_drift": since_s}.get(fault, 0.0)
+        if fault == "both":  # the first of b is the position's, the second the velocity's
+            place[0], speed[1] = place[0] + b[0], speed[1] + b[1]
     lat, lon, up = states.position[0] + np.array([1.0, 1.0, -1.0]) * place * np.abs(
         1.0 / runs.metres_per_unit(states.position[0, 0], states.position[0, 2])
     )

@@ -32,6 +32,7 @@ from fusiond.estimators.fault_bank import (
     SIZE,
     WAITS,
     fault_table,
+    turned_by,
 )
 from fusiond.estimators.fault_bank_interface import Hypotheses
 from fusiond.estimators.fault_carried import mix, settle
@@ -170,6 +171,31 @@ def test_what_the_unit_has_been_found_to_have_turned_is_open() -> None:
     made.initialise(3, 0, nav, np.zeros(model.size), np.eye(model.size))
     bank.take(3, True, False, fused=False)
     assert made.wider.max() == 0.0
+
+
+def test_a_turn_is_what_is_decided_and_what_the_filter_finds_after_it() -> None:
+    """A unit that turns by 10 deg, of which a decision finds 2, and that turns back later."""
+    model = make_model("ins15", imu_noise(IMU), mounting_block(math.radians(5.0)))
+    kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
+    made = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds))
+    nav, n = np.array([0.5, 2.0, 0.0, 20.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), model.size
+    yaw, (tenth, two, six, eight, ten) = (
+        model.slots_of(MOUNTING)[1],
+        np.radians([0.1, 2.0, 6.0, 8.0, 10.0]).tolist(),
+    )
+    made.initialise(0, 0, nav, np.zeros(n), tenth**2 * np.eye(n))
+    bank = made.hypotheses
+    assert bank is not None
+    assert turned_by(bank.bank, 1, eight) == 0.0  # as it may sit
+    mean, spread = np.zeros(n), np.zeros((n, n))
+    mean[yaw], spread[yaw, yaw] = two, six**2
+    made.adopt(mean, spread)
+    assert turned_by(bank.bank, 1, made.xi[yaw]) == pytest.approx(two)
+    made.xi[yaw] += eight
+    assert turned_by(bank.bank, 1, made.xi[yaw]) == pytest.approx(ten, rel=0.01)
+    mean[yaw] = -ten
+    made.adopt(mean, spread)
+    assert turned_by(bank.bank, 1, made.xi[yaw]) == pytest.approx(0.0, abs=tenth)
 
 
 def test_what_lies_between_two_measurements_is_multiplied_once() -> None:

@@ -18,7 +18,7 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     group_at,
 )
-from fusiond.estimators.fault_odds import APART, solve
+from fusiond.estimators.fault_odds import APART, identified, solve
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import table_of
 from tests import runs
@@ -176,6 +176,31 @@ def test_weights_are_a_distribution() -> None:
     opened = bank.opened()
     assert np.allclose(opened, opened.T)
     assert np.linalg.eigvalsh(opened).min() > -1e-12
+
+
+def test_two_faults_at_once_stay_open_though_none_explains_them() -> None:
+    """A position and a velocity, each off by far more than the other's fault allows."""
+    bank = run("both", np.array([60.0, 8.0, 0.0])).hypotheses
+    assert bank is not None
+    found = bank.judge(LAST_NS)
+    assert not bank.explains[bank.log_odds > 0.0].any()
+    assert bank.weights.sum() > 0.99
+    assert not identified(found)
+
+
+@pytest.mark.parametrize(("turn_deg", "explains"), [(30.0, True), (60.0, False)])
+def test_a_turn_may_leave_what_its_rows_have_not(turn_deg: float, explains: bool) -> None:
+    """Of a turn b, linear rows leave a quarter of b^2: no chance at 7 % of 10,000."""
+    bank = run().hypotheses
+    assert bank is not None
+    row, turn = row_of("mount"), math.radians(turn_deg)
+    at = group_at(bank.bank, RESTARTS * row + RESTARTS - 1)
+    l_0 = 1e4 / turn**2
+    bank.bank[at + L_ROWS[range(3), range(3)]] = l_0
+    bank.bank[at + E_ROWS] = np.array([0.0, 0.0, turn]) * l_0
+    bank.bank[at + J_AT], bank.bank[at + N_AT] = 1e4 * (1.0 + 0.24 * turn**2), 30.0
+    bank.judge(LAST_NS)
+    assert bank.explains[row, -1] == explains
 
 
 def known(size_m: float, sd_m: float) -> tuple[Array, NDArray[np.bool_]]:

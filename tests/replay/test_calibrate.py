@@ -52,6 +52,13 @@ def test_a_recording_gives_lines_of_toml(tmp_path: Path) -> None:
     assert {"mounting_pitch_deg", "gnss_time_s"} <= said["parameters"].keys()
 
 
+def test_a_recording_without_the_configured_imu_says_so() -> None:
+    config = REPOSITORY / "config" / "vehicle.toml"
+    done = CliRunner().invoke(app, ["calibrate", str(config), str(DEMO)])
+    assert (done.exit_code, done.stdout) == (65, "")
+    assert "Nothing to calibrate by: Waiting for IMU data" in " ".join(done.stderr.split())
+
+
 def test_a_drive_is_either_a_recording_or_files(tmp_path: Path) -> None:
     for arguments in ([], [str(DEMO), "--imu", "imu.csv"], [str(DEMO), "--aid", "gnss=gnss.csv"]):
         done = _called(tmp_path, *arguments)

@@ -96,7 +96,7 @@ def picture(series: dict[str, Any], path: Path) -> None:
             for number, (name, found) in enumerate(series["models"].items()):
                 for what, line in (("true", "-"), ("believed", "--")):
                     values = [sigma[row] for sigma in found[what][key]]
-                    label = f"{name.replace('_', ' ')} states" if what == "true" else None
+                    label = _label(name) if what == "true" else None
                     panel.plot(series["t_s"], values, line, color=f"C{number}", label=label)
             for number, of in enumerate(PAPER["models"].values()):
                 panel.axhline(of[key][row], color=f"C{number}", linewidth=0.8, linestyle=":")
@@ -110,3 +110,15 @@ def picture(series: dict[str, Any], path: Path) -> None:
     for panel in axes[2]:
         panel.set_xlabel("s")
     save_figure(figure, path)
+
+
+def _label(name: str) -> str:
+    """Label of a filter: its states, then what is particular."""
+    particular = {
+        "bare": "biases dropped",
+        "four": "four satellites",
+        "all": "all in view",
+    }
+    states = "".join(word for word in name.split("_") if word not in particular)
+    more = [particular[word] for word in name.split("_") if word in particular]
+    return ", ".join([f"{states} states", *more])

@@ -62,6 +62,21 @@ def bit_by_bit(data: bytes) -> int:
     return crc
 
 
+@pytest.mark.parametrize("name", ["ADRNAVA", "SPPNAVA", "PPPNAVA"])
+def test_unicores_solutions_of_one_kind(name: str) -> None:
+    """Laid out as BESTNAV, which serves where both are; PPPNAV ends before the velocity."""
+    fields = bestnav().decode().partition(";")[2].partition("*")[0].split(",")
+    body = ",".join(fields if name != "PPPNAVA" else fields[:21])
+    (fix,) = fixes(decoded(unicore(name, body))[0])
+    assert fix.sd_ned_m == (0.014, 0.012, 0.031)
+    assert (fix.v_ned_m_s is None) == (name == "PPPNAVA")
+    other = unicore(name, body.replace("0.0140,0.0120", "0.9000,0.9000"))
+    for both in ((bestnav(), other), (other, bestnav())):
+        (fix,) = fixes(decoded(*both)[0])
+        assert fix.sd_ned_m == (0.014, 0.012, 0.031)
+        assert fix.v_ned_m_s is not None
+
+
 @given(st.binary(max_size=300))
 def test_crc_is_that_of_the_polynomial(data: bytes) -> None:
     assert log_crc(data) == bit_by_bit(data)

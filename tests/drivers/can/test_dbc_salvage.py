@@ -155,6 +155,21 @@ def test_what_is_sound_is_read_as_without_the_flaw(name: str, flaw: str, tmp_pat
     assert set(found.left_out) == left_out  # type: ignore[attr-defined]
 
 
+def test_a_format_that_no_list_has_costs_no_message(tmp_path: Path) -> None:
+    """An attribute, on which no frame depends."""
+    path = tmp_path / "flawed.dbc"
+    path.write_text(
+        f"{MULTIPLEXED}BO_ 1315 FOO: 8 X\n"
+        ' SG_ A : 0|8@1+ (2,0) [0|1] "" X\n'
+        'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";\n'
+        'BA_DEF_DEF_ "VFrameFormat" "StandardCAN";\nBA_ "VFrameFormat" BO_ 1315 14;\n'
+    )
+    found = load_dbc(str(path))
+    assert set(told(found)) == {"FOO", *told(read_whole(MULTIPLEXED))}
+    assert found.get_message_by_name("FOO").decode(bytes([3] + [0] * 7)) == {"A": 6}
+    assert set(found.left_out) == {"an attribute of FOO"}  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_sound_file_by_its_messages_alone(name: str) -> None:
     whole = cantools.database.load_string(content(name), database_format="dbc", strict=False)
