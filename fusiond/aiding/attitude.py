@@ -42,8 +42,8 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory, Oriented
-from fusiond.aiding.initialisation import HeadingCandidate
+from fusiond.aiding.heading_history import HeadingHistory, Oriented
+from fusiond.aiding.initialisation_candidates import HeadingCandidate
 from fusiond.aiding.wheel_and_heading import CourseMeasurement
 from fusiond.navigation.rotation import (
     dcm_from_rpy,

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import Candidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import Candidate
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity

@@ -12,8 +12,8 @@ m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, w
 seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the rounding p, as
 a share of a step q, are estimated if the model has their blocks
 (fusiond.models.vehicle_parameter_blocks). c is the learned factor of a configured drift
-(fusiond.navigator.drift_level_estimation). With z = h(x^) - y, navigation errors computed minus
-true, parameters true minus estimated, and e_i the axis's unit vector:
+(fusiond.navigator.aiding_drift_sigma_estimation). With z = h(x^) - y, navigation errors computed
+minus true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + c ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
@@ -49,8 +49,8 @@ from fusiond.aiding.base import (
     State,
     Vector3,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import STEADY, SpeedCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import STEADY, SpeedCandidate
 from fusiond.aiding.smoothed_imu_jacobian import add_of_force, turning
 from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.model import Model

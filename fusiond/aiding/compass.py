@@ -5,8 +5,8 @@ r"""Heading of a compass: magnetic, with the deviation of the vehicle.
 D is the declination at the vehicle. a (mounting, and the error of the field's model) and b, c (the
 vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d lasts for
 some seconds (bridges, vehicles beside, own currents), a first-order Gauss-Markov process with a
-learned factor (fusiond.navigator.drift_level_estimation); v is white. The measurement is psi_m +
-D:
+learned factor (fusiond.navigator.aiding_drift_sigma_estimation); v is white. The measurement is
+psi_m + D:
 
     z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev
 
@@ -24,8 +24,8 @@ import numpy as np
 from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingMeasurement
 from fusiond.aiding.base import Innovation, NotApplicable, State
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import HeadingCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import HeadingCandidate
 from fusiond.aiding.wheel_and_heading import CourseMeasurement
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle

@@ -21,8 +21,8 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import HeightCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import HeightCandidate
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN
 

@@ -31,7 +31,7 @@ of another sensor at about that instant,
 
 C_y measured, J as in fusiond.aiding.attitude, s the misalignment of its sensor, a block of the
 model. theta is noise beside the angles' own, cov = dA/dphi cov(theta) dA/dphi^T, and both rows are
-whitened. For a vehicle on a road a heading is enough (fusiond.aiding.headings_without_imu).
+whitened. For a vehicle on a road a heading is enough (fusiond.aiding.heading_history).
 
 Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checked numerically.
 """
@@ -54,7 +54,7 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory, Oriented
+from fusiond.aiding.heading_history import HeadingHistory, Oriented
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.models.blocks import SAR_MISALIGNMENT
 from fusiond.navigation.earth import meridian_radius, transverse_radius

@@ -28,8 +28,8 @@ a metre are 5 cm, with u = C dl
                                                   - 2 (P_jk U_jk + X_jj X_kk)
 
 with P, U and X = cov(u, phi) of the two. (96 cars of
-tests/estimators/test_lever_arm_after_attitude_update.py, NEES a degree of lever arm and place: 1.5
-without it, 1.1 with it.)
+tests/estimators/test_antenna_position_after_attitude_update.py, NEES a degree of lever arm and
+place: 1.5 without it, 1.1 with it.)
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3; Bar-Shalom, Li, Kirubarajan (2001),
 section 10.3.2 (second-order terms).
@@ -58,8 +58,8 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.aiding.smoothed_imu_jacobian import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled

@@ -81,7 +81,7 @@ from fusiond.aiding.carrier_anchor import (
     anchored,
 )
 from fusiond.aiding.carrier_anchor_noise import ANCHORED, OF_ANCHOR, WALKED, leave
-from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.aiding.range_rows import SOUND, WRONG, by_clock, measured, range_rows
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.models.blocks import CARRIER_ANCHOR, CARRIER_CLOCK, CLOCK_DRIFT, CLOCK_OFFSET

@@ -40,8 +40,8 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN

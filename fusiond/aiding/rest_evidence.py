@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import STEADY, SpeedCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import STEADY, SpeedCandidate, VelocityCandidate
 
 # What remains of an averaged velocity (m/s): multipath moves a receiver's Doppler by a centimetre
 # or two a second, for seconds alike.

@@ -43,8 +43,8 @@ from fusiond.aiding.base import (
     Vector3,
     level_arm_m,
 )
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import VelocityCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import VelocityCandidate
 from fusiond.aiding.smoothed_imu_jacobian import add_of_force
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
-from fusiond.aiding.headings_without_imu import HeadingHistory
+from fusiond.aiding.heading_history import HeadingHistory
 from fusiond.navigation.strapdown import VD, VE, VN
 
 Array = NDArray[np.float64]

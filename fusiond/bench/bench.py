@@ -18,7 +18,7 @@ present, with a position fix five times a second and a checkpoint every 0.5 s;
 order of validity, files read and the solution written at every row; `raw_epoch_40_ratio`, an epoch
 of 40 satellites (`fusiond.bench.raw_epoch`); `late_tick_ratio`, the tick in which a fix arrives 10
 s late (`fusiond.bench.delayed_fix`); `late_raw_tick_ratio`, the tick in which an RDSS fix arrives
-1.5 s late, over raw epochs of 40 satellites (`fusiond.bench.delayed_raw`).
+1.5 s late, over raw epochs of 40 satellites (`fusiond.bench.delayed_fix_over_raw_epochs`).
 
 Seconds: `process_start_s`, `fusiond process` before its first row
 (`fusiond.bench.process_startup`).
@@ -36,7 +36,7 @@ Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
 Counted: `fix_functions` and `fix_modules`, the Python functions of an ordinary fix from arrival
 to published sigma, and the modules that they are in (`fusiond.bench.fix_call_trace`);
 `wired_fix_functions` and `wired_fix_modules`, those from bytes on a line to the payload of `nav`
-(`fusiond.bench.wire_call_trace`).
+(`fusiond.bench.wire_to_payload_call_trace`).
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.bench.delayed_fix import delayed_fix
-from fusiond.bench.delayed_raw import delayed_raw
+from fusiond.bench.delayed_fix_over_raw_epochs import delayed_raw
 from fusiond.bench.fix_call_trace import ordinary_fix
 from fusiond.bench.process_startup import start
 from fusiond.bench.raw_epoch import raw_epoch
-from fusiond.bench.wire_call_trace import wired_fix
+from fusiond.bench.wire_to_payload_call_trace import wired_fix
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.base import Estimator

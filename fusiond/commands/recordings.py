@@ -203,7 +203,7 @@ def export(
 
 def _export_measurements(recording: Log, folder: Path, out: Path, to: str) -> dict[str, int]:
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-    from fusiond.replay.csv_export import write_tables  # noqa: PLC0415
+    from fusiond.replay.measurement_csv_export import write_tables  # noqa: PLC0415
     from fusiond.replay.replay_config import replay_config  # noqa: PLC0415
     from fusiond.replay.rosbag_export import write_rosbag  # noqa: PLC0415
 

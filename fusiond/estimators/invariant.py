@@ -75,7 +75,7 @@ from fusiond.estimators.invariant_error import (
 )
 from fusiond.estimators.measurement_loop_kernel import KNOWN, LARGE, PLAIN, SETTLES, UNDOUBTED
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.tilt_axes_update import keep_down_rows, keep_downward
+from fusiond.estimators.tilt_axes_rotation_after_update import keep_down_rows, keep_downward
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.estimators.update_with_exclusion import KEPT
 from fusiond.models.blocks import CARRIER_ANCHOR

@@ -55,7 +55,7 @@ from fusiond.estimators.state_array import (
     XI_AT,
 )
 from fusiond.estimators.state_array import SIZE as STATES
-from fusiond.estimators.tilt_axes_update import (
+from fusiond.estimators.tilt_axes_rotation_after_update import (
     ESTIMATE_SIZE,
     carry_over,
     may_part,

@@ -73,14 +73,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
+from fusiond.estimators.antenna_position_after_attitude_update import antenna_slots
 from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.gyro_error_after_rate_update import gyro_slots
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.lever_arm_after_attitude_update import antenna_slots
 from fusiond.estimators.measurement_loop_kernel import UNDOUBTED, Axes
 from fusiond.estimators.propagation import TURN_TILT
-from fusiond.estimators.tilt_axes_update import (
+from fusiond.estimators.tilt_axes_rotation_after_update import (
     ESTIMATE_SIZE,
     carry_over,
     keep_rows,
@@ -101,7 +101,7 @@ class TiltAxesFilter(KalmanEstimator):
     P keeps three quantities over an update: the tilt in axes that turn with the heading, the gyro
     errors relative to the turn (fusiond.estimators.gyro_error_after_rate_update), and, with an
     estimated lever arm, the antenna's position
-    (fusiond.estimators.lever_arm_after_attitude_update)."""
+    (fusiond.estimators.antenna_position_after_attitude_update)."""
 
     def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
         super().__init__(model, gap_s, faults=faults)

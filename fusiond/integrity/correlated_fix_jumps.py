@@ -24,7 +24,7 @@ import math
 import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.fault_bank_interface import Estimated
 from fusiond.integrity.catalogue import POSITION_SD_M

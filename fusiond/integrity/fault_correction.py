@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.fault_bank_interface import Estimated
 from fusiond.navigation.earth import meridian_radius, transverse_radius

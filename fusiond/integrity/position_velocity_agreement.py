@@ -15,7 +15,7 @@ import math
 from typing import NamedTuple
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 
 SIGMAS = 4.0

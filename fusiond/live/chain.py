@@ -15,8 +15,8 @@ from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
 from fusiond.live.injection import Injection
-from fusiond.live.messaging import Messaging
 from fusiond.live.operator import Operator
+from fusiond.live.rdss_messaging import Messaging
 from fusiond.live.sources import Sources
 from fusiond.live.tick_scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution

@@ -23,20 +23,20 @@ from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.chain import Chain
 from fusiond.live.early_services import Front
-from fusiond.live.journal import handler
-from fusiond.live.message_keeper import MessageKeeper
 from fusiond.live.process_usage import (
     release_start_memory,
     share_one_heap,
     widen_descriptor_table,
 )
 from fusiond.live.publishing import Publishing
+from fusiond.live.rdss_message_keeper import MessageKeeper
 from fusiond.live.reload import difference
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.state_in_memory import KEPT_STATE, WarmKeeper
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.stderr_log_handler import StandardErrorHandler
 from fusiond.live.supervision import supervise
+from fusiond.live.systemd_journal import handler
 from fusiond.live.tick_scheduler import SECOND_NS, Every, Scheduler
 from fusiond.navigation.compiled import kernels_can_be_kept, load_compiler, load_kernels
 from fusiond.navigation.solution import Solution

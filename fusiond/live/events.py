@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fusiond.clock.stamp_mapping import Clock
-from fusiond.live.journal import fields
+from fusiond.live.systemd_journal import fields
 from fusiond.outputs.messages.event import EventMessage, event_message
 from fusiond.outputs.messages.event_catalogue import entry_of
 

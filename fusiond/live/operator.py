@@ -6,7 +6,7 @@ import math
 
 from fusiond.configuration.si_units import DEG
 from fusiond.live.injection import Injection
-from fusiond.live.messaging import Messaging
+from fusiond.live.rdss_messaging import Messaging
 from fusiond.live.sources import Sources
 from fusiond.navigator.navigator import Navigator
 from fusiond.outputs.commands import (

@@ -20,8 +20,8 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.drift_level_estimation import DriftLevels
 from fusiond.navigator.imu_grade import UnitGrade
 from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS, NoiseShares
 from fusiond.navigator.timeline import Timeline

@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.measurements import PositionFix
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.estimators.base import Estimator
 from fusiond.models.model import Model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2

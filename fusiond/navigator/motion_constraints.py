@@ -20,7 +20,7 @@ from fusiond.models.vehicle_parameter_blocks import (
 )
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
-from fusiond.navigator.drift_level_estimation import DriftLevels
+from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
 
 GATE = 0.9999
 """Gate probability, as the measured measurements' default."""

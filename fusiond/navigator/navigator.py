@@ -24,6 +24,7 @@ from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
@@ -37,7 +38,6 @@ from fusiond.navigator.assembly import (
     verdicts_of,
 )
 from fusiond.navigator.calibration import CalibrationWatch
-from fusiond.navigator.drift_level_estimation import DriftLevels
 from fusiond.navigator.fault_events import ServiceEvents
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedMeasurements, broken
 from fusiond.navigator.imu_handover import hand_over, publish_by_axes

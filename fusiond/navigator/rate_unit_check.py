@@ -47,7 +47,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 

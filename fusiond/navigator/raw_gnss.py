@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from drivers.raw.messages import Ephemeris, NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
-from fusiond.aiding.headings_without_imu import HeadingHistory
-from fusiond.aiding.initialisation import Candidate, PositionCandidate, VelocityCandidate
+from fusiond.aiding.heading_history import HeadingHistory
+from fusiond.aiding.initialisation_candidates import Candidate, PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeMeasurement, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.update_with_exclusion import KEPT

@@ -3,9 +3,9 @@
 Sums of evidence, which can be scaled to less weight: division of a receiver's errors of fixes
 (fusiond.aiding.fix_error_correlation), noise share of the samples
 (fusiond.navigator.imu_vibration_noise_share), size of configured drifts and white noise
-(fusiond.navigator.drift_level_estimation, fusiond.navigator.sensor_white_noise). The next drive has
-other streets, so only `CARRIED` of the sums counts: two of ten minutes, which two new minutes
-outweigh. With antenna and load possibly changed, the weight falls by e each week.
+(fusiond.navigator.aiding_drift_sigma_estimation, fusiond.navigator.sensor_white_noise). The next
+drive has other streets, so only `CARRIED` of the sums counts: two of ten minutes, which two new
+minutes outweigh. With antenna and load possibly changed, the weight falls by e each week.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fusiond.aiding.fix_error_correlation import MOST_SHOWN, SHOWN
-from fusiond.navigator.drift_level_estimation import GRID as LEVELS
+from fusiond.navigator.aiding_drift_sigma_estimation import GRID as LEVELS
 from fusiond.navigator.imu_vibration_noise_share import GRID
 from fusiond.navigator.saved_state import STRICT
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement, Feedback
-from fusiond.aiding.initialisation import Candidate
+from fusiond.aiding.initialisation_candidates import Candidate
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.measurement_loop_kernel import JUDGE, KEEP
 from fusiond.integrity.catalogue import Kind

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import AttitudeMeasurement
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.headings_without_imu import HeadingHistory, KnownHeading
-from fusiond.aiding.initialisation import HeadingCandidate, PositionCandidate
+from fusiond.aiding.heading_history import HeadingHistory, KnownHeading
+from fusiond.aiding.initialisation_candidates import HeadingCandidate, PositionCandidate
 from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.configuration.constraints import NonHolonomic
 from fusiond.configuration.schema import Config

@@ -23,7 +23,7 @@ from fusiond.files.csv_tables import MissingPackageError
 from fusiond.files.install_extra import install_command
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
-from fusiond.replay.csv_export import replay_measurements
+from fusiond.replay.measurement_csv_export import replay_measurements
 
 _TO_ROS = np.array([1.0, -1.0, -1.0])
 

@@ -10,7 +10,7 @@ import pytest
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeMeasurement
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.headings_without_imu import (
+from fusiond.aiding.heading_history import (
     CORNER_RAD_S,
     HOLDS_NS,
     LEVEL_SD_RAD,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.aiding.initialisation import SpeedCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import SpeedCandidate, VelocityCandidate
 from fusiond.aiding.rest_evidence import KEEP_NS, Measured, RestEvidence
 from fusiond.simulation.markov import gauss_markov
 

@@ -12,7 +12,7 @@ from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.aiding.base import AidingMeasurement, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicConstraint, WheelSpeedMeasurement
 from fusiond.aiding.compass import CompassMeasurement, deviation, disturbance
-from fusiond.aiding.headings_without_imu import HOLDS_NS, HeadingHistory, KnownHeading
+from fusiond.aiding.heading_history import HOLDS_NS, HeadingHistory, KnownHeading
 from fusiond.aiding.wheel_and_heading import SIGN_SIGMAS, GroundSpeed
 from fusiond.models.constant_velocity import constant_velocity
 from fusiond.models.vehicle_parameter_blocks import (

@@ -40,7 +40,7 @@ from fusiond.estimators.fault_odds import LEAST_SQUARE, MOST_OF_UNIT, MOST_SQUAR
 from fusiond.estimators.fault_update import _at_past, _past, walk_path
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.published_state import MOVING, moving, opened_variances
-from fusiond.estimators.tilt_axes_update import turn_covariance
+from fusiond.estimators.tilt_axes_rotation_after_update import turn_covariance
 from fusiond.integrity.catalogue import kinds_of, table_of
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle_parameter_blocks import MOUNTING, mounting_block

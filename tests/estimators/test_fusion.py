@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusiond.estimators.federated.bank import (
+from fusiond.estimators.federated.fusion import fuse_correlated, fuse_uncorrelated, information
+from fusiond.estimators.federated.fusion_kernels import (
     carry,
     cholesky,
     combine,
     difference,
     inverse_of_factor,
 )
-from fusiond.estimators.federated.fusion import fuse_correlated, fuse_uncorrelated, information
 
 Array = NDArray[np.float64]
 # Sigmas of an INS: attitude, velocity, position, gyro bias.

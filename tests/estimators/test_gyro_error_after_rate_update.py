@@ -10,7 +10,7 @@ import pytest
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.gyro_error_after_rate_update import gyro_slots, keep_turn
-from fusiond.estimators.tilt_axes_update import heading_turn, turn_rows
+from fusiond.estimators.tilt_axes_rotation_after_update import heading_turn, turn_rows
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.error_model import PHI
 from fusiond.navigation.rotation import dcm_from_quaternion, quaternion_from_rpy

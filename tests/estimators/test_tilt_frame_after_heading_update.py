@@ -12,7 +12,7 @@ from fusiond.aiding.attitude import AttitudeMeasurement, HeadingMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
 from fusiond.estimators.invariant import InvariantFilter
-from fusiond.estimators.tilt_axes_update import heading_turn
+from fusiond.estimators.tilt_axes_rotation_after_update import heading_turn
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DV, PHI

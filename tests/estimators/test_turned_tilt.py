@@ -24,7 +24,7 @@ from fusiond.estimators.covariance_propagation import mirror
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.tilt_axes_propagation import TURN_SIZE, rest_axes, rest_rows, turn_at_rest
-from fusiond.estimators.tilt_axes_update import turn_rows
+from fusiond.estimators.tilt_axes_rotation_after_update import turn_rows
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

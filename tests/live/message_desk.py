@@ -10,7 +10,7 @@ from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.rdss.mail import MessageReceived
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.messaging import Messaging
+from fusiond.live.rdss_messaging import Messaging
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import SendMessage
 

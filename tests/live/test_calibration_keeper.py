@@ -14,7 +14,7 @@ from fusiond.aiding.fix_error_correlation import SHOWN
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
-from fusiond.navigator.drift_level_estimation import GRID as LEVELS
+from fusiond.navigator.aiding_drift_sigma_estimation import GRID as LEVELS
 from fusiond.navigator.imu_vibration_noise_share import GRID
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_calibration import (

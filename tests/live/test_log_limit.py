@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fusiond.live.journal import fields, handler
 from fusiond.live.log_limit import CAUSES, MOST, LogLimit
+from fusiond.live.systemd_journal import fields, handler
 
 
 class Kept(logging.Handler):

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
-from fusiond.live.message_keeper import MessageKeeper
-from fusiond.live.messaging import MOST_UNCONFIRMED
+from fusiond.live.rdss_message_keeper import MessageKeeper
+from fusiond.live.rdss_messaging import MOST_UNCONFIRMED
 from fusiond.live.restored_state import RESTORED_STATE, RestoredState
 from fusiond.live.stored_messages import KEPT_MESSAGES, KeptMessages
 from fusiond.navigator.state_file import MOST_BYTES, DamagedStateError, read_state
@@ -128,7 +128,7 @@ def test_the_fullest_state_fits_its_file() -> None:
     for _ in range(3 * MOST_UNCONFIRMED):
         desk.received(payload=b"\xa4" + b"\xff" * 209, text="\\u" * 100)
     assert desk.drivers["rdss"].counters["message_untold"] > 0
-    from fusiond.live.message_keeper import _text  # noqa: PLC0415
+    from fusiond.live.rdss_message_keeper import _text  # noqa: PLC0415
 
     text = _text(desk.messaging.state(desk.clock.now_ns()))
     assert len(text) <= MOST_BYTES - 100

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigator.alignment.position_jumps import (
     LOOKED_NS,
     Epoch,

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.aiding.pseudorange import RANGE_BIAS, epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu

@@ -11,8 +11,8 @@ from drivers.measurements import MonotonicStamp, WheelSpeed
 from fusiond.aiding.body_velocity import WheelSpeedMeasurement
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
+from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
 from fusiond.navigator.assembly import model_of
-from fusiond.navigator.drift_level_estimation import DriftLevels
 from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.sensor_white_noise import FIRST, LEAST, WhiteNoise

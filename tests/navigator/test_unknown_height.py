@@ -12,7 +12,7 @@ import pytest
 
 from drivers.measurements import PositionFix
 from drivers.nmea.geoid_fallback import GEOID_SD_M
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import imu_noise
 from fusiond.navigation.solution import Mode, Solution

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, Estimator, Outcome, gate_threshold
-from fusiond.estimators.federated.bank import combine
+from fusiond.estimators.federated.fusion_kernels import combine
 from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection, Record
 from fusiond.estimators.federated.options import FederatedOptions, local_of
 from fusiond.estimators.update import normalised_innovation_squared, update

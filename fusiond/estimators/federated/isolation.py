@@ -7,9 +7,10 @@ Innovation test   sum over the last W innovations of min(nu^T S^-1 nu, gate), ea
                   it would once in 5000 cases, two in 2 %, three in 60 %, four do. While the window
                   is not full yet, two in a row are enough.
 Difference test   d^T (P_i + P_o)^-1 d, local filter against all others on position and velocity
-                  (fusiond.estimators.federated.bank), against the quantile 1 - p. It finds a slow
-                  drift, which a local filter follows with small innovations. The filter that
-                  stands out most is the one isolated; among fewer than three nobody can say which.
+                  (fusiond.estimators.federated.fusion_kernels), against the quantile 1 - p. It
+                  finds a slow drift, which a local filter follows with small innovations. The
+                  filter that stands out most is the one isolated; among fewer than three nobody can
+                  say which.
 
 p is the probability of a false alarm of one test. Both tests are conservative: capped innovations
 are less than chi-square, and local filters that each carry Q / beta of the common process noise

@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
-from fusiond.estimators.federated.bank import (
+from fusiond.estimators.federated.continuing_base import CarriedFilter
+from fusiond.estimators.federated.fusion_kernels import (
     carry,
     cholesky,
     difference,
     inverse_of_factor,
     publish,
 )
-from fusiond.estimators.federated.continuing_base import CarriedFilter
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation
-from fusiond.estimators.federated.bank import publish
 from fusiond.estimators.federated.filter import FederatedFilter
+from fusiond.estimators.federated.fusion_kernels import publish
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.published_state import Published
 from fusiond.estimators.shared_error_renewal import renew
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
-from fusiond.estimators.tilt_axes_update import turn_rows
+from fusiond.estimators.tilt_axes_rotation_after_update import turn_rows
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.estimators.update_with_exclusion import KEPT, Screened
 from fusiond.models.blocks import CLOCK_OFFSET

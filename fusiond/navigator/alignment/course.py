@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.initialisation import VelocityCandidate
+from fusiond.aiding.initialisation_candidates import VelocityCandidate
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.alignment import level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity

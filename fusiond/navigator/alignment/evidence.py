@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import (
+from fusiond.aiding.initialisation_candidates import (
     HeadingCandidate,
     HeightCandidate,
     PositionCandidate,

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusiond.aiding.initialisation import HeadingCandidate
+from fusiond.aiding.initialisation_candidates import HeadingCandidate
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.imu_buffer import ImuBuffer

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.aiding.body_velocity import NonHolonomicConstraint
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model, TooManyStatesError

@@ -44,7 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.estimators.base import gate_threshold
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model

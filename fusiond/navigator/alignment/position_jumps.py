@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.initialisation import PositionCandidate, VelocityCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate, VelocityCandidate
 from fusiond.navigation.distributions import median
 from fusiond.navigator.alignment.start import as_geodetic
 

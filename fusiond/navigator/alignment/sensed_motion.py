@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.initialisation import VelocityCandidate
+from fusiond.aiding.initialisation_candidates import VelocityCandidate
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.preintegration import integrate_sensed
 from fusiond.navigator.alignment.start import velocity_of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.aiding.initialisation import (
+from fusiond.aiding.initialisation_candidates import (
     Candidate,
     HeadingCandidate,
     PositionCandidate,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from fusiond.aiding.base import AidingMeasurement
-from fusiond.aiding.initialisation import PositionCandidate
+from fusiond.aiding.initialisation_candidates import PositionCandidate
 from fusiond.aiding.rest_evidence import RestEvidence
 from fusiond.estimators.base import Estimator
 from fusiond.integrity.catalogue import SENSOR

@@ -79,7 +79,7 @@ from fusiond.navigator.intake.kind import (
 )
 
 if TYPE_CHECKING:
-    from fusiond.navigator.drift_level_estimation import DriftLevels
+    from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
 
 KINDS: tuple[Kind, ...] = (
     gnss.KIND,

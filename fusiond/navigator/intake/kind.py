@@ -12,7 +12,7 @@ from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 
 if TYPE_CHECKING:
-    from fusiond.navigator.drift_level_estimation import DriftLevels
+    from fusiond.navigator.aiding_drift_sigma_estimation import DriftLevels
     from fusiond.navigator.raw_gnss import RawGnss
 
 S = TypeVar("S", bound=Aiding)

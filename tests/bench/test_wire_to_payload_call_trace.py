@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from fusiond.bench.fix_call_trace import FixPath
-from fusiond.bench.wire_call_trace import wired_fix
+from fusiond.bench.wire_to_payload_call_trace import wired_fix
 
 FUNCTIONS, MODULES = 208, 43
 """Budget, which only falls: 237 and 67 before all that a fix does not need had left its way."""

@@ -1,7 +1,7 @@
 """Cars whose lever arm nobody has measured, with fixes of centimetres: the filter stays honest.
 
 What each correction of the attitude would tell of the lever, and is no turn, is carried over
-(fusiond.estimators.lever_arm_after_attitude_update).
+(fusiond.estimators.antenna_position_after_attitude_update).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.si_units import imu_noise
+from fusiond.estimators.antenna_position_after_attitude_update import antenna_slots, keep_antenna
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.lever_arm_after_attitude_update import antenna_slots, keep_antenna
 from fusiond.estimators.tilt_frame_after_heading_update import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model

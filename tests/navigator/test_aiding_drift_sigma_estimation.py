@@ -15,8 +15,8 @@ from fusiond.configuration.schema import Config
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import Model
 from fusiond.models.vehicle_parameter_blocks import SIDE_DRIFT, WHEEL_DRIFT
+from fusiond.navigator.aiding_drift_sigma_estimation import FIRST, DriftLevels
 from fusiond.navigator.assembly import model_of
-from fusiond.navigator.drift_level_estimation import FIRST, DriftLevels
 from fusiond.navigator.imu_vibration_noise_share import COUNTS_NS, EVERY_NS
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.motion_constraints import vehicle_blocks

@@ -16,8 +16,8 @@ import pytest
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import ClockOptions
 from fusiond.live.events import Events
-from fusiond.live.journal import JournalHandler, handler
 from fusiond.live.stderr_log_handler import StandardErrorHandler
+from fusiond.live.systemd_journal import JournalHandler, handler
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_standard_error_where_that_is_not_the_journal(monkeypatch: pytest.Monkey
     with open(os.devnull, "w") as err:
         found = os.fstat(err.fileno())
         monkeypatch.setattr(sys, "stderr", err)
-        monkeypatch.setattr("fusiond.live.journal.SOCKET", Path("/"))
+        monkeypatch.setattr("fusiond.live.systemd_journal.SOCKET", Path("/"))
         made = handler({"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
         assert isinstance(made, JournalHandler)
         made.close()

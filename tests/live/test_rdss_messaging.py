@@ -17,7 +17,7 @@ from drivers.rdss.position_report_coding import (
     encode_short,
 )
 from fusiond.configuration.schema import Config
-from fusiond.live.messaging import MOST_CARDS
+from fusiond.live.rdss_messaging import MOST_CARDS
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import BadCommandError, CommandRefusedError, parse
 from fusiond.outputs.messages.fleet import FleetMessage

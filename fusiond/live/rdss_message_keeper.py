@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from fusiond.clock.stamp_mapping import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.messaging import Messaging
+from fusiond.live.rdss_messaging import Messaging
 from fusiond.live.state_keeper import state_file
 from fusiond.navigator.state_file import (
     MOST_BYTES,

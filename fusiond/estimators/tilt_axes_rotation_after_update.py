@@ -1,7 +1,7 @@
 """Compiled kernels: rotation of P and sensitivities after an update that rotated the tilt axes.
 
-Equations: fusiond.estimators.tilt_frame_after_heading_update, gyro_error_of_update and
-unknown_lever_arm.
+Equations: fusiond.estimators.tilt_frame_after_heading_update, gyro_error_after_rate_update and
+antenna_position_after_attitude_update.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.antenna_position_after_attitude_update import keep_antenna
 from fusiond.estimators.fault_carried import mix
 from fusiond.estimators.gyro_error_after_rate_update import keep_turn
-from fusiond.estimators.lever_arm_after_attitude_update import keep_antenna
 from fusiond.estimators.tilt_axes_propagation import UPRIGHT
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
