@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -31,10 +33,10 @@ def test_every_kind_of_frame_comes_through(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("does", "count", "words"),
     [
-        ("kill -SEGV $$", 0, "breaks off"),
-        ("cat FRAMES; kill -SEGV $$", 2, "breaks off"),
-        ("head -c 20 FRAMES", 0, "breaks off"),
-        ("exit 1", 0, "breaks off"),
+        ("kill -SEGV $$", 0, "dies of it"),
+        ("cat FRAMES; kill -SEGV $$", 2, "dies of it"),
+        ("head -c 20 FRAMES", 0, "dies of it"),
+        ("exit 1", 0, "dies of it"),
     ],
 )
 def test_a_reader_that_dies_ends_the_log(
@@ -55,3 +57,9 @@ def test_a_reader_that_dies_ends_the_log(
         messages, refused, _ = read(path)
         assert [(m.arbitration_id, bytes(m.data)) for m in messages] == [(0x7E8, b"\1\2")] * count
         assert [each.reason for each in refused.all()] == ["cut"]
+
+
+def test_one_that_never_ends_is_ended() -> None:
+    does = "import fusiond.offline.mf4_frames as m; m._CPU_S = 3; m._limit_to(0)\nwhile True: pass"
+    done = subprocess.run([sys.executable, "-c", does], check=False, timeout=600)
+    assert done.returncode in (-signal.SIGXCPU, -signal.SIGKILL)
