@@ -51,6 +51,18 @@ def test_dependencies_are_the_locked_ones() -> None:
     assert len(pip) == 2
 
 
+def test_kernels_go_where_the_second_stage_finds_them() -> None:
+    steps = _steps()
+    images = [rest.split()[0] for word, rest in steps if word == "FROM"]
+    assert len(images) == 2
+    assert len(set(images)) == 1  # the environment runs the Python that it was made with
+    (python,) = re.findall(r"^python:(\d+\.\d+)-", images[0])
+    (prebuilt,) = [rest for word, rest in steps if word == "RUN" and "tools.prebuilt" in rest]
+    packages = f"/opt/fusiond/lib/python{python}/site-packages"
+    assert shlex.split(prebuilt)[-2:] == ["--package", packages]
+    assert ("COPY", "--from=build /opt/fusiond /opt/fusiond") in steps
+
+
 def test_no_kernel_is_compiled_at_the_start_and_nobody_is_root() -> None:
     steps = _steps()
     assert any("tools.prebuilt" in rest for word, rest in steps if word == "RUN")
