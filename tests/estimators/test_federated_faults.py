@@ -276,7 +276,7 @@ def test_a_step_in_one_source_is_isolated_told_and_taken_back(delay_s: float) ->
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"aiding": {}}, "needs a section"),
+        ({"aiding": {}}, r"needs \[aiding.NAME\]"),
         ({"estimator": {"filter": "federated", "federated": {"sources": ["x"]}}}, "no .aiding.x"),
         (
             {"estimator": {"filter": "federated", "federated": {"shares": {"gnss": 1.0}}}},
