@@ -6,12 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from fusiond.configuration.schema import Config
 from fusiond.configuration.si_units import DEG
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.matched_noise_drives import CODE, Vehicle, scene
+from fusiond.studies.faults.solution_errors import errors_against
 from tests import runs
 from tests.navigator.starting import (
     CASES,
@@ -178,3 +181,23 @@ def test_fixes_of_before_the_first_sample_start_nothing_and_raise_nothing() -> N
             navigator.add(m, m.t_seen_ns)
     navigator.advance()
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.ALIGNING
+
+
+def test_a_heading_by_the_course_has_the_noise_of_the_velocity_that_it_is_of() -> None:
+    """Moving off by code: if the velocity was off by e across the way, the heading was by e / v, so
+    that what the next velocities say of the first corrects the other."""
+    on = scene(Vehicle("mems", CODE), "looked", 1600, 30.0)
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def watch(navigator: Navigator) -> None:
+        if navigator.started is not None and not found:
+            start = navigator.started
+            assert start.how == "GNSS course"
+            found.append((start.covariance, start.nav))
+
+    errors_against(on.config, on.recording, on.truth.at(np.arange(0.1, 30.0, 0.1)), watch=watch)
+    [(p, nav)] = found
+    speed = math.hypot(nav[3], nav[4])
+    across = np.array([-nav[4], nav[3]]) / speed
+    level, _ = CODE.velocity_m_s
+    assert float(p[2, 3:5] @ across) == pytest.approx(-(level**2) / speed, rel=0.1)

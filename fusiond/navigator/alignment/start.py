@@ -207,6 +207,8 @@ def build_start(
     made_of = fix, moves.candidate if moves is not None else None, heading
     used = tuple(candidate for candidate in made_of if candidate is not None)
     confirmed = not how.endswith(BACKWARD)
+    if moves is not None and fitted is None:
+        _by_course(p, moves.candidate)
     covariance = by @ p @ by.T
     return Start(t_ns, nav, xi, covariance, how, used=used, confirmed=confirmed, grades=grades)
 
@@ -278,6 +280,17 @@ def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
     for axis, slot in enumerate(model.slots_of(moves.candidate.rest)):
         by[DV : DV + 3, slot] = (dcm @ skew(moves.rate))[:, axis]
     by[~model.active] = 0.0
+
+
+def _by_course(p: Array, velocity: VelocityCandidate) -> None:
+    """Correlate a heading by the course with the velocity of that course, whose noise e is in both:
+
+        phi_D = -(z x v) e / |v|^2 + the rest
+
+    Without it further velocities would correct the velocity and leave the heading."""
+    north, east, *_ = velocity.v_ned
+    of_course = np.array([east, -north]) / (north * north + east * east)
+    p[PHI + 2, DV : DV + 2] = p[DV : DV + 2, PHI + 2] = of_course * np.square(velocity.sd[:2])
 
 
 def _take_fitted(
