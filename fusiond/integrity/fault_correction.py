@@ -7,7 +7,7 @@ w_f,
 
 plus a second-order term for the nonlinear part: an attitude error phi has turned the velocity, and
 the path, by phi / 2 on average. For a gyro fault of twenty seconds in an outage that is a metre a
-second. Its own estimate is of that order, too: phi^2 / 2, 8 deg of a unit that turns by 30.
+second. Along phi its own estimate is of that order: phi^2 / 2, 8 deg of a unit that turns by 30.
 """
 
 from __future__ import annotations
@@ -56,9 +56,11 @@ def mixed(taken: Sequence[Estimated]) -> Correction:
 def _bent(mean: Array) -> Array:
     """Covariance (n, n) of the nonlinear part of a correction, which V b lacks."""
     half, left = 0.5 * float(np.linalg.norm(mean[:3])), np.zeros(len(mean))
-    for first in (0, PLACE_ROW - 3, PLACE_ROW):
+    for first in (PLACE_ROW - 3, PLACE_ROW):
         left[first : first + 3] = half * np.linalg.norm(mean[first : first + 3])
-    return np.diag(left**2)
+    bent = np.diag(left**2)
+    bent[:3, :3] += half * half * np.outer(mean[:3], mean[:3])
+    return bent
 
 
 def somewhere_else(measurement: AidingMeasurement, estimator: Estimator) -> Correction:
