@@ -25,15 +25,22 @@ multiplies the model's variances of multipath and thermal noise, here and in the
 
 Both are independent of the receiver's position. The receiver's delay between bands remains in I.
 
-For a tracked carrier an epoch has L_a, its variance s_L^2, and the tracking time since the
-satellite's previous epoch; fusiond.aiding.carrier_anchor makes paths from an anchor epoch of them.
-s_L comes from a model of C/N0 and a scale, learned in the same way from d(L_a - L_b) of variance 2
-(s_La^2 + s_Lb^2).
+Either carrier shows the path: half a cycle of a data signal (L1 C/A) is open for seconds, while a
+pilot is tracked. The joined carrier L grows by that of a, or by that of b over an interval in which
+only b is tracked, and begins anew if none is. So a change of carriers opens no ambiguity; it adds
 
-The carrier also shows reflections: code minus carrier, d = P_a - L_a, changes only by 2 dI,
-millimetres a second. With D its mean over the last `MEANS_S` of tracking, m seconds long at first,
-and s^2 (1 + 1 / m) the variance of d - D, s^2 that of a code by the model and a scale learned from
-d (over a slip, which changes D, too, by the Dopplers),
+    s_La^2 + s_Lb^2                       at each change: noise of the epoch before, which has both
+    ((gamma - 1) dI/dt)^2 T dt            while b serves, advanced by gamma I; T an anchor's age
+
+to the variance of L. For a tracked carrier an epoch has L, its variance s_L^2, and the tracking
+time since the satellite's previous epoch; fusiond.aiding.carrier_anchor makes paths from an anchor
+epoch of them. s_L comes from a model of C/N0 and a scale, learned in the same way from d(L_a - L_b)
+of variance 2 (s_La^2 + s_Lb^2).
+
+The carrier also shows reflections: code minus carrier, d = P_a - L, changes only by 2 dI, (1 +
+gamma) dI while b serves, millimetres a second. With D its mean over the last `MEANS_S` of tracking,
+m seconds long at first, and s^2 (1 + 1 / m) the variance of d - D, s^2 that of a code by the model
+and a scale learned from d (over a slip, which changes D, too, by the Dopplers),
 
     d - D > 4 s    `multipath`, until d - D < 2 s, two minutes at most
     d - D < -4 s   D was too long
@@ -68,17 +75,18 @@ SLOT, LENGTH_A, LENGTH_B, GAMMA, DELAY, DELAY_VARIANCE, PAIR, SIGNAL = range(PLA
 # (drivers.raw.messages.PackedSignals).
 P, RATE, CNO, SD, SD_RATE, CYCLES, LOCK = range(SIGNAL_VALUES)
 # Columns kept for a satellite, of its first signal and of its pair; a time or number of 0: nothing
-# kept.
-SLOTS, KEPT_COLUMNS = 3 * 64, 12
+# kept. The last: 1 while the second carrier serves.
+SLOTS, KEPT_COLUMNS = 3 * 64, 14
 (
-    _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_AB, _DELAY, _V, _BESIDE, _MANY, _SINCE,
+    _T, _SIGNAL, _L_A, _RATE, _T_PAIR, _PAIR, _L_B, _DELAY, _V, _BESIDE, _MANY, _SINCE, _PATH,
+    _SERVES,
 ) = range(KEPT_COLUMNS)  # fmt: skip
 # Slot 0, which no satellite has, holds sums: of w nu^2 / (A + V) and of w; the same for changes of
 # two carriers, and for codes minus carriers.
 _SUM, _COUNT, _PHASES, _PHASE_COUNT, _CODES, _CODE_COUNT = range(6)
 # Columns of the results; NaN: unknown.
-OUT_COLUMNS = 6
-SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE = range(OUT_COLUMNS)
+OUT_COLUMNS = 7
+SLANT, SLANT_VARIANCE, WITH_CODE, CARRIER, SPAN, CARRIER_VARIANCE, GROWN = range(OUT_COLUMNS)
 # Refusals of a satellite, or of its carrier, by the number that `follow` writes.
 FOLLOWED, LOCK_LOST, CYCLE_SLIP, MULTIPATH = 0, 1, 2, 3
 ALL_FOLLOWED, JUMPED, SOME_REFUSED = 0, 1, 2
@@ -115,6 +123,8 @@ FORGOTTEN_S = 120.0
 DELAY_RATE_M_S = 0.01
 """Largest rate of a slant delay by itself: ten times the quiet ionosphere's 1 mm/s
 (Klobuchar, in Parkinson and Spilker 1996, vol. 1, chapter 12)."""
+QUIET_M_S, HELD_S = 0.001, 30.0
+"""The quiet ionosphere's own rate, and how long it holds: an anchor's age."""
 SLIP_SIGMAS = 4.0
 """Largest difference of two carriers in sigmas of their noise (one in 16,000), beside the
 ionosphere's change. A cycle lost on both L1 and L2 changes the difference by 54 mm, on L1 and L5 by
@@ -235,6 +245,32 @@ def _has_multipath(
     return False
 
 
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8[::1])", forceinline=True)
+def _join(
+    state: Array, plan: Array, first: Array, second: Array, span: float, scale: float, out: Array
+) -> None:
+    """Write the joined carrier, its noise, its tracking time and the growth of its variance."""
+    l_a, l_b = first[CYCLES] * plan[LENGTH_A], second[CYCLES] * plan[LENGTH_B]
+    by_a, by_b = l_a + (state[_PATH] - state[_L_A]), l_b + (state[_PATH] - state[_L_B])
+    known = span <= LONGEST_S and state[_SIGNAL] == plan[SIGNAL]
+    a = known and not math.isnan(by_a) and not first[LOCK] < span
+    b = known and not math.isnan(by_b) and not second[LOCK] < span
+    b = b and state[_PAIR] == plan[PAIR] and state[_T_PAIR] == state[_T]
+    of_a = scale * _phase_variance(_weakness(first[CNO]), plan[LENGTH_A])
+    of_b = scale * _phase_variance(_weakness(second[CNO]), plan[LENGTH_B])
+    serves = not a and (b or math.isnan(l_a))
+    out[CARRIER] = by_a if a else by_b if b else l_b if serves else l_a
+    out[CARRIER_VARIANCE] = of_b if serves else of_a
+    out[SPAN] = max(span, 0.0) if a or b else 0.0
+    out[GROWN] = 0.0
+    if b and serves:
+        out[GROWN] = ((plan[GAMMA] - 1.0) * QUIET_M_S) ** 2 * HELD_S * out[SPAN]
+    if out[SPAN] > 0.0 and serves != (state[_SERVES] > 0.0):
+        out[GROWN] += of_a + of_b
+    if span > 0.0:
+        state[_SERVES] = 1.0 if serves else 0.0
+
+
 @compiled("f8(f8[:, ::1], i8)", forceinline=True)
 def _shown(kept: Array, of: int) -> float:
     """Factor by the sums in slot 0 from index `of` on; old sums are halved."""
@@ -275,7 +311,7 @@ def follow(
 ) -> int:
     """Process an epoch at `now` (s); returns `ALL_FOLLOWED` or a sum of others.
 
-    `kept` (SLOTS, 12) is changed; `plan` (n, 8), `first` and `second` (n, 7); writes `out` (n, 6)
+    `kept` (SLOTS, 14) is changed; `plan` (n, 8), `first` and `second` (n, 7); writes `out` (n, 7)
     and `refused` (n,)."""
     n = plan.shape[0]
     scale, phases, codes = _shown(kept, _SUM), _shown(kept, _PHASES), _shown(kept, _CODES)
@@ -286,20 +322,15 @@ def follow(
         refused[i] = FOLLOWED
         for j in range(OUT_COLUMNS):
             out[i, j] = math.nan
-        out[i, SPAN] = 0.0
         span = now - state[_T]
-        l_a = first[i, CYCLES] * plan[i, LENGTH_A]
-        out[i, CARRIER] = l_a
         weak[i] = _weakness(first[i, CNO])
-        out[i, CARRIER_VARIANCE] = phases * _phase_variance(weak[i], plan[i, LENGTH_A])
-        if not (0.0 < span <= LONGEST_S) or state[_SIGNAL] != plan[i, SIGNAL]:
+        _join(state, plan[i], first[i], second[i], span, phases, out[i])
+        if out[i, SPAN] == 0.0:
+            known = 0.0 < span <= LONGEST_S and state[_SIGNAL] == plan[i, SIGNAL]
+            if known and first[i, LOCK] < span and not math.isnan(first[i, CYCLES] * state[_L_A]):
+                refused[i] = LOCK_LOST
             continue
-        if math.isnan(l_a) or math.isnan(state[_L_A]):
-            continue
-        if first[i, LOCK] < span:
-            refused[i] = LOCK_LOST
-            continue
-        moved[i], out[i, SPAN] = (l_a - state[_L_A]) / span, span
+        moved[i] = (out[i, CARRIER] - state[_PATH]) / span
         d = moved[i] - 0.5 * (first[i, RATE] + state[_RATE])
         if not math.isnan(d):
             residuals[many] = d
@@ -317,15 +348,13 @@ def follow(
                 refused[i] = MULTIPATH
             _write_rates(state, plan[i], first[i], weak_a, scale, out[i])
             continue
-        l_a = first[i, CYCLES] * plan[i, LENGTH_A]
+        path, l_a = out[i, CARRIER], first[i, CYCLES] * plan[i, LENGTH_A]
         pair = plan[i, GAMMA] > 0.0 and not math.isnan(second[i, P])
-        l_ab = math.nan
-        if pair:
-            l_ab = l_a - second[i, CYCLES] * plan[i, LENGTH_B]
+        l_b = second[i, CYCLES] * plan[i, LENGTH_B]
         change = math.nan
         locked = first[i, LOCK] >= span and second[i, LOCK] >= span
         if pair and locked and state[_PAIR] == plan[i, PAIR] and state[_T_PAIR] == state[_T]:
-            change = l_ab - state[_L_AB]
+            change = l_a - l_b - (state[_L_A] - state[_L_B])
         weak_b = _weakness(second[i, CNO])
         noise = _phase_variance(weak_a, plan[i, LENGTH_A])
         noise = 2.0 * (noise + _phase_variance(weak_b, plan[i, LENGTH_B]))
@@ -336,15 +365,16 @@ def follow(
             kept[0, _PHASE_COUNT] += w
         if out[i, SPAN] > 0.0:
             d = moved[i] - 0.5 * (first[i, RATE] + state[_RATE]) - common
-            if slipped or abs(d) > max(SLIP_RATE_M_S, plan[i, LENGTH_A] / span):
+            wave = plan[i, LENGTH_B if state[_SERVES] > 0.0 else LENGTH_A]
+            if slipped or abs(d) > max(SLIP_RATE_M_S, wave / span):
                 refused[i] = CYCLE_SLIP
         lost = 0.0
         if jumped or span > LONGEST_S or state[_SIGNAL] != plan[i, SIGNAL]:
             lost = math.nan
         elif out[i, SPAN] == 0.0 or refused[i] != FOLLOWED:
             rate = 0.5 * (first[i, RATE] + state[_RATE]) + common
-            lost = l_a - state[_L_A] - rate * span
-        if _has_multipath(state, first[i], weak_a, l_a, now, span, lost, codes, kept[0]):
+            lost = path - state[_PATH] - rate * span
+        if _has_multipath(state, first[i], weak_a, path, now, span, lost, codes, kept[0]):
             refused[i] = MULTIPATH
         if jumped or refused[i] != FOLLOWED:
             out[i, SPAN] = 0.0
@@ -354,9 +384,9 @@ def follow(
             since = now - state[_T_PAIR]
             of = weak_a, weak_b, since, change, scale
             _delay(state, plan[i], first[i], second[i], *of, kept[0])
-            state[_T_PAIR], state[_PAIR], state[_L_AB] = now, plan[i, PAIR], l_ab
+            state[_T_PAIR], state[_PAIR], state[_L_B] = now, plan[i, PAIR], l_b
         state[_T], state[_SIGNAL], state[_L_A] = now, plan[i, SIGNAL], l_a
-        state[_RATE] = first[i, RATE]
+        state[_RATE], state[_PATH] = first[i, RATE], path
         _write_rates(state, plan[i], first[i], weak_a, scale, out[i])
     found = int(jumped) * JUMPED
     for i in range(n):

@@ -57,6 +57,7 @@ from fusiond.gnss.carrier_phase import CARRIER as LENGTH
 from fusiond.gnss.carrier_phase import CARRIER_VARIANCE as LENGTH_VARIANCE
 from fusiond.gnss.carrier_phase import (
     CNO,
+    GROWN,
     SLANT,
     SLANT_VARIANCE,
     SPAN,
@@ -220,7 +221,7 @@ def range_rows(
     `receiver` (3,) ECEF m, at GPS time `week`, `tow` of its clock. Returns the number of satellites
     below `least_elevation` (rad) or `least_cno` (dB Hz).
 
-    `states` (n, 8) of `choose`, `signals` (n, 8), `measured` (n, 7), `carriers` (n, 6) of
+    `states` (n, 8) of `choose`, `signals` (n, 8), `measured` (n, 7), `carriers` (n, 7) of
     fusiond.gnss.carrier_phase, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
     terms of BDGIM; `noise` (8,), whose codes are `code_scale` times the model's.
     """
@@ -306,7 +307,10 @@ def range_rows(
         out[CARRIER_SPAN, k] = carriers[k, SPAN]
         out[CARRIER, k] = carriers[k, LENGTH] + SPEED_OF_LIGHT_M_S * states[k, 6] - tropo + iono
         out[CARRIER_VARIANCE, k] = carriers[k, LENGTH_VARIANCE] * thin * thin
-        out[WALK, k] = WALK_M_SQRT_S * thin
+        walked = WALK_M_SQRT_S * WALK_M_SQRT_S
+        if carriers[k, SPAN] > 0.0:
+            walked += carriers[k, GROWN] / carriers[k, SPAN]
+        out[WALK, k] = math.sqrt(walked) * thin
         code = code_zenith * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno

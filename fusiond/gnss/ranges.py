@@ -150,7 +150,7 @@ class ChosenSignals(NamedTuple):
 
 
 class TrackedSignals(NamedTuple):
-    """Chosen signals with the results of their carriers (n, 6).
+    """Chosen signals with the results of their carriers (n, 7).
 
     These parts do not depend on the receiver's position: the carriers' results by earlier epochs,
     the factors on the model's sigmas of codes, the carriers without a result, with the reason, and

@@ -42,6 +42,8 @@ class Receiver:
         self.cycles = np.zeros((n, 2))
         self.longer_m = np.zeros(n)
         """By a wall, both codes."""
+        self.open = np.zeros((n, 2), bool)
+        """Carriers with an open half cycle, which decoders leave out."""
 
     def delays(self) -> Array:
         """They grow by 2 mm/s."""
@@ -52,7 +54,12 @@ class Receiver:
         found: Array = 300.0 + 10.0 * np.arange(self.n)
         return found
 
-    def epoch(self, lock_s: float = math.inf, doppler: bool = True) -> Told:
+    def epoch(
+        self,
+        lock_s: float = math.inf,
+        doppler: bool = True,
+        second_lock_s: float | None = None,
+    ) -> Told:
         rho = 2.2e7 + self.rates() * (self.t - NOON) + self.clock_m
         noise = self.code_m * self.rng.standard_normal((2, self.n))
         i = self.delays()
@@ -66,7 +73,9 @@ class Receiver:
         second[:, ca.P] = rho + GAMMA * i + DELAY_M + noise[1] + self.longer_m
         second[:, ca.CNO] = 45.0
         second[:, ca.CYCLES] = (rho - GAMMA * i) / L2 - 2e5 + self.cycles[:, 1]
-        second[:, ca.LOCK] = lock_s
+        second[:, ca.LOCK] = lock_s if second_lock_s is None else second_lock_s
+        first[self.open[:, 0], ca.CYCLES] = np.nan
+        second[self.open[:, 1], ca.CYCLES] = np.nan
         out = np.empty((self.n, ca.OUT_COLUMNS))
         refused = np.empty(self.n, np.int64)
         found = ca.follow(self.kept, self.plan, first, second, self.t, out, refused)
@@ -192,6 +201,60 @@ def test_another_first_signal_is_no_way_from_the_one_before() -> None:
     told = receiver.after(0.25)
     assert told.out[:, ca.SPAN].tolist() == [0.25, 0.0, 0.25, 0.25]
     assert told.refused == [ca.FOLLOWED] * 4
+
+
+def test_the_second_carrier_bridges_an_open_half_cycle_of_the_first() -> None:
+    """The first comes back with another ambiguity. While the second serves, the path is shorter by
+    gamma times the delay's growth of 2 mm/s."""
+    receiver = Receiver(12, code_m=0.3)
+    before = receiver.epoch()
+    for _ in range(30):
+        before = receiver.after(1.0)
+    for k in range(12):
+        receiver.open[:3, 0] = 2 <= k < 8
+        receiver.cycles[:3, 0] += 1e4 * (k == 8)
+        told = receiver.after(1.0)
+        by_second = 2 <= k <= 8
+        moved = (told.out - before.out)[:, ca.CARRIER]
+        advance = np.where(np.arange(12) < 3, GAMMA if by_second else 1.0, 1.0)
+        assert moved == pytest.approx(receiver.rates() - 0.002 * advance, abs=1e-6)
+        assert told.refused == [ca.FOLLOWED] * 12
+        assert (told.out[:, ca.SPAN] == 1.0).all()
+        # (gamma - 1)^2 (1 mm/s)^2 30 s = 12.55e-6 m^2 a second, and two phases' at each change.
+        noise = told.out[3, ca.CARRIER_VARIANCE] * (1.0 + GAMMA)
+        grown = 12.55e-6 * by_second + noise * (k in (2, 9))
+        assert told.out[:3, ca.GROWN] == pytest.approx(grown, rel=0.02, abs=0.0)
+        assert (told.out[3:, ca.GROWN] == 0.0).all()
+        assert receiver.epoch().out[:, ca.CARRIER] == pytest.approx(told.out[:, ca.CARRIER])
+        before = told
+
+
+def test_no_carrier_is_joined_over_an_epoch_that_has_neither() -> None:
+    """Nor one that has both, but not the same one as the epoch before; the second may begin."""
+    receiver = Receiver()
+    receiver.open[0, 0] = True
+    receiver.epoch()
+    begun = receiver.after(0.25)
+    assert (begun.out[:, ca.SPAN] == 0.25).all()
+    receiver.open[0] = False, True
+    receiver.open[1] = True, True
+    told = receiver.after(0.25)
+    assert told.out[:, ca.SPAN].tolist() == [0.0, 0.0, 0.25, 0.25]
+    receiver.open[:] = False
+    told = receiver.after(0.25)
+    assert told.out[:, ca.SPAN].tolist() == [0.25, 0.0, 0.25, 0.25]
+    assert told.refused == [ca.FOLLOWED] * 4
+
+
+def test_a_lock_lost_by_the_first_carrier_alone_breaks_nothing() -> None:
+    receiver = Receiver()
+    receiver.epoch()
+    before = receiver.after(0.25)
+    receiver.cycles[:, 0] += 1e4
+    told = receiver.after(0.25, lock_s=0.1, second_lock_s=math.inf)
+    assert told.refused == [ca.FOLLOWED] * 4
+    moved = (told.out - before.out)[:, ca.CARRIER] / 0.25
+    assert moved == pytest.approx(receiver.rates() - 0.002 * GAMMA, abs=1e-6)
 
 
 def test_the_same_epoch_again_changes_nothing() -> None:

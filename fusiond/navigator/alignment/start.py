@@ -285,12 +285,16 @@ def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
 def _by_course(p: Array, velocity: VelocityCandidate) -> None:
     """Correlate a heading by the course with the velocity of that course, whose noise e is in both:
 
-        phi_D = -(z x v) e / |v|^2 + the rest
+        phi_D = -w (z x v) e / |v|^2 + the rest
 
-    Without it further velocities would correct the velocity and leave the heading."""
+    w is 1, or the variance of the heading by that of this course alone where more than this course
+    made it (the weight of a mean). Without it further velocities would correct the velocity and
+    leave the heading."""
     north, east, *_ = velocity.v_ned
     of_course = np.array([east, -north]) / (north * north + east * east)
-    p[PHI + 2, DV : DV + 2] = p[DV : DV + 2, PHI + 2] = of_course * np.square(velocity.sd[:2])
+    shared = of_course * np.square(velocity.sd[:2])
+    weight = min(1.0, p[PHI + 2, PHI + 2] / float(of_course @ shared))
+    p[PHI + 2, DV : DV + 2] = p[DV : DV + 2, PHI + 2] = weight * shared
 
 
 def _take_fitted(
