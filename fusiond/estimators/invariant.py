@@ -380,11 +380,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self._bent, self._knows[_OF_STATE]
+        return self.turns, self._bent, *self._knows[_OF_STATE].tolist()
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self._bent, self._knows[_OF_STATE] = extra
+        self.turns, self._bent, *self._knows[_OF_STATE] = extra
 
 
 def _way(a: Array, b: Array) -> Array:

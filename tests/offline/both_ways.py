@@ -82,7 +82,7 @@ def by_daemon(config: Config, files: Path) -> Told:
             given += 1
         while taken < len(times) and times[taken] <= k * tick_ns:
             row = int(times[taken]), tuple(read.imu.samples[taken].tolist())
-            chain.sources.imu._waiting.append(row)
+            chain.sources.imu.waiting.append(row)
             taken += 1
         host.mono = k * tick_ns
         chain.tick(k * tick_ns)
