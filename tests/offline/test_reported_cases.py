@@ -95,9 +95,8 @@ def test_19_a_receiver_that_drives_off_at_rest_is_one_story(tmp_path: Path) -> N
 
 
 def test_22_quality_4_publishes_what_the_filter_knows(tmp_path: Path) -> None:
-    """Fixes of 1 cm with NMEA's quality of a fixed solution: at most 1.5 of its own sigma for 99 % of
-    the time. At 483 s a bump has a chi-square of 155 in 16 rows, which no fault explains: 2.1 there,
-    for one look of 0.5 s."""
+    """Fixes of 1 cm with NMEA's quality of a fixed solution: at most 1.5 of its own sigma for 99 %
+    of the time. At 483 s a bump has a chi-square of 155 in 16 rows: 2.1 at one look of 0.5 s."""
     shares: list[float] = []
 
     def watch(navigator: Navigator) -> None:
