@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import AidingMeasurement
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import DECIDED, POSITION, RESTARTS
+from fusiond.estimators.fault_bank import DECIDED, DELAY, POSITION, RESTARTS
 from fusiond.estimators.fault_bank_interface import Estimated, Hypotheses
 from fusiond.estimators.fault_odds import APART, BEST, EXPLAINS, identified
-from fusiond.integrity.catalogue import PLACE, Kind, changed_kind
+from fusiond.integrity.catalogue import MOTION, PLACE, Kind, changed_kind
 from fusiond.integrity.correlated_fix_jumps import renewed_slots
 from fusiond.integrity.fault_correction import Correction, mixed, somewhere_else
 from fusiond.integrity.fault_findings import Finding, Lasting
@@ -219,7 +219,7 @@ class Diagnosis(ServiceTable):
             return True
         kind = self._kinds[int(found.item(BEST)) // RESTARTS]
         places = [s for s in self._series.values() if s.device == kind.device and s.locates]
-        if measurement.moves and measurement.device == kind.device:
+        if kind.of == MOTION and measurement.moves and measurement.device == kind.device:
             since_ns = measurement.t_ns - LONGEST_NS
             if any(s.received_ns > since_ns for s in places if not s.out):
                 return False
@@ -338,7 +338,7 @@ class Diagnosis(ServiceTable):
 
         The device's positions have agreed for a minute with its velocity, which is that of the
         filter: it is in service, and the position's fault is over, or it passes while all series
-        are excluded."""
+        are excluded. Those of a delayed device agree with each other, too."""
         if not (one.out and one.locates):
             return False
         known = self._agreement.get(one.device)
@@ -346,7 +346,10 @@ class Diagnosis(ServiceTable):
             return False
         own = [s for s in self._series.values() if s.device == one.device]
         if all(s.out for s in own):
-            return _velocities_passed(own, READMIT_COUNT)
+            delayed = any(
+                f.kind.signature == DELAY and f.kind.device == one.device for f in self.findings
+            )
+            return not delayed and _velocities_passed(own, READMIT_COUNT)
         moves = [s for s in own if s.moves]
         unexplained = one.reason in (DISAGREES, STILL)
         return unexplained and bool(moves) and not any(s.out for s in moves)
