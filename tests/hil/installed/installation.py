@@ -33,8 +33,12 @@ def readme_blocks() -> list[list[str]]:
     return [block.strip().splitlines() for block in blocks]
 
 
-def carry_out(lines: list[str]) -> None:
-    """Each line by a shell, as root, in the checkout; all must succeed."""
+def carry_out(lines: list[str]) -> str:
+    """Carry out each line by a shell, as root, in the checkout; return what they print.
+
+    All must succeed. What they print is shown only if one does not.
+    """
+    printed = ""
     python = f"{PYTHON / 'bin'}:{os.environ['PATH']}"
     for line in lines:
         print(f"# {line}", flush=True)
@@ -48,8 +52,13 @@ def carry_out(lines: list[str]) -> None:
             cwd=REPOSITORY,
             env={"PATH": python, "HOME": os.environ["HOME"], "PIP_NO_INDEX": "1"},
             check=False,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
-        assert run.returncode == 0, journal()
+        assert run.returncode == 0, run.stdout + journal()
+        printed += run.stdout
+    return printed
 
 
 def show_python() -> None:

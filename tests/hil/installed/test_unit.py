@@ -110,7 +110,8 @@ async def _mistake(start: list[str]) -> None:
     """A mistake in the configuration: what the README starts fails with 78, once."""
     good = CONFIG.read_text()
     CONFIG.write_text(good.replace("rate_hz = 100.0", 'rate_hz = "fast"'))
-    carry_out([*start[1:-1], start[-1] + " || true"])
+    printed = carry_out([*start[1:-1], start[-1] + " || true"])
+    assert "Job for fusiond.service failed" in printed
     failed = await _until(lambda unit: unit["ActiveState"] == "failed")
     assert (failed["Result"], failed["ExecMainStatus"]) == ("exit-code", "78"), journal()
     assert failed["NRestarts"] == "0"
