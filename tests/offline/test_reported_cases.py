@@ -94,9 +94,9 @@ def test_19_a_receiver_that_drives_off_at_rest_is_one_story(tmp_path: Path) -> N
     assert result["mode"] == "navigating"
 
 
-def test_22_quality_4_publishes_what_the_filter_knows(tmp_path: Path) -> None:
-    """Fixes of 1 cm with NMEA's quality of a fixed solution: at most 1.5 of its own sigma for 99 %
-    of the time. At 483 s a bump has a chi-square of 155 in 16 rows: 2.1 at one look of 0.5 s."""
+@pytest.fixture(scope="module")
+def quality_4() -> list[float]:
+    """Published horizontal sigma over the filter's own, at each look (0.5 s), where both are."""
     shares: list[float] = []
 
     def watch(navigator: Navigator) -> None:
@@ -111,7 +111,19 @@ def test_22_quality_4_publishes_what_the_filter_knows(tmp_path: Path) -> None:
     measurements = [("gnss", CASES / "22_rtk_quality_4_gnss.csv")]
     result = process(shipped, drive / "imu.csv", measurements, watch=watch)
     assert result["mode"] == "navigating"
-    finite = [s for s in shares if math.isfinite(s)]
-    assert len(finite) > 500
-    assert np.quantile(finite, 0.99) <= 1.5
-    assert max(finite) <= 2.5
+    return [share for share in shares if math.isfinite(share)]
+
+
+def test_22_quality_4_publishes_what_the_filter_knows(quality_4: list[float]) -> None:
+    """Fixes of 1 cm with NMEA's quality of a fixed solution."""
+    assert len(quality_4) > 500
+    assert np.quantile(quality_4, 0.99) <= 1.5
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="a bump (chi-square 155 in 16 rows), as of a turned unit, opens one look: 2.1",
+)
+def test_22_quality_4_does_so_at_every_look(quality_4: list[float]) -> None:
+    """No more than 1.5 of its own sigma."""
+    assert max(quality_4) <= 1.5
