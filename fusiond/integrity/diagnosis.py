@@ -346,9 +346,8 @@ class Diagnosis(ServiceTable):
             return False
         own = [s for s in self._series.values() if s.device == one.device]
         if all(s.out for s in own):
-            delayed = any(
-                f.kind.signature == DELAY and f.kind.device == one.device for f in self.findings
-            )
+            delays = [f.kind for f in self.findings if f.kind.signature == DELAY]
+            delayed = any(kind.spoils(one.device, locates=True, moves=True) for kind in delays)
             return not delayed and _velocities_passed(own, READMIT_COUNT)
         moves = [s for s in own if s.moves]
         unexplained = one.reason in (DISAGREES, STILL)

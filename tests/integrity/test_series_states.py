@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from fusiond.aiding.position import PositionMeasurement
 from fusiond.aiding.velocity import VelocityMeasurement
+from fusiond.integrity.catalogue import carried_kinds, delay_kinds
 from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.integrity.fault_findings import Finding
 from fusiond.integrity.position_velocity_agreement import Agreement
 from fusiond.integrity.series_states import (
     DISAGREES,
@@ -229,6 +233,20 @@ def test_velocities_that_are_the_filters_leave_only_the_place_in_doubt(passed: i
     diagnosis.series["gnss_velocity"].passed = passed
     assert (diagnosis.contradicts is None) == (passed > 0)
     assert diagnosis._goes_its_own_way(diagnosis.series["gnss"]) == (passed == READMIT_COUNT)
+
+
+@pytest.mark.parametrize("device", ["gnss", "second", "all"])
+@pytest.mark.parametrize("late", [True, False])
+def test_a_delayed_device_agrees_with_itself_and_is_not_believed(device: str, late: bool) -> None:
+    """Its velocities pass at a constant speed; its place is behind, alone or with the others."""
+    diagnosis = excluded("left out")
+    kind = (delay_kinds if late else carried_kinds)(device)[0]
+    if device == "all":
+        kind = replace(kind, devices=("gnss", "second"))
+    diagnosis.findings = (Finding(kind, 0, 0.0, (0.8,), (0.03,), 9.0),)
+    diagnosis.series["gnss_velocity"].passed = READMIT_COUNT
+    own_way = diagnosis._goes_its_own_way(diagnosis.series["gnss"])
+    assert own_way == (not late or device == "second")
 
 
 @pytest.mark.parametrize(
